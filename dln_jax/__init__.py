@@ -1,0 +1,26 @@
+"""Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers."""
+
+from dln_jax.data.schema import Trajectories, load, save
+from dln_jax.deploy.load import load_run
+from dln_jax.mechanics import lagrangian, natural
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.models.delan import make_delan
+from dln_jax.models.model import Model
+from dln_jax.types import InputError, Needs
+
+__all__ = [
+    "Decomposition",
+    "Dynamics",
+    "InputError",
+    "Model",
+    "NaturalSystem",
+    "Needs",
+    "Trajectories",
+    "lagrangian",
+    "load",
+    "load_run",
+    "make_delan",
+    "natural",
+    "save",
+]

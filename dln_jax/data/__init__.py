@@ -1,0 +1,1 @@
+"""Trajectories: the npz schema, validation, splits, and generators that sample the scenes."""

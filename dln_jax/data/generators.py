@@ -1,0 +1,210 @@
+"""Data sets sampled from scenes, with exact rates, torques and decomposition, in float64."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import TypeVar, cast
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.letters import LETTERS, letter_path
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics import lagrangian
+from dln_jax.scenes.scene import (
+    Scene,
+    actuation_matrix,
+    closed_form_decomposition,
+    closed_form_forward_dynamics,
+    closed_form_inverse_dynamics,
+)
+from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
+from dln_jax.types import InputError
+
+Function = TypeVar("Function", bound=Callable)
+
+
+def _in_float64(function: Function) -> Function:
+    """Computes in float64, whatever the caller's default is."""
+
+    @functools.wraps(function)
+    def wrapped(*arguments, **keywords):
+        with jax.enable_x64(True):
+            return function(*arguments, **keywords)
+
+    return cast(Function, wrapped)
+
+
+@_in_float64
+def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Trajectories:
+    """The two-link arm's tip writes letters, one trajectory each, sampled every `dt` s.
+
+    The outlines come from matplotlib's bundled font, smoothed; angles, rates and torques are exact derivatives of
+    the tip's path through the inverse kinematics and the closed-form equations of motion.
+    """
+    _require_positive("dt", dt)
+    paths = [letter_path(letter) for letter in letters]
+    times = [np.arange(0.0, path.duration, dt) for path in paths]
+
+    @jax.jit
+    def states(position, t):
+        def angles(t):
+            return joint_angles(position(t))
+
+        def rates(t):
+            return jax.jvp(angles, (t,), (jnp.ones_like(t),))
+
+        def motion(t):
+            (q, qd), (_, qdd) = jax.jvp(rates, (t,), (jnp.ones_like(t),))
+            return q, qd, qdd
+
+        return jax.vmap(motion)(t)
+
+    # One length for all, so that letters share a compilation; a path rests beyond its end.
+    longest = max(map(len, times))
+    motions = [states(path.position, dt * np.arange(longest)) for path in paths]
+    q, qd, qdd = (
+        np.concatenate([np.asarray(motion[k])[: len(t)] for motion, t in zip(motions, times, strict=True)])
+        for k in range(3)
+    )
+    trajectory = np.repeat(np.arange(len(times)), [len(t) for t in times])
+    return _complete(two_link_arm(), np.concatenate(times), q, qd, qdd, trajectory, np.array(list(letters)))
+
+
+@_in_float64
+def uniform(
+    scene: Scene,
+    *,
+    samples: int = 3000,
+    position_bound: float = np.pi,
+    rate_bound: float = 5.0,
+    acceleration_bound: float = 20.0,
+    control_bound: float = 10.0,
+    seed: int = 0,
+) -> Trajectories:
+    """Independent random states, each a trajectory of its own, uniform in a box symmetric about zero.
+
+    Bounds are in rad or m, 1/s, 1/s² and N m or N. A fully actuated scene draws accelerations; an under-actuated one
+    draws controls, from which the accelerations follow.
+    """
+    for name, value in (("samples", samples), ("position_bound", position_bound), ("rate_bound", rate_bound)):
+        _require_positive(name, value)
+    d = scene.needs.degrees_of_freedom
+    random = np.random.default_rng(seed)
+    q, qd = (random.uniform(-bound, bound, (samples, d)) for bound in (position_bound, rate_bound))
+    if scene.needs.actuation is None:
+        qdd = random.uniform(-acceleration_bound, acceleration_bound, (samples, d))
+    else:
+        matrix = actuation_matrix(scene.needs)
+        control = random.uniform(-control_bound, control_bound, (samples, matrix.shape[1]))
+        qdd = _batched(closed_form_forward_dynamics, scene)(q, qd, control @ matrix.T)
+    order = np.arange(samples)
+    label = np.array([f"state-{index}" for index in order])
+    return _complete(scene, np.zeros(samples), q, qd, np.asarray(qdd), order, label)
+
+
+@_in_float64
+def free_swing(
+    scene: Scene,
+    *,
+    starts: Float[np.ndarray, "K d"] | None = None,
+    trajectories: int = 10,
+    steps: int = 400,
+    dt: float = 0.02,
+    tolerance: float = 1e-10,
+    seed: int = 0,
+) -> Trajectories:
+    """Motions from rest without torque, integrated adaptively (Dormand-Prince 8) to the given tolerance.
+
+    Without `starts` [K, d], as many starting postures as asked for are drawn within ±π/2 (rad, or m).
+
+    Raises:
+        InputError: the integration does not finish.
+    """
+    for name, value in (("trajectories", trajectories), ("steps", steps), ("dt", dt), ("tolerance", tolerance)):
+        _require_positive(name, value)
+    d = scene.needs.degrees_of_freedom
+    if starts is None:
+        starts = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, (trajectories, d))
+    t = dt * np.arange(steps)
+    q, qd = rollouts(scene, starts, np.zeros_like(starts), t, tolerance=tolerance)
+    q, qd = q.reshape(-1, d), qd.reshape(-1, d)
+    qdd = np.asarray(_batched(closed_form_forward_dynamics, scene)(q, qd, np.zeros_like(q)))
+    trajectory = np.repeat(np.arange(len(starts)), steps)
+    label = np.array([f"swing-{index}" for index in range(len(starts))])
+    data = _complete(scene, np.tile(t, len(starts)), q, qd, qdd, trajectory, label)
+    return data._replace(tau=np.zeros_like(q))
+
+
+@_in_float64
+def rollouts(
+    scene: Scene,
+    q: Float[np.ndarray, "K d"],
+    qd: Float[np.ndarray, "K d"],
+    t: Float[np.ndarray, " T"],
+    *,
+    tolerance: float = 1e-10,
+) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
+    """Reference motions of a scene without torque from K states: q and qd at the times t, which start at 0."""
+
+    def field(time, state, _):
+        return state[1], closed_form_forward_dynamics(scene, state[0], state[1], jnp.zeros_like(state[0]))
+
+    @jax.jit
+    @jax.vmap
+    def solve(q, qd):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            diffrax.Dopri8(),
+            t0=t[0],
+            t1=t[-1],
+            dt0=None,
+            y0=(q, qd),
+            saveat=diffrax.SaveAt(ts=jnp.asarray(t)),
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+            max_steps=100_000,
+            throw=False,
+        )
+        return solution.ys, solution.result == diffrax.RESULTS.successful
+
+    motions, successful = solve(q, qd)
+    if not bool(successful.all()):
+        raise InputError(f"the motion could not be integrated to {tolerance:g}; ask for less accuracy or time")
+    return np.asarray(motions[0]), np.asarray(motions[1])
+
+
+def _complete(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
+    """Adds exact torques, momenta and the decomposition to a motion of a scene."""
+    parts = _batched(closed_form_decomposition, scene)(q, qd, qdd)
+
+    def momentum(scene, q, qd, qdd):
+        p, pd = jax.jvp(lambda q, qd: lagrangian.momentum(scene.lagrangian, q, qd), (q, qd), (qd, qdd))
+        return p, pd
+
+    p, pd = _batched(momentum, scene)(q, qd, qdd)
+    return Trajectories(
+        t=t,
+        q=q,
+        qd=qd,
+        qdd=qdd,
+        tau=np.asarray(_batched(closed_form_inverse_dynamics, scene)(q, qd, qdd)),
+        trajectory=trajectory,
+        label=label,
+        p=np.asarray(p),
+        pd=np.asarray(pd),
+        tau_inertial=np.asarray(parts.inertial),
+        tau_coriolis=np.asarray(parts.coriolis),
+        tau_gravity=np.asarray(parts.gravity),
+        needs=scene.needs,
+    )
+
+
+def _batched(function, scene: Scene):
+    return jax.jit(jax.vmap(lambda *state: function(scene, *state)))
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not value > 0:
+        raise InputError(f"{name} is {value}; expected a positive number")

@@ -1,0 +1,248 @@
+"""Letters as smooth tip paths in the plane: what an arm that writes has to follow.
+
+The outline of a glyph (DejaVu Sans, the font that comes inside matplotlib) is traced contour by contour:
+
+1. each closed contour is resampled by arc length and smoothed by a Gaussian, which rounds the corners;
+2. it is sampled again, densely where it is curved, by the weight `(1 + (curvature bend_radius)²)^(1/4)`,
+   blurred: at a constant rate of that phase the pen brakes ahead of bends. (Without the blur its centripetal
+   acceleration would be at most `straight_speed² / bend_radius`.) People write like this: speed falls with a
+   power of the curvature (Lacquaniti, Terzuolo and Viviani, 1983, "The law relating the kinematic and figural
+   aspects of drawing movements");
+3. a Fourier series in the phase replaces the samples: a contour is smooth everywhere and closes exactly;
+4. the rate of the phase rises and falls like a minimum-jerk motion (Flash and Hogan, 1985), for contours and
+   the straight pen-up moves between them. All are joined at rest: velocity and acceleration are continuous.
+
+The shapes come from the font's own integer coordinates: no machine, rasteriser or setting changes them.
+"""
+
+import math
+from collections.abc import Callable
+from numbers import Real
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array, Float
+from matplotlib.font_manager import FontProperties, get_font
+from matplotlib.path import Path as Outline
+from matplotlib.textpath import TextToPath
+
+from dln_jax.types import InputError, Scalar
+
+LETTERS = "abcdeghlmnopqrsuvwyz"
+"""The letters of the embedded data set `characters`."""
+
+_SAMPLES = 4096
+"""Points per contour before they become a Fourier series."""
+_HARMONICS = 96
+"""Highest harmonic of that series; with the default smoothing the rest is below a micrometre."""
+
+
+class LetterPath(NamedTuple):
+    """A letter as a motion of the tip, at rest before time 0 and after `duration`."""
+
+    duration: float
+    """Time from rest to rest, s."""
+    position: Callable[[Scalar], Float[Array, "2"]]
+    """Time in s -> tip (x, y) in m; `jax.jvp` of it gives the velocity, and once more the acceleration.
+
+    It is a pytree: given to a jitted function as an argument, all letters with equally many strokes share one
+    compilation. It holds still outside 0..duration and computes in the default float of JAX.
+    """
+
+
+class _Stroke(NamedTuple):
+    """A curve over phase 0..1: a closed contour, or a straight pen-up move (whose harmonics are zero)."""
+
+    cosines: Float[np.ndarray, "harmonics 2"]
+    """Coefficients of cos(2 pi k phase), k = 0, 1, ..., m."""
+    sines: Float[np.ndarray, "harmonics 2"]
+    """Coefficients of sin(2 pi k phase), m."""
+    displacement: Float[np.ndarray, "2"]
+    """End minus start, m; zero for a contour."""
+    length: float
+    """Length of the curve, m."""
+
+
+class _TimedStrokes(NamedTuple):
+    """All strokes of a letter, stacked, and when they happen; times are relative to the duration."""
+
+    duration: Float[Array, ""]
+    starts: Float[Array, "strokes"]
+    shares: Float[Array, "strokes"]
+    ramps: Float[Array, "strokes"]
+    """Part of its own time that a stroke spends on speeding up, and again on slowing down; at most 1/2."""
+    cosines: Float[Array, "strokes harmonics 2"]
+    sines: Float[Array, "strokes harmonics 2"]
+    displacements: Float[Array, "strokes 2"]
+
+
+class _DesignUnits(TextToPath):
+    """matplotlib's outlines at one pixel per font unit (1/2048 em), where coordinates are exact."""
+
+    FONT_SCALE = 2048.0
+
+
+def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
+    """Closed polygons along the outline of a glyph of DejaVu Sans.
+
+    Args:
+        character: one printable character.
+
+    Returns:
+        One polygon [points, 2] per contour in font units (1/2048 em), y up from the baseline; the last point
+        repeats the first.
+
+    Raises:
+        InputError: `character` is no single printable character whose glyph has an outline.
+    """
+    expected = "expected one printable character with an outline in DejaVu Sans, such as 'a'"
+    if not isinstance(character, str):
+        raise InputError(f"character is {character!r}, a {type(character).__name__}; {expected}")
+    if len(character) != 1:
+        raise InputError(f"character is {character!r}, {len(character)} characters; {expected}")
+    # By file and not by name: a name would find a user's font of that name first.
+    file = str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"))
+    if not character.isprintable() or get_font(file).get_char_index(ord(character)) == 0:
+        raise InputError(f"character is {character!r}, which the font lacks; {expected}")
+    font = FontProperties(family="DejaVu Sans", fname=file)
+    vertices, codes = _DesignUnits().get_text_path(font, character)
+    # The font's points are integers, those that TrueType implies between them halves.
+    exact = np.round(2.0 * np.asarray(vertices, np.float64).reshape(-1, 2)) / 2.0
+    polygons = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
+    # Fonts keep lone points as anchors; they draw nothing.
+    polygons = [np.asarray(polygon) for polygon in polygons if np.ptp(polygon, axis=0).max() > 0.0]
+    if not polygons:
+        raise InputError(f"character is {character!r}, an empty glyph; {expected}")
+    return polygons
+
+
+def _contour(
+    polygon: Float[np.ndarray, "points 2"],
+    pen: Float[np.ndarray, "2"] | None,
+    *,
+    smoothing: float,
+    bend_radius: float,
+) -> _Stroke:
+    """The smooth stroke along a closed polygon, from its point nearest to the pen (`None`: top left)."""
+    corners = polygon @ np.array([1.0, 1.0j])
+    arc = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(corners)))])
+    uniform = np.arange(_SAMPLES) / _SAMPLES
+    wave_number = 2.0 * np.pi * np.fft.fftfreq(_SAMPLES, 1.0 / _SAMPLES)
+    blur = np.exp(-0.5 * (wave_number * smoothing / arc[-1]) ** 2)
+    spectrum = np.fft.fft(np.interp(uniform * arc[-1], arc, corners)) * blur
+    curve = np.fft.ifft(spectrum)
+    first = np.fft.ifft(1j * wave_number * spectrum)
+    second = np.fft.ifft(-(wave_number**2) * spectrum)
+    stretch = np.abs(first)
+    curvature = np.imag(np.conj(first) * second) / stretch**3
+    weight = stretch * (1.0 + (curvature * bend_radius) ** 2) ** 0.25
+    # Blurred as well, so that the pen brakes ahead of a bend and not in it.
+    weight = np.fft.ifft(np.fft.fft(weight) * blur).real
+    if pen is None:
+        start = np.argmax(curve.imag - 0.5 * curve.real)
+    else:
+        start = np.argmin(np.abs(curve - pen @ np.array([1.0, 1.0j])))
+    curve, weight = np.roll(curve, -start), np.roll(weight, -start)
+    curve, weight = np.append(curve, curve[0]), np.append(weight, weight[0])
+    phase = np.concatenate([[0.0], np.cumsum(0.5 * (weight[1:] + weight[:-1]))])
+    by_phase = np.interp(uniform * phase[-1], phase, curve)
+    both = np.stack([by_phase.real, by_phase.imag], axis=-1)
+    series = np.fft.rfft(both, axis=0)[: _HARMONICS + 1] * (2.0 / _SAMPLES)
+    series[0] *= 0.5
+    return _Stroke(series.real, -series.imag, np.zeros(2), float(np.abs(np.diff(curve)).sum()))
+
+
+def _pen_up(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> _Stroke:
+    cosines = np.zeros((_HARMONICS + 1, 2))
+    cosines[0] = start
+    return _Stroke(cosines, np.zeros_like(cosines), end - start, float(np.hypot(*(end - start))))
+
+
+def _minimum_jerk_phase(time: Scalar, ramp: Scalar) -> Scalar:
+    """Phase 0..1 at relative time 0..1: its rate rises during `ramp`, stays, and falls during `ramp`."""
+    # The second half mirrors the first.
+    early = jnp.where(time > 0.5, 1.0 - time, time)
+    rising = jnp.where(early < ramp, early, ramp) / ramp
+    # Integral of the minimum-jerk step 10 s³ - 15 s⁴ + 6 s⁵.
+    risen = ramp * rising**4 * (2.5 + rising * (rising - 3.0))
+    phase = jnp.where(early < ramp, risen, early - 0.5 * ramp) / (1.0 - ramp)
+    return jnp.where(time > 0.5, 1.0 - phase, phase)
+
+
+def _position(letter: _TimedStrokes, time: Scalar) -> Float[Array, "2"]:
+    relative = jnp.clip(time / letter.duration, 0.0, 1.0)
+    stroke = jnp.sum(relative >= letter.starts[1:])
+    local = (relative - letter.starts[stroke]) / letter.shares[stroke]
+    phase = _minimum_jerk_phase(local, letter.ramps[stroke])
+    angles = 2.0 * jnp.pi * phase * jnp.arange(letter.cosines.shape[1])
+    periodic = jnp.cos(angles) @ letter.cosines[stroke] + jnp.sin(angles) @ letter.sines[stroke]
+    return periodic + phase * letter.displacements[stroke]
+
+
+def letter_path(
+    character: str,
+    *,
+    height: float = 0.55,
+    centre: tuple[float, float] = (1.05, 0.45),
+    mean_speed: float = 0.53,
+    smoothing: float = 0.04,
+    bend_radius: float = 0.3,
+    ramp_length: float = 0.2,
+) -> LetterPath:
+    """The tip's motion along the outline of a character; the head of this module has the steps.
+
+    Args:
+        character: one printable character of DejaVu Sans that has an outline.
+        height: height of a lower-case x, m; characters share this scale and keep the font's proportions.
+        centre: (x, y) in m of the point midway across the character and half an x-height above the baseline.
+        mean_speed: length of the path over its duration, m/s; it scales time and changes nothing else.
+        smoothing: standard deviation of the Gaussian along the contour, m: corners are rounded by about this.
+        bend_radius: the pen slows down where the radius of curvature falls below this, m.
+        ramp_length: what one start and one stop cost, as a way at full speed, m.
+
+    Returns:
+        Duration in s and position in m.
+
+    Raises:
+        InputError: the character has no outline, or a number is not finite or not positive.
+    """
+    polygons = outline(character)
+    lengths = dict(height=height, smoothing=smoothing, bend_radius=bend_radius, ramp_length=ramp_length)
+    for name, value in {"mean_speed": mean_speed, **lengths}.items():
+        if not (isinstance(value, Real) and math.isfinite(value) and value > 0.0):
+            raise InputError(f"{name} is {value!r}; expected a finite number above 0")
+    if np.shape(centre) != (2,) or not np.all(np.isfinite(centre)):
+        raise InputError(f"centre is {centre!r}; expected two finite numbers (x, y) in m")
+
+    widths = np.concatenate(polygons)[:, 0]
+    x_height = outline("x")[0][:, 1].max()
+    middle = 0.5 * np.array([widths.min() + widths.max(), x_height])
+    strokes: list[_Stroke] = []
+    pen = None
+    for polygon in polygons:
+        placed = (polygon - middle) * (height / x_height) + np.asarray(centre)
+        contour = _contour(placed, pen, smoothing=smoothing, bend_radius=bend_radius)
+        start = contour.cosines.sum(axis=0)
+        if pen is not None:
+            strokes.append(_pen_up(pen, start))
+        strokes.append(contour)
+        pen = start
+
+    way = np.array([stroke.length for stroke in strokes])
+    duration = float(way.sum() / mean_speed)
+    costs = way + ramp_length
+    shares = costs / costs.sum()
+    timed = _TimedStrokes(
+        duration=jnp.asarray(duration),
+        starts=jnp.asarray(np.cumsum(shares) - shares),
+        shares=jnp.asarray(shares),
+        ramps=jnp.asarray(np.minimum(ramp_length / costs, 0.5)),
+        cosines=jnp.asarray(np.stack([stroke.cosines for stroke in strokes])),
+        sines=jnp.asarray(np.stack([stroke.sines for stroke in strokes])),
+        displacements=jnp.asarray(np.stack([stroke.displacement for stroke in strokes])),
+    )
+    return LetterPath(duration, Partial(_position, timed))

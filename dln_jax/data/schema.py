@@ -1,0 +1,220 @@
+"""The one schema of trajectory files: what is in an npz, how it is read, checked and written.
+
+Samples of all trajectories are concatenated on axis 0.
+
+| key | shape | unit | |
+|---|---|---|---|
+| `t` | [N] | s | time within its trajectory |
+| `q`, `qd`, `qdd` | [N, d] | rad or m, 1/s, 1/s² | rates that are absent are estimated from `q` |
+| `tau` | [N, d] | N m or N | zero if absent |
+| `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
+| `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
+| `trajectory` | [N] int | | index of the trajectory that a sample belongs to |
+| `label` | [K] str | | a name for each trajectory; indices if absent |
+| `needs` | str | | optional JSON of `dln_jax.types.Needs` |
+"""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.data.derivatives import time_derivative
+from dln_jax.types import InputError, Needs
+
+RATES = ("qd", "qdd")
+OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+
+
+class Trajectories(NamedTuple):
+    """Samples of several trajectories, float64; shapes and units as in the module's table."""
+
+    t: np.ndarray
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+    trajectory: np.ndarray
+    label: np.ndarray
+    p: np.ndarray | None = None
+    pd: np.ndarray | None = None
+    tau_inertial: np.ndarray | None = None
+    tau_coriolis: np.ndarray | None = None
+    tau_gravity: np.ndarray | None = None
+    needs: Needs | None = None
+    estimated: tuple[str, ...] = ()
+    """Keys that were absent: rates estimated by finite differences, torques taken as zero."""
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """d."""
+        return self.q.shape[1]
+
+
+def load(path: str | Path) -> Trajectories:
+    """Reads and checks a file; never unpickles.
+
+    Raises:
+        InputError: the file is missing, is no npz, holds pickled objects, or breaks the schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the path of an npz file")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise InputError(
+            f"{path}: not a readable npz file without pickled objects ({type(error).__name__}); "
+            "write it with numpy.savez and plain numeric or string arrays"
+        ) from error
+    try:
+        return from_arrays(arrays)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def from_arrays(arrays: dict[str, Any]) -> Trajectories:
+    """Checks arrays against the schema and completes them.
+
+    Raises:
+        InputError: names the key, what it holds, what was expected and what to do.
+    """
+    q = _numeric(arrays, "q", None)
+    if q.ndim != 2 or q.shape[1] == 0:
+        raise InputError(f"q has shape {q.shape}; expected [N, d] with d >= 1: one column per coordinate")
+    samples = q.shape[0]
+    if samples < 2:
+        raise InputError(f"q has {samples} sample(s); expected at least 2: record longer trajectories")
+    t = _numeric(arrays, "t", (samples,))
+    trajectory, label = _trajectory_names(arrays, samples)
+    _require_increasing_time(t, trajectory, label)
+
+    checked = {"q": q}
+    estimated = []
+    for key, source in zip(RATES, ("q", "qd"), strict=True):
+        if key in arrays:
+            checked[key] = _numeric(arrays, key, q.shape)
+        else:
+            checked[key] = time_derivative(t, checked[source], trajectory, name=key)
+            estimated.append(key)
+    for key in OPTIONAL:
+        if key in arrays:
+            checked[key] = _numeric(arrays, key, q.shape)
+    if "tau" not in arrays:
+        checked["tau"] = np.zeros_like(q)
+        estimated.append("tau")
+    needs = _stated_needs(arrays, q.shape[1])
+    return Trajectories(t=t, trajectory=trajectory, label=label, needs=needs, estimated=tuple(estimated), **checked)
+
+
+def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
+    """Writes a file that `load` reads; keys that were estimated are left out, so that the file says only what is known.
+
+    Raises:
+        InputError: the file exists and `overwrite` is false, or its folder does not exist.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise InputError(f"{path}: trajectories are stored as npz; let the name end in .npz")
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists; choose another name or ask to overwrite it")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent}: no such folder; create it first")
+    arrays = {
+        key: value
+        for key, value in data._asdict().items()
+        if value is not None and key not in ("needs", "estimated", *data.estimated)
+    }
+    if data.needs is not None:
+        arrays["needs"] = np.array(json.dumps(data.needs._asdict()))
+    partial = path.with_name(path.name + ".partial")
+    with open(partial, "wb") as file:
+        np.savez_compressed(file, **arrays)
+    partial.replace(path)
+
+
+def needs_from_json(stated: Any) -> Needs:
+    """`Needs` from the plain values of its JSON.
+
+    Raises:
+        InputError: unknown or missing fields, or values of the wrong kind.
+    """
+    advice = f"expected JSON with the fields {', '.join(Needs._fields)}"
+    if not isinstance(stated, dict) or not set(stated) <= set(Needs._fields) or "joints" not in stated:
+        raise InputError(f"needs: {advice}, got {stated!r:.80}")
+    joints = stated["joints"]
+    if not isinstance(joints, list | tuple) or not joints or not set(joints) <= {"revolute", "prismatic"}:
+        raise InputError(f"needs: joints are {joints!r:.80}; expected a list of 'revolute' and 'prismatic'")
+    for key in ("gravity", "friction"):
+        if not isinstance(stated.get(key, False), bool):
+            raise InputError(f"needs: {key} is {stated[key]!r:.80}; expected true or false")
+    actuation = stated.get("actuation")
+    if actuation is not None:
+        matrix = np.array(actuation, dtype=object)
+        if matrix.ndim != 2 or len(matrix) != len(joints):
+            raise InputError(f"needs: actuation has shape {matrix.shape}; expected [{len(joints)}, u], or null")
+        actuation = tuple(tuple(float(entry) for entry in row) for row in actuation)
+    return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation})
+
+
+def _numeric(arrays: dict[str, Any], key: str, shape: tuple[int, ...] | None) -> np.ndarray:
+    if key not in arrays:
+        raise InputError(f"key '{key}' is missing (found: {', '.join(sorted(arrays)) or 'nothing'}); add it")
+    array = np.asarray(arrays[key])
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{key} has type {array.dtype}; expected real numbers")
+    if shape is not None and array.shape != shape:
+        raise InputError(f"{key} has shape {array.shape}; expected {shape} to match q")
+    array = array.astype(np.float64)
+    finite = np.isfinite(array)
+    if not finite.all():
+        first = int(np.argwhere(~finite)[0][0])
+        count = int((~finite).sum())
+        raise InputError(
+            f"{key} has {count} NaN or infinite value(s), the first at sample {first}; remove or repair them"
+        )
+    return array
+
+
+def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
+    trajectory = _numeric(arrays, "trajectory", (samples,))
+    if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0:
+        raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
+    trajectory = trajectory.astype(np.int64)
+    count = int(trajectory.max()) + 1
+    label = np.asarray(arrays.get("label", [str(index) for index in range(count)]))
+    if label.dtype.kind not in "US" or label.ndim != 1:
+        raise InputError(f"label has type {label.dtype} and shape {label.shape}; expected one string per trajectory")
+    if len(label) < count:
+        raise InputError(f"label names {len(label)} trajectories, but trajectory counts {count}; add the missing names")
+    if len(set(label)) < len(label):
+        raise InputError("label has repeated names; give every trajectory a name of its own")
+    return trajectory, label.astype(str)
+
+
+def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.ndarray) -> None:
+    same = trajectory[1:] == trajectory[:-1]
+    starts = trajectory[np.flatnonzero(np.r_[True, ~same])]
+    if len(set(starts)) < len(starts):
+        raise InputError("trajectory returns to an earlier index; keep the samples of each trajectory together")
+    backward = same & (np.diff(t) <= 0)
+    if backward.any():
+        sample = int(np.flatnonzero(backward)[0]) + 1
+        name = label[trajectory[sample]]
+        raise InputError(f"t does not increase at sample {sample} of trajectory '{name}'; sort the samples by time")
+
+
+def _stated_needs(arrays: dict[str, Any], d: int) -> Needs | None:
+    if "needs" not in arrays:
+        return None
+    try:
+        stated = json.loads(str(arrays["needs"]))
+    except json.JSONDecodeError as error:
+        raise InputError(f"needs is not JSON ({error}); expected the fields {', '.join(Needs._fields)}") from error
+    needs = needs_from_json(stated)
+    if needs.degrees_of_freedom != d:
+        raise InputError(f"needs states {needs.degrees_of_freedom} joints, but q has {d} columns; make them agree")
+    return needs

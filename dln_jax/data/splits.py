@@ -1,0 +1,82 @@
+"""Splits by trajectory, never by sample: neighbouring samples of one trajectory are almost copies."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError
+
+PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+
+
+class Split(NamedTuple):
+    """Three disjoint sets of trajectories: fitted to, selected by, and reported on."""
+
+    train: Trajectories
+    validation: Trajectories
+    test: Trajectories
+
+
+def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajectories:
+    """The trajectories with these indices; indices and labels stay as they are."""
+    samples = np.isin(data.trajectory, indices)
+    kept = {key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None}
+    return data._replace(**kept)
+
+
+def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
+    """Indices of the trajectories with these labels.
+
+    Raises:
+        InputError: a label that the data do not have.
+    """
+    known = list(data.label)
+    unknown = [label for label in labels if label not in known]
+    if unknown:
+        shown = ", ".join(known[:30]) + (", ..." if len(known) > 30 else "")
+        raise InputError(f"no trajectory is labelled '{unknown[0]}'; choose the test labels from: {shown}")
+    return np.array([known.index(label) for label in labels], dtype=int)
+
+
+def split(
+    data: Trajectories, *, test: Sequence[str] | None = None, validation_share: float = 0.1, seed: int = 0
+) -> Split:
+    """Splits off the test trajectories, and validation trajectories from the rest.
+
+    Without test labels every sixth trajectory is a test. The validation trajectories (at least one) are drawn by the
+    seed from the rest, so that no choice made by validation has seen the test.
+
+    Raises:
+        InputError: an unknown label, or fewer than one trajectory left for training.
+    """
+    present = np.unique(data.trajectory)
+    test_indices = present[5::6] if test is None else label_indices(data, test)
+    if test is None and len(present) < 6:
+        test_indices = present[-1:]
+    rest = np.setdiff1d(present, test_indices)
+    if len(rest) < 2 or len(test_indices) == 0:
+        raise InputError(
+            f"{len(present)} trajectories, {len(test_indices)} of them for the test, leave {len(rest)} for training "
+            "and validation; at least 3 in all are needed: record more, or cut long ones and index the parts"
+        )
+    count = min(max(1, round(validation_share * len(rest))), len(rest) - 1)
+    validation = np.random.default_rng(seed).choice(rest, size=count, replace=False)
+    return Split(
+        train=select(data, np.setdiff1d(rest, validation)),
+        validation=select(data, validation),
+        test=select(data, test_indices),
+    )
+
+
+def merged(sets: Split) -> Trajectories:
+    """All trajectories of a split in their original order."""
+    parts = [part for part in sets if len(part.t)]
+    order = np.argsort(np.concatenate([part.trajectory for part in parts]), kind="stable")
+    joined = {
+        key: np.concatenate([getattr(part, key) for part in parts])[order]
+        for key in PER_SAMPLE
+        if getattr(parts[0], key) is not None
+    }
+    return sets.train._replace(**joined)

@@ -1,0 +1,1 @@
+"""Metrics, latency, reports and figures."""

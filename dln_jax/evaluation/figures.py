@@ -1,0 +1,102 @@
+"""Figures of a trained model; each function returns a Matplotlib figure and touches no global state."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.train import Progress
+
+TRUTH, MODEL, TEST = "#111111", "#d1495b", "#2e6f95"
+PARTS = ("tau", "tau_inertial", "tau_coriolis", "tau_gravity")
+TITLES = ("torque", "inertial", "Coriolis", "gravity")
+
+
+def force_decomposition(
+    data: Trajectories, predicted: dict[str, np.ndarray], *, most_joints: int = 4, most_trajectories: int = 6
+) -> Figure:
+    """Torque and its parts over the first test trajectories: a row per joint, truth in black, model in colour."""
+    shown = np.unique(data.trajectory)[:most_trajectories]
+    samples = np.flatnonzero(np.isin(data.trajectory, shown))
+    trajectory = data.trajectory[samples]
+    starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
+    # Single states are no curves; they are compared point by point.
+    style = "-" if len(samples) > 2 * len(shown) else "."
+    rows = min(data.degrees_of_freedom, most_joints)
+    figure = _figure(13, 1.1 + 1.9 * rows)
+    axes = figure.subplots(rows, len(PARTS), sharex=True, squeeze=False)
+    for row in range(rows):
+        for axis, key, title in zip(axes[row], PARTS, TITLES, strict=True):
+            truth = getattr(data, key)
+            if truth is not None:
+                axis.plot(truth[samples, row], style, color=TRUTH, linewidth=2.2, label="truth")
+            model_style = "--" if style == "-" else "x"
+            axis.plot(predicted[key][samples, row], model_style, color=MODEL, linewidth=1.3, label="model")
+            for start in starts[1:]:
+                axis.axvline(start, color="0.8", linewidth=0.8, zorder=0)
+            if row == 0:
+                axis.set_title(title, pad=18)
+                for start, end in zip(starts, [*starts[1:], len(samples)], strict=True):
+                    name = str(data.label[trajectory[start]])
+                    axis.annotate(
+                        name,
+                        ((start + end) / 2, 1.02),
+                        xycoords=("data", "axes fraction"),
+                        ha="center",
+                        fontsize=9 if len(name) < 4 else 6,
+                        color="0.35",
+                    )
+            if row == rows - 1:
+                axis.set_xlabel("test sample")
+        axes[row, 0].set_ylabel(f"joint {row + 1}, {_force_unit(data, row)}")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    return figure
+
+
+def training_curve(history: Sequence[Progress], *, best_step: int) -> Figure:
+    """Training loss, validation error and test error against steps; the test error decided nothing."""
+    figure = _figure(7, 4.2)
+    axis = figure.subplots()
+    steps = [progress.step for progress in history]
+    curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, "validation torque MSE"))
+    for field, colour, label in (*curves, ("monitor", TEST, "test torque MSE")):
+        axis.semilogy(steps, [getattr(progress, field) for progress in history], color=colour, label=label)
+    axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
+    axis.set_xlabel("optimiser step")
+    axis.set_ylabel("loss, or MSE in (N m)²")
+    axis.grid(True, alpha=0.25)
+    axis.legend(frameon=False)
+    return figure
+
+
+def tip_paths(data: Trajectories, tip: Callable, *, test: Sequence[int], most_trajectories: int = 24) -> Figure:
+    """The paths that an arm's tip draws, one panel a trajectory; those of the test in colour."""
+    shown = np.unique(data.trajectory)[:most_trajectories]
+    columns = min(len(shown), 8)
+    rows = -(-len(shown) // columns)
+    figure = _figure(1.5 * columns, 1.75 * rows + 0.3)
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    positions = np.asarray(jax.vmap(tip)(data.q))
+    for axis in axes.flat:
+        axis.set_aspect("equal")
+        axis.axis("off")
+    for axis, index in zip(axes.flat, shown, strict=False):
+        path = positions[data.trajectory == index]
+        is_test = index in test
+        axis.plot(*path.T, color=MODEL if is_test else TRUTH, linewidth=1.4)
+        axis.set_title(f"{data.label[index]} (test)" if is_test else str(data.label[index]), fontsize=9)
+    return figure
+
+
+def _force_unit(data: Trajectories, joint: int) -> str:
+    return "N" if data.needs is not None and data.needs.joints[joint] == "prismatic" else "N m"
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=130)
+    FigureCanvasAgg(figure)
+    return figure

@@ -1,0 +1,51 @@
+"""Errors of a model on trajectories."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.dynamics import Dynamics
+
+DECOMPOSITION = ("inertial", "coriolis", "gravity")
+
+
+def predictions(dynamics: Dynamics, data: Trajectories, dtype) -> dict[str, np.ndarray]:
+    """What the model says of every sample: `tau`, `qdd`, and the parts of the torque, each [N, d] in float64."""
+
+    @jax.jit
+    @jax.vmap
+    def answer(q, qd, qdd, tau):
+        parts = dynamics.decompose(q, qd, qdd)
+        return {
+            "tau": dynamics.inverse_dynamics(q, qd, qdd),
+            "qdd": dynamics.forward_dynamics(q, qd, tau),
+            **{f"tau_{name}": getattr(parts, name) for name in DECOMPOSITION},
+        }
+
+    answers = answer(*(jnp.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)))
+    return {key: np.asarray(array, np.float64) for key, array in answers.items()}
+
+
+def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, float]:
+    """Mean squared errors over samples, each the sum over joints (the published metric; SI units squared).
+
+    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction), and, where the data
+    have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`.
+    """
+    torque_error = predicted["tau"] - data.tau
+    result = {
+        "torque_mse": mean_square(torque_error),
+        "forward_mse": mean_square(predicted["qdd"] - data.qdd),
+        "power_mse": float(np.mean(np.sum(data.qd * torque_error, axis=1) ** 2)),
+    }
+    for name in DECOMPOSITION:
+        truth = getattr(data, f"tau_{name}")
+        if truth is not None:
+            result[f"{name}_mse"] = mean_square(predicted[f"tau_{name}"] - truth)
+    return result
+
+
+def mean_square(error: np.ndarray) -> float:
+    """Mean over samples of the sum of squares over joints; error [N, d]."""
+    return float(np.mean(np.sum(error**2, axis=1)))

@@ -1,0 +1,1 @@
+"""Residuals, optimisers, the fit loop and its checkpoints."""

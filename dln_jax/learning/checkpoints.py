@@ -1,0 +1,114 @@
+"""Parameter trees on disk: safetensors for the numbers, JSON for what they mean. Nothing that is read can run code.
+
+The manifest names its tensor file and carries its SHA-256, so that a truncated, swapped or edited file is refused.
+Both files are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from dln_jax.types import InputError
+
+SCHEMA_VERSION = 1
+
+
+def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, number: int | None = None) -> None:
+    """Writes `name.json` and its tensor file, `name.safetensors` or, numbered, `name-NUMBER.safetensors`.
+
+    Numbered files never replace one another, so that not even a kill between the two renames leaves a torn pair;
+    the file that the manifest named before is removed afterwards.
+
+    Args:
+        directory: an existing folder.
+        name: of the pair.
+        tree: any pytree of arrays.
+        facts: JSON values to store in the manifest beside versions, shapes and digest.
+        number: distinguishes successive states of one run.
+    """
+    tensors = {key: np.asarray(leaf) for key, leaf in _flatten(tree).items()}
+    data = safetensors.numpy.save(tensors)
+    file_name = f"{name}.safetensors" if number is None else f"{name}-{number:09d}.safetensors"
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "tensor_file": file_name,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "tensors": {key: {"shape": list(a.shape), "dtype": str(a.dtype)} for key, a in tensors.items()},
+        "versions": {package: importlib.metadata.version(package) for package in ("dln-jax", "jax", "dm-haiku")},
+        **facts,
+    }
+    _replace(directory / file_name, data)
+    _replace(directory / f"{name}.json", json.dumps(manifest, indent=2).encode() + b"\n")
+    if number is not None:
+        for old in directory.glob(f"{name}-*.safetensors"):
+            if old.name != file_name:
+                old.unlink()
+
+
+def load_manifest(directory: Path, name: str) -> dict[str, Any]:
+    """The manifest `name.json`, checked for its schema version.
+
+    Raises:
+        InputError: it is missing, no JSON object, or of another schema.
+    """
+    path = directory / f"{name}.json"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the folder of a run that has written one")
+    try:
+        manifest = json.loads(path.read_text())
+        version, file_name = manifest["schema_version"], manifest["tensor_file"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a manifest ({error}); train again or restore the file") from error
+    if version != SCHEMA_VERSION or Path(file_name).name != file_name:
+        raise InputError(f"{path}: schema version {version!r}; this release reads version {SCHEMA_VERSION}")
+    return manifest
+
+
+def load_tree(directory: Path, name: str, like: Any) -> Any:
+    """The stored tree, in the structure of `like`.
+
+    Raises:
+        InputError: a file is missing, truncated or altered, or its tensors do not fit `like`.
+    """
+    manifest = load_manifest(directory, name)
+    path = directory / manifest["tensor_file"]
+    if not path.is_file():
+        raise InputError(f"{path}: missing, though {name}.json names it; restore it or train again")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != manifest.get("sha256"):
+        raise InputError(f"{path}: truncated or altered (its SHA-256 is not {name}.json's); restore or train again")
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise InputError(f"{path}: not a safetensors file ({error}); restore it or train again") from error
+    expected = _flatten(like)
+    for key, array in expected.items():
+        if key not in tensors:
+            raise InputError(f"{path}: has no tensor '{key}'; the settings differ from those it was written with")
+        stored = tensors[key]
+        if stored.shape != array.shape or stored.dtype != array.dtype:
+            raise InputError(
+                f"{path}: '{key}' is {stored.dtype} {stored.shape}, expected {array.dtype} {array.shape}; "
+                "load it with the settings and precision it was written with"
+            )
+    # Copies: arrays over the file's bytes could not be donated.
+    leaves = [jax.numpy.array(tensors[key]) for key in expected]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _flatten(tree: Any) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _replace(path: Path, data: bytes) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(data)
+    partial.replace(path)

@@ -1,0 +1,23 @@
+"""First-order optimisers."""
+
+import optax
+
+
+def adamw(
+    *,
+    steps: int,
+    learning_rate: float = 1e-2,
+    weight_decay: float = 1e-5,
+    warm_up_share: float = 0.02,
+    final_share: float = 1e-3,
+) -> optax.GradientTransformation:
+    """AdamW with linear warm-up to `learning_rate` and cosine decay to `final_share` of it after `steps` steps."""
+    warm_up = max(1, round(warm_up_share * steps))
+    schedule = optax.warmup_cosine_decay_schedule(
+        init_value=learning_rate / warm_up,
+        peak_value=learning_rate,
+        warmup_steps=warm_up,
+        decay_steps=max(steps, warm_up + 1),
+        end_value=final_share * learning_rate,
+    )
+    return optax.adamw(schedule, weight_decay=weight_decay)

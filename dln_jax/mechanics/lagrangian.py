@@ -1,0 +1,80 @@
+"""Equations of motion of any Lagrangian L(q, qd), for one state.
+
+    d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
+
+Only the derivatives that a quantity needs are taken: the inverse model is one `jvp` of the momentum plus one
+gradient; the forward model adds the Hessian in qd alone, which is solved and never inverted.
+A mass matrix that is singular gives non-finite accelerations rather than a regularised answer.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
+
+
+def momentum(L: Lagrangian, q: Vector, qd: Vector) -> Vector:
+    """Generalised momentum p = dL/dqd [d]."""
+    return jax.grad(L, argnums=1)(q, qd)
+
+
+def energy(L: Lagrangian, q: Vector, qd: Vector) -> Scalar:
+    """Energy E = qdᵀ dL/dqd - L, which is T + V for a natural system."""
+    lagrangian, rate = jax.jvp(lambda velocity: L(q, velocity), (qd,), (qd,))
+    return rate - lagrangian
+
+
+def mass_matrix(L: Lagrangian, q: Vector, qd: Vector) -> Matrix:
+    """Mass matrix M = d²L/dqd² [d, d]; symmetric, but definite only if the Lagrangian makes it so."""
+    return jax.jacfwd(lambda velocity: momentum(L, q, velocity))(qd)
+
+
+def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau = d/dt dL/dqd - dL/dq [d] that a motion takes."""
+    _, momentum_rate = jax.jvp(functools.partial(momentum, L), (q, qd), (qd, qdd))
+    return momentum_rate - jax.grad(L)(q, qd)
+
+
+def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vector:
+    """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
+    bias = inverse_dynamics(L, q, qd, jnp.zeros_like(qd))
+    return jnp.linalg.solve(mass_matrix(L, q, qd), tau - bias)
+
+
+def decompose(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+    """Inertial, Coriolis and gravity force, each [d]; their sum is tau(q, qd, qdd) when M depends on q alone."""
+    rest = jnp.zeros_like(qd)
+    gravity = inverse_dynamics(L, q, rest, rest)
+    return Decomposition(
+        inertial=inverse_dynamics(L, q, rest, qdd) - gravity,
+        coriolis=inverse_dynamics(L, q, qd, rest) - gravity,
+        gravity=gravity,
+    )
+
+
+def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
+    """Generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
+    return jax.grad(D, argnums=1)(q, qd)
+
+
+def dynamics(L: Lagrangian, *, dissipation: Dissipation | None = None) -> Dynamics:
+    """All functions of the system at once; friction enters only where there is a Rayleigh function."""
+
+    def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        tau = inverse_dynamics(L, q, qd, qdd)
+        return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
+
+    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        driving = tau if dissipation is None else tau - friction_force(dissipation, q, qd)
+        return forward_dynamics(L, q, qd, driving)
+
+    return Dynamics(
+        inverse_dynamics=with_friction,
+        forward_dynamics=accelerate,
+        energy=functools.partial(energy, L),
+        mass_matrix=functools.partial(mass_matrix, L),
+        decompose=functools.partial(decompose, L),
+    )

@@ -1,0 +1,96 @@
+"""Equations of motion of natural systems, T = ½ qdᵀ M(q) qd with M = L Lᵀ given as a Cholesky factor.
+
+    tau = M qdd + dM/dt qd - dT/dq + dV/dq
+
+The factor makes M definite by construction, gives the momentum without a derivative, and turns the forward model
+into two triangular solves. The potential is `None` where a scene has none, and is then never traced.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.lagrangian import friction_force
+from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Matrix, Potential, Scalar, Vector
+
+
+class NaturalSystem(NamedTuple):
+    """The energies of a natural system, as functions of one state."""
+
+    cholesky: CholeskyFactor
+    """q -> lower triangular L [d, d], M = L Lᵀ."""
+    potential: Potential | None = None
+    """q -> V, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar."""
+
+
+def lagrangian(system: NaturalSystem) -> Lagrangian:
+    """L(q, qd) = ½ |Lᵀ qd|² - V(q), for the generic functions of `mechanics.lagrangian`."""
+
+    def difference(q: Vector, qd: Vector) -> Scalar:
+        kinetic = _kinetic(system.cholesky(q), qd)
+        return kinetic if system.potential is None else kinetic - system.potential(q)
+
+    return difference
+
+
+def momentum(system: NaturalSystem, q: Vector, qd: Vector) -> Vector:
+    """Generalised momentum p = L Lᵀ qd [d]."""
+    factor = system.cholesky(q)
+    return factor @ (factor.T @ qd)
+
+
+def energy(system: NaturalSystem, q: Vector, qd: Vector) -> Scalar:
+    """Energy T + V."""
+    kinetic = _kinetic(system.cholesky(q), qd)
+    return kinetic if system.potential is None else kinetic + system.potential(q)
+
+
+def mass_matrix(system: NaturalSystem, q: Vector, qd: Vector | None = None) -> Matrix:
+    """Mass matrix M = L Lᵀ [d, d]; the velocity is accepted, and not needed."""
+    factor = system.cholesky(q)
+    return factor @ factor.T
+
+
+def inverse_dynamics(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] that a motion takes, friction included."""
+    # One differentiation of the factor along the motion serves M and dM/dt; one gradient serves dT/dq and dV/dq.
+    _, momentum_rate = jax.jvp(lambda q, qd: momentum(system, q, qd), (q, qd), (qd, qdd))
+    tau = momentum_rate - jax.grad(lagrangian(system))(q, qd)
+    return tau if system.dissipation is None else tau + friction_force(system.dissipation, q, qd)
+
+
+def forward_dynamics(system: NaturalSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
+    """Acceleration qdd [d] under a generalised force, by two triangular solves with the factor at hand."""
+    bias = inverse_dynamics(system, q, qd, jnp.zeros_like(qd))
+    factor = system.cholesky(q)
+    return solve_lower_transposed(factor, solve_lower(factor, tau - bias))
+
+
+def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+    """Inertial M qdd, Coriolis dM/dt qd - dT/dq and gravity dV/dq, each [d]."""
+    inertial_only = NaturalSystem(system.cholesky)
+    return Decomposition(
+        inertial=mass_matrix(system, q) @ qdd,
+        coriolis=inverse_dynamics(inertial_only, q, qd, jnp.zeros_like(qd)),
+        gravity=jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q),
+    )
+
+
+def dynamics(system: NaturalSystem) -> Dynamics:
+    """All functions of the system at once."""
+    return Dynamics(
+        inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
+        forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),
+        energy=lambda q, qd: energy(system, q, qd),
+        mass_matrix=lambda q, qd=None: mass_matrix(system, q, qd),
+        decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
+    )
+
+
+def _kinetic(factor: Matrix, qd: Vector) -> Scalar:
+    return 0.5 * jnp.sum((factor.T @ qd) ** 2)

@@ -1,0 +1,1 @@
+"""Energies made of networks, built from what a scene needs."""

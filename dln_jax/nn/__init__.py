@@ -1,0 +1,1 @@
+"""Networks: functions of x that know no physics."""

@@ -1,0 +1,62 @@
+"""Symbols, units and shapes that every floor shares.
+
+| symbol | shape | unit | meaning |
+|---|---|---|---|
+| `d` | | | degrees of freedom |
+| `N` | | | samples |
+| `q` | [d] | rad or m | generalised coordinates |
+| `qd`, `qdd` | [d] | 1/s, 1/s² | their first and second time derivatives |
+| `p`, `pd` | [d] | | generalised momentum dL/dqd and its rate |
+| `tau` | [d] | N m or N | generalised force |
+| `M(q)` | [d, d] | | mass matrix |
+| `c(q, qd)` | [d] | N m or N | Coriolis and centrifugal force |
+| `g(q)` | [d] | N m or N | force of the potential ("gravity") |
+| `dt` | | s | time step |
+
+Equation of motion: `tau = M(q) qdd + c(q, qd) + g(q)`, plus `dD/dqd` where there is friction.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+Vector = Float[Array, "d"]
+Matrix = Float[Array, "d d"]
+
+Lagrangian = Callable[[Array, Array], Array]
+"""L(q, qd) -> scalar, in J."""
+Potential = Callable[[Array], Array]
+"""V(q) -> scalar, in J."""
+Dissipation = Callable[[Array, Array], Array]
+"""Rayleigh function D(q, qd) -> scalar, in W; friction takes the force dD/dqd."""
+CholeskyFactor = Callable[[Array], Array]
+"""q -> lower triangular L [d, d] with M(q) = L Lᵀ."""
+
+JointKind = Literal["revolute", "prismatic"]
+
+
+class InputError(ValueError):
+    """A user's input is wrong; the message says what was wrong, what was expected and what to do."""
+
+
+class Needs(NamedTuple):
+    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
+
+    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON.
+    """
+
+    joints: tuple[JointKind, ...]
+    """Kind of each joint: a revolute angle enters a model as cos and sin, a prismatic displacement as it is."""
+    gravity: bool = True
+    """Whether there is a potential V(q) (weight, springs)."""
+    friction: bool = False
+    """Whether there is a Rayleigh dissipation function D(q, qd)."""
+    actuation: tuple[tuple[float, ...], ...] | None = None
+    """Rows of the matrix B [d, u] in tau = B control; `None` when each coordinate has its own motor."""
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """d."""
+        return len(self.joints)

@@ -1,0 +1,1 @@
+"""Command lines: thin layers from arguments to library calls to files and figures."""

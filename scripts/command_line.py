@@ -1,0 +1,86 @@
+"""What the command lines share: errors as one line, names for scenes, and folders for runs."""
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import tyro
+
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "two-link-arm": two_link_arm,
+    "two-link-arm-hanging": lambda: two_link_arm(zero="hanging"),
+    "pendulum": pendulum,
+    "double-pendulum": double_pendulum,
+    "cart-pole": cart_pole,
+    **{f"chain-{d}": (lambda d=d: chain(d)) for d in range(1, 13)},
+}
+
+Arguments = TypeVar("Arguments")
+
+
+def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
+    """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130."""
+    # Data and references are float64; models state their own precision.
+    jax.config.update("jax_enable_x64", True)
+    given = tyro.cli(arguments, description=sys.modules[main.__module__].__doc__)
+    try:
+        main(given)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def scene_named(name: str) -> Scene:
+    """The scene of a name; `InputError` lists the names."""
+    if name not in SCENES:
+        raise InputError(f"scene '{name}' is unknown; choose from {', '.join(SCENES)}")
+    return SCENES[name]()
+
+
+def new_folder(path: Path | None, default: str) -> Path:
+    """Creates the folder for a run: the path given, or the first free number behind `runs/default`.
+
+    Raises:
+        InputError: the folder holds something already, or cannot be created.
+    """
+    if path is None:
+        number = 1
+        while (path := Path("runs") / f"{default}-{number}").exists():
+            number += 1
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path} is not empty; choose another --out, or --resume the run in it")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot create the folder ({error.strerror}); choose another --out") from error
+    return path
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes JSON, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(values, indent=2) + "\n")
+    partial.replace(path)
+
+
+def cache_folder() -> Path:
+    """Folder for generated default data: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "dln_jax"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,31 @@
+"""The data that scripts use when they are given none: generated once, then read from the cache."""
+
+import os
+from pathlib import Path
+
+from dln_jax.data import generators, schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.scenes.scene import Scene
+from scripts.command_line import cache_folder
+
+CHARACTERS_TEST = ("e", "q", "v")
+"""Test letters of the published protocol."""
+
+_VERSION = 1  # of the generators' output; a change makes a new file instead of reading a stale one
+
+
+def default_data(scene: Scene) -> Trajectories:
+    """Letters for the two-link arm; for any other scene random states, which exercise every term."""
+    kind = "characters" if scene.name == "two-link-arm" else "uniform"
+    path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
+    if not path.exists():
+        data = generators.characters() if kind == "characters" else generators.uniform(scene)
+        _save_once(path, data)
+    return schema.load(path)
+
+
+def _save_once(path: Path, data: Trajectories) -> None:
+    """Two processes may generate at the same time: each writes its own file, and one rename wins."""
+    own = path.with_name(f"{path.stem}-{os.getpid()}.npz")
+    schema.save(own, data, overwrite=True)
+    own.replace(path)

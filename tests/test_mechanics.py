@@ -1,0 +1,175 @@
+"""Generic mechanics against the textbook, the structured path against the generic one, and the laws of both."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dln_jax.mechanics import lagrangian, natural
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.scene import (
+    Scene,
+    closed_form_decomposition,
+    closed_form_forward_dynamics,
+    closed_form_inverse_dynamics,
+    dynamics,
+)
+from dln_jax.scenes.two_link_arm import two_link_arm
+
+SCENES = [
+    two_link_arm(),
+    two_link_arm(zero="hanging"),
+    pendulum(),
+    pendulum(acceleration=0.0, friction=0.3),
+    double_pendulum(friction=0.2),
+    cart_pole(),
+    chain(1),
+    chain(5),
+    chain(12),
+]
+
+
+class Answers(NamedTuple):
+    """Everything that one system says of a batch of states."""
+
+    tau: jax.Array
+    accelerations: jax.Array
+    energy: jax.Array
+    mass: jax.Array
+    parts: object
+    power: jax.Array
+
+
+def ask(system: Dynamics, q, qd, qdd, tau) -> Answers:
+    return Answers(
+        tau=system.inverse_dynamics(q, qd, qdd),
+        accelerations=system.forward_dynamics(q, qd, tau),
+        energy=system.energy(q, qd),
+        mass=system.mass_matrix(q, qd),
+        parts=system.decompose(q, qd, qdd),
+        power=jax.jvp(system.energy, (q, qd), (qd, qdd))[1],
+    )
+
+
+def natural_twin(scene: Scene) -> Dynamics:
+    def cholesky(q):
+        return jnp.linalg.cholesky(scene.mass_matrix(q))
+
+    return natural.dynamics(natural.NaturalSystem(cholesky, scene.potential, scene.dissipation))
+
+
+@pytest.fixture(scope="module", params=SCENES, ids=lambda scene: scene.name + scene.needs.friction * "-friction")
+def answers(request):
+    """A scene, 1000 random states, and the answers of both paths to them."""
+    scene = request.param
+    d = scene.needs.degrees_of_freedom
+    q, qd, qdd, tau = 2 * jax.random.normal(jax.random.key(0), (4, 1000, d))
+
+    # Two programs: batched LAPACK calls that run side by side in one can deadlock on two cores.
+    paths = (
+        jax.jit(jax.vmap(lambda *state, system=system: ask(system, *state)))
+        for system in (dynamics(scene), natural_twin(scene))
+    )
+    return scene, (q, qd, qdd, tau), *(path(q, qd, qdd, tau) for path in paths)
+
+
+def relative_error(got, expected):
+    return float(jnp.max(jnp.abs(got - expected)) / jnp.max(jnp.abs(expected)))
+
+
+def test_generic_mechanics_equals_the_textbook(answers):
+    scene, (q, qd, qdd, tau), generic, _ = answers
+    expected = jax.vmap(lambda *state: closed_form_inverse_dynamics(scene, *state))(q, qd, qdd)
+    assert relative_error(generic.tau, expected) < 1e-12
+    expected = jax.vmap(lambda *state: closed_form_forward_dynamics(scene, *state))(q, qd, tau)
+    # An ill-conditioned M amplifies rounding in any method.
+    condition = float(jnp.max(jnp.linalg.cond(generic.mass)))
+    assert relative_error(generic.accelerations, expected) < max(1e-12, 1e-15 * condition)
+    np.testing.assert_allclose(generic.mass, jax.vmap(scene.mass_matrix)(q), rtol=1e-12, atol=1e-13)
+
+
+def test_decomposition_equals_the_textbook_and_sums_to_the_total(answers):
+    scene, (q, qd, qdd, _), generic, structured = answers
+    expected = jax.vmap(lambda *state: closed_form_decomposition(scene, *state))(q, qd, qdd)
+    scale = float(jnp.max(jnp.abs(generic.tau)))
+    friction = jnp.zeros_like(q)
+    if scene.dissipation is not None:
+        friction = jax.vmap(jax.grad(scene.dissipation, argnums=1))(q, qd)
+    for got in (generic, structured):
+        for part, truth in zip(got.parts, expected, strict=True):
+            np.testing.assert_allclose(part, truth, atol=1e-12 * scale)
+        np.testing.assert_allclose(sum(got.parts) + friction, got.tau, atol=1e-12 * scale)
+
+
+def test_structured_path_equals_generic_path(answers):
+    _, _, generic, structured = answers
+    assert relative_error(structured.tau, generic.tau) < 1e-10
+    assert relative_error(structured.accelerations, generic.accelerations) < 1e-10
+    assert relative_error(structured.mass, generic.mass) < 1e-10
+    assert relative_error(structured.energy, generic.energy) < 1e-10
+
+
+def test_power_balance(answers):
+    """dE/dt = qdᵀ tau - qdᵀ dD/dqd."""
+    scene, (q, qd, _, _), generic, structured = answers
+    for got in (generic, structured):
+        supplied = jnp.sum(qd * got.tau, axis=1)
+        if scene.dissipation is not None:
+            supplied -= jnp.sum(qd * jax.vmap(jax.grad(scene.dissipation, argnums=1))(q, qd), axis=1)
+        np.testing.assert_allclose(got.power, supplied, atol=1e-12 * float(jnp.max(jnp.abs(supplied))))
+
+
+@functools.cache
+def round_trip(d):
+    """Both paths' residual of inverse after forward, and of the momentum, compiled once per size."""
+
+    @jax.jit
+    def residuals(weights, q, qd, tau):
+        def cholesky(q):
+            return jnp.tril(jnp.tanh(weights @ q), -1) + jnp.diag(1.0 + jnp.cos(q) ** 2)
+
+        system = natural.NaturalSystem(cholesky, lambda q: jnp.sum(jnp.sin(q) ** 2))
+        L = natural.lagrangian(system)
+        paths = natural.dynamics(system), lagrangian.dynamics(L)
+        residuals = [path.inverse_dynamics(q, qd, path.forward_dynamics(q, qd, tau)) - tau for path in paths]
+        return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.momentum(system, q, qd)])
+
+    return residuals
+
+
+@settings(max_examples=60, deadline=None)
+@given(d=st.integers(1, 6), seed=st.integers(0, 2**16))
+def test_inverse_after_forward_is_the_identity(d, seed):
+    """Random energies of every size, not only textbook ones."""
+    random = np.random.default_rng(seed)
+    weights = random.normal(size=(d, d, d)) / d
+    assert np.abs(round_trip(d)(weights, *random.normal(size=(3, d)))).max() < 1e-10
+
+
+def test_generic_functions_take_any_lagrangian():
+    """A charged particle in a magnetic field: L is linear in qd as well, and M is not its whole story."""
+
+    def L(q, qd):
+        return 0.5 * jnp.sum(qd**2) + 0.5 * 1.7 * (q[0] * qd[1] - q[1] * qd[0])
+
+    q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
+    acceleration = lagrangian.forward_dynamics(L, q, qd, jnp.zeros(2))
+    np.testing.assert_allclose(acceleration, 1.7 * jnp.array([qd[1], -qd[0]]), rtol=1e-13)
+    assert lagrangian.energy(L, q, qd) == pytest.approx(0.5 * float(qd @ qd), rel=1e-14)
+
+
+def test_a_singular_mass_matrix_is_not_hidden():
+    def L(q, qd):
+        return 0.5 * qd[0] ** 2 - jnp.sum(q**2)
+
+    acceleration = lagrangian.forward_dynamics(L, jnp.ones(2), jnp.ones(2), jnp.zeros(2))
+    assert not jnp.isfinite(acceleration).all()

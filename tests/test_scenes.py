@@ -1,0 +1,120 @@
+"""Scenes against their own kinematics, and against each other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.mechanics import lagrangian
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.scene import actuation_matrix, closed_form_inverse_dynamics
+from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
+from dln_jax.types import InputError
+
+
+def rod_energy(d):
+    """Kinetic and potential energy of uniform rods, by summing mass points along each rod."""
+    nodes, weights = np.polynomial.legendre.leggauss(3)  # exact for the quadratic along a rod
+    nodes, weights = (nodes + 1) / 2, weights / 2
+
+    def points(q):
+        angles = jnp.cumsum(q)
+        directions = jnp.stack([jnp.sin(angles), -jnp.cos(angles)], axis=1)
+        starts = jnp.cumsum(directions, axis=0) - directions
+        return starts[:, None] + nodes[:, None] * directions[:, None]
+
+    return points, np.broadcast_to(weights, (d, 3))
+
+
+def point_masses(positions, masses):
+    return lambda q: jnp.stack(positions(q)), np.array(masses)
+
+
+def swing(angle):
+    return jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+
+
+CARTESIAN = {
+    "pendulum": (
+        pendulum(mass=2.0, length=0.7),
+        *point_masses(lambda q: [0.7 * swing(q[0])], [2.0]),
+    ),
+    "double-pendulum": (
+        double_pendulum(masses=(1.5, 0.5), lengths=(0.8, 1.3)),
+        *point_masses(lambda q: [0.8 * swing(q[0]), 0.8 * swing(q[0]) + 1.3 * swing(q[1])], [1.5, 0.5]),
+    ),
+    "cart-pole": (
+        cart_pole(cart_mass=1.2, pole_mass=0.3, length=0.6),
+        *point_masses(
+            lambda q: [
+                jnp.stack([q[0], 0 * q[0]]),
+                jnp.stack([q[0] + 0.6 * jnp.sin(q[1]), 0.6 * jnp.cos(q[1])]),
+            ],
+            [1.2, 0.3],
+        ),
+    ),
+    **{f"chain-{d}": (chain(d), *rod_energy(d)) for d in (1, 3, 12)},
+}
+
+
+@pytest.mark.parametrize("name", CARTESIAN)
+def test_energies_equal_those_of_the_moving_masses(name):
+    scene, points, masses = CARTESIAN[name]
+    d = scene.needs.degrees_of_freedom
+    q, qd = jax.random.normal(jax.random.key(0), (2, d))
+    position, velocity = jax.jvp(points, (q,), (qd,))
+    kinetic = 0.5 * jnp.sum(masses[..., None] * velocity**2)
+    height = jnp.sum(masses * position[..., 1]) - jnp.sum(masses * points(jnp.zeros(d))[..., 1])
+    total = lagrangian.energy(scene.lagrangian, q, qd)
+    assert total - scene.potential(q) == pytest.approx(float(kinetic), rel=1e-12)
+    assert scene.potential(q) - scene.potential(jnp.zeros(d)) == pytest.approx(9.81 * float(height), rel=1e-11)
+
+
+def test_the_arm_is_a_chain_of_two_with_other_constants():
+    """Published constants of the arm, protocols of Lutter et al., in the form M(q2), c(q, qd), g(q)."""
+    q, qd, qdd = jnp.array([[0.3, -1.1], [0.7, 1.9], [-2.0, 0.4]])
+    c, s = np.cos(-1.1), np.sin(-1.1)
+    first = (1.3727291666666667 + c) * -2.0 + (0.5176145833333333 + 0.5 * c) * 0.4
+    first += -0.5 * s * (2 * 0.7 * 1.9 + 1.9**2) + 2.625 * np.cos(0.3) + 1.5 * np.cos(0.3 - 1.1)
+    second = (0.5176145833333333 + 0.5 * c) * -2.0 + 0.5176145833333333 * 0.4
+    second += 0.5 * s * 0.7**2 + 1.5 * np.cos(0.3 - 1.1)
+    got = closed_form_inverse_dynamics(two_link_arm(), q, qd, qdd)
+    np.testing.assert_allclose(got, [first, second], rtol=1e-13)
+
+
+def test_both_gravity_conventions_are_one_arm_turned_by_a_quarter():
+    turned = jnp.array([jnp.pi / 2, 0.0])
+    q, qd, qdd = jax.random.normal(jax.random.key(1), (3, 2))
+    horizontal, hanging = two_link_arm(), two_link_arm(zero="hanging")
+    np.testing.assert_allclose(
+        closed_form_inverse_dynamics(hanging, q, qd, qdd),
+        closed_form_inverse_dynamics(horizontal, q - turned, qd, qdd),
+        rtol=1e-12,
+    )
+    np.testing.assert_allclose(hanging.tip(q), horizontal.tip(q - turned), rtol=1e-12)
+
+
+def test_inverse_kinematics_reaches_the_tip():
+    tips = jax.random.uniform(jax.random.key(2), (100, 2), minval=0.2, maxval=1.3)
+    angles = jax.vmap(joint_angles)(tips)
+    np.testing.assert_allclose(jax.vmap(two_link_arm().tip)(angles), tips, rtol=1e-12)
+    assert (angles[:, 1] > 0).all()
+    assert jnp.isnan(joint_angles(jnp.array([3.0, 0.0]))).all()
+
+
+def test_needs_say_what_a_scene_has():
+    assert cart_pole().needs.joints == ("prismatic", "revolute")
+    np.testing.assert_array_equal(actuation_matrix(cart_pole().needs), [[1.0], [0.0]])
+    np.testing.assert_array_equal(actuation_matrix(chain(3).needs), np.eye(3))
+    weightless = pendulum(acceleration=0.0)
+    assert not weightless.needs.gravity and weightless.potential is None and weightless.gravity is None
+    assert pendulum(friction=0.1).needs.friction and not pendulum().needs.friction
+
+
+@pytest.mark.parametrize("d", [0, -1])
+def test_a_chain_without_links_is_refused(d):
+    with pytest.raises(InputError, match="at least 1"):
+        chain(d)
