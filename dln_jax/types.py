@@ -41,6 +41,13 @@ class InputError(ValueError):
     """A user's input is wrong; the message says what was wrong, what was expected and what to do."""
 
 
+def require_positive(**numbers: int | float) -> None:
+    """Raises `InputError` that names the first number that is not positive (NaN is not)."""
+    for name, value in numbers.items():
+        if not value > 0:
+            raise InputError(f"{name} is {value}; expected a positive number")
+
+
 class Needs(NamedTuple):
     """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
 

@@ -24,11 +24,10 @@ from dln_jax.deploy.load import build, load_run, save_model
 from dln_jax.evaluation import figures
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.metrics import errors, predictions
-from dln_jax.learning.fit import require_positive
-from dln_jax.learning.train import Settings, Training, data_type, has_checkpoint, train
+from dln_jax.learning.train import Progress, Settings, Training, check, data_type, has_checkpoint, train
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, Needs, require_positive
 from scripts.command_line import new_folder, run, scene_named, write_json
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.progress import progress
@@ -57,7 +56,7 @@ class Arguments:
     """Optimiser steps."""
     batch: int = 512
     """Samples per step."""
-    learning_rate: float = 1e-2
+    learning_rate: float = 5e-3
     """Peak of the warm-up and cosine schedule."""
     weight_decay: float = 1e-5
     """Of AdamW."""
@@ -104,13 +103,18 @@ def main(given: Arguments) -> None:
     write_json(folder / CONFIG, stored_settings(given))
     announce(console, task)
     with progress(task.settings.steps) as show:
+
+        def report(at: Progress) -> None:
+            text = f"loss {at.loss:.2e}  validation {at.validation:.2e} (N m)²"
+            show(min(int(at.step), task.settings.steps), text)
+
         training = train(
             model,
             task.sets,
             task.settings,
             directory=folder,
             resume=given.resume and has_checkpoint(folder),
-            report=lambda at: show(at.step, f"loss {at.loss:.2e}  validation {at.validation:.2e} (N m)²"),
+            report=report,
         )
     save_model(folder, task.description, training.parameters)
     metrics = evaluate(folder, task, training, draw=given.figures)
@@ -155,6 +159,7 @@ def prepare(given: Arguments) -> Task:
     }
     settings = Settings(**{field: getattr(given, field) for field in Settings._fields})
     sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
+    check(sets, settings)
     return Task(name, sets, scene, needs, origin, description, settings)
 
 
@@ -217,9 +222,10 @@ def evaluate(folder: Path, task: Task, training: Training, *, draw: bool) -> dic
         if task.scene is not None and task.scene.tip is not None:
             paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
             paths.savefig(folder / "tip_paths.png")
+    validation = {"validation_mse": min(at.validation for at in training.history)} if training.history else {}
     return {
         **errors(predicted, test),
-        "validation_mse": min(at.validation for at in training.history),
+        **validation,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)),
         "steps": training.stop.step,
         "best_step": training.best_step,

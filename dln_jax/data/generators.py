@@ -21,7 +21,7 @@ from dln_jax.scenes.scene import (
     closed_form_inverse_dynamics,
 )
 from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -44,7 +44,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     The outlines come from matplotlib's bundled font, smoothed; angles, rates and torques are exact derivatives of
     the tip's path through the inverse kinematics and the closed-form equations of motion.
     """
-    _require_positive("dt", dt)
+    require_positive(dt=dt)
     paths = [letter_path(letter) for letter in letters]
     times = [np.arange(0.0, path.duration, dt) for path in paths]
 
@@ -89,8 +89,13 @@ def uniform(
     Bounds are in rad or m, 1/s, 1/s² and N m or N. A fully actuated scene draws accelerations; an under-actuated one
     draws controls, from which the accelerations follow.
     """
-    for name, value in (("samples", samples), ("position_bound", position_bound), ("rate_bound", rate_bound)):
-        _require_positive(name, value)
+    require_positive(
+        samples=samples,
+        position_bound=position_bound,
+        rate_bound=rate_bound,
+        acceleration_bound=acceleration_bound,
+        control_bound=control_bound,
+    )
     d = scene.needs.degrees_of_freedom
     random = np.random.default_rng(seed)
     q, qd = (random.uniform(-bound, bound, (samples, d)) for bound in (position_bound, rate_bound))
@@ -123,8 +128,7 @@ def free_swing(
     Raises:
         InputError: the integration does not finish.
     """
-    for name, value in (("trajectories", trajectories), ("steps", steps), ("dt", dt), ("tolerance", tolerance)):
-        _require_positive(name, value)
+    require_positive(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
     d = scene.needs.degrees_of_freedom
     if starts is None:
         starts = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, (trajectories, d))
@@ -203,8 +207,3 @@ def _complete(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
 
 def _batched(function, scene: Scene):
     return jax.jit(jax.vmap(lambda *state: function(scene, *state)))
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not value > 0:
-        raise InputError(f"{name} is {value}; expected a positive number")

@@ -26,7 +26,7 @@ def force_decomposition(
     # Single states are no curves; they are compared point by point.
     style = "-" if len(samples) > 2 * len(shown) else "."
     rows = min(data.degrees_of_freedom, most_joints)
-    figure = _figure(13, 1.1 + 1.9 * rows)
+    figure = _figure(13.0, 1.1 + 1.9 * rows)
     axes = figure.subplots(rows, len(PARTS), sharex=True, squeeze=False)
     for row in range(rows):
         for axis, key, title in zip(axes[row], PARTS, TITLES, strict=True):
@@ -53,13 +53,13 @@ def force_decomposition(
                 axis.set_xlabel("test sample")
         axes[row, 0].set_ylabel(f"joint {row + 1}, {_force_unit(data, row)}")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=2, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
 def training_curve(history: Sequence[Progress], *, best_step: int) -> Figure:
     """Training loss, validation error and test error against steps; the test error decided nothing."""
-    figure = _figure(7, 4.2)
+    figure = _figure(7.0, 4.2)
     axis = figure.subplots()
     steps = [progress.step for progress in history]
     curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, "validation torque MSE"))

@@ -12,8 +12,6 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from dln_jax.types import InputError
-
 Parameters = Any
 Data = Any
 """A pytree of arrays with samples on axis 0."""
@@ -35,8 +33,8 @@ class FitState(NamedTuple):
     """[] lowest validation value so far."""
     best_step: Array
     """[] step at which it was reached."""
-    failed: Array
-    """[] whether the loss or its gradient stopped being finite; the parameters are those before."""
+    failed_step: Array
+    """[] steps after which the loss was not finite, -1 while it is; the rest is the state before that dispatch."""
 
 
 class Record(NamedTuple):
@@ -56,6 +54,7 @@ class Stop(NamedTuple):
     reason: str
     """"finished", "no improvement" or "not finite"."""
     step: int
+    """Steps taken; for "not finite" those after which the loss was not."""
 
 
 class Fit(NamedTuple):
@@ -98,47 +97,47 @@ def make_fit(
     batches = samples // batch
     epochs = -(-steps // batches)
 
-    def step(state: FitState, indices: Array) -> tuple[FitState, Array]:
-        value, gradient = jax.value_and_grad(loss)(state.parameters, jax.tree.map(lambda a: a[indices], train))
+    def step(state: FitState, batch: Data) -> tuple[FitState, Array]:
+        value, gradient = jax.value_and_grad(loss)(state.parameters, batch)
         updates, optimiser_state = optimiser.update(gradient, state.optimiser, state.parameters)
-        parameters = optax.apply_updates(state.parameters, updates)
-        finite = jnp.isfinite(value) & jnp.isfinite(optax.tree.norm(updates)) & ~state.failed
-
-        def keep(new, old):
-            return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
-
         state = state._replace(
-            parameters=keep(parameters, state.parameters),
-            optimiser=keep(optimiser_state, state.optimiser),
-            step=state.step + finite,
-            failed=~finite,
+            parameters=optax.apply_updates(state.parameters, updates),
+            optimiser=optimiser_state,
+            step=state.step + 1,
+            # The first loss that is not finite; the steps after it are thrown away with the dispatch.
+            failed_step=jnp.where(jnp.isfinite(value) | (state.failed_step >= 0), state.failed_step, state.step),
         )
         return state, value
 
-    def run_epoch(state: FitState, _) -> tuple[FitState, Array]:
+    def epoch(state: FitState) -> tuple[FitState, Array]:
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.epoch)
-        order = jax.random.permutation(key, samples)[: batches * batch].reshape(batches, batch)
-        state, losses = jax.lax.scan(step, state, order)
+        order = jnp.argsort(jax.random.bits(key, (samples,)))[: batches * batch]
+        shuffled = jax.tree.map(lambda a: a[order].reshape(batches, batch, *a.shape[1:]), train)
+        state, losses = jax.lax.scan(step, state, shuffled)
         return state._replace(epoch=state.epoch + 1), losses.mean()
 
-    def dispatch(state: FitState, count: Array) -> tuple[FitState, Array]:
+    def dispatch(before: FitState, count: Array) -> tuple[FitState, Array]:
+        dtype = before.best_validation.dtype
+
         def body(index, carry):
             state, total = carry
-            state, value = run_epoch(state, None)
+            state, value = epoch(state)
             return state, total + value
 
-        state, total = jax.lax.fori_loop(0, count, body, (state, jnp.zeros((), jnp.float32)))
+        state, total = jax.lax.fori_loop(0, count, body, (before, jnp.zeros((), dtype)))
+        finite = jnp.isfinite(optax.tree.norm(state.parameters))
+        failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
+        # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
+        state = _choose(failed_step < 0, state, before)._replace(failed_step=failed_step)
         value = validate(state.parameters)
-        better = (value < state.best_validation) & ~state.failed
+        better = value < state.best_validation
         state = state._replace(
-            best_parameters=jax.tree.map(
-                lambda new, old: jnp.where(better, new, old), state.parameters, state.best_parameters
-            ),
+            best_parameters=_choose(better, state.parameters, state.best_parameters),
             best_validation=jnp.where(better, value, state.best_validation),
             best_step=jnp.where(better, state.step, state.best_step),
         )
         shown = jnp.nan if monitor is None else monitor(state.parameters)
-        return state, jnp.stack([jnp.asarray(v, jnp.float32) for v in (total / count, value, shown)])
+        return state, jnp.stack([jnp.asarray(v, dtype) for v in (total / count, value, shown)])
 
     def init(parameters: Parameters, seed: int) -> FitState:
         value = jnp.asarray(jnp.inf, jnp.result_type(*jax.tree.leaves(parameters)))
@@ -151,7 +150,7 @@ def make_fit(
             best_parameters=jax.tree.map(jnp.copy, parameters),
             best_validation=value,
             best_step=jnp.zeros((), jnp.int32),
-            failed=jnp.zeros((), bool),
+            failed_step=jnp.asarray(-1, jnp.int32),
         )
 
     return Fit(
@@ -178,19 +177,18 @@ def run(
         on_dispatch: called after every dispatch, to report and to store; the state is valid only during the call.
     """
     while int(state.epoch) < fit.epochs:
-        if bool(state.failed):
-            return state, Stop("not finite", int(state.step))
+        if int(state.failed_step) >= 0:
+            return state, Stop("not finite", int(state.failed_step))
         if int(state.step) - int(state.best_step) >= patience:
             return state, Stop("no improvement", int(state.step))
         count = min(fit.epochs_per_dispatch, fit.epochs - int(state.epoch))
         state, values = fit.dispatch(state, count)
+        if int(state.failed_step) >= 0:
+            continue
         loss, validation, monitor = map(float, values)
         on_dispatch(state, Record(int(state.step), loss, validation, monitor))
-    return state, Stop("not finite" if bool(state.failed) else "finished", int(state.step))
+    return state, Stop("finished", int(state.step))
 
 
-def require_positive(**numbers: float) -> None:
-    """Raises `InputError` that names the first number that is not positive."""
-    for name, value in numbers.items():
-        if not value > 0:
-            raise InputError(f"{name} is {value}; expected a positive number")
+def _choose(condition: Array, yes: Parameters, no: Parameters) -> Parameters:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

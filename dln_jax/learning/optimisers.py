@@ -6,12 +6,17 @@ import optax
 def adamw(
     *,
     steps: int,
-    learning_rate: float = 1e-2,
+    learning_rate: float = 5e-3,
     weight_decay: float = 1e-5,
+    second_moment_decay: float = 0.99,
     warm_up_share: float = 0.02,
     final_share: float = 1e-3,
 ) -> optax.GradientTransformation:
-    """AdamW with linear warm-up to `learning_rate` and cosine decay to `final_share` of it after `steps` steps."""
+    """AdamW with linear warm-up to `learning_rate` and cosine decay to `final_share` of it after `steps` steps.
+
+    The default decay of the second moment forgets within a hundred steps; residuals shrink by orders of magnitude
+    during a run, and a longer memory keeps the steps too small (validation torque MSE 9e-7 against 4e-6 with 0.999).
+    """
     warm_up = max(1, round(warm_up_share * steps))
     schedule = optax.warmup_cosine_decay_schedule(
         init_value=learning_rate / warm_up,
@@ -20,4 +25,4 @@ def adamw(
         decay_steps=max(steps, warm_up + 1),
         end_value=final_share * learning_rate,
     )
-    return optax.adamw(schedule, weight_decay=weight_decay)
+    return optax.adamw(schedule, b2=second_moment_decay, weight_decay=weight_decay)

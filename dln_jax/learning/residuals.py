@@ -34,8 +34,8 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
         InputError: no channel varies, so that the data cannot tell any Lagrangian from its multiples.
     """
     deviation = data.tau.std(axis=0)
-    # Rounding leaves a constant channel with a deviation of some 1e-17 of its size.
-    varies = deviation > 1e-12 * (abs(data.tau).max(axis=0) + 1e-300)
+    # Rounding leaves a constant channel with a deviation of some 1e-17 of the torques it was computed from.
+    varies = deviation > 1e-12 * abs(data.tau).max()
     if not varies.any():
         raise InputError(
             "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "

@@ -1,6 +1,7 @@
 """Training of a model of dynamics on trajectories: split in, best parameters out, resumable at any dispatch."""
 
 import hashlib
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from dln_jax.learning import checkpoints, fit
 from dln_jax.learning.optimisers import adamw
 from dln_jax.learning.residuals import samples, torque_loss, torque_scale
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 CHECKPOINT = "checkpoint"
 """Name of the file pair in a run's folder from which it can continue."""
@@ -26,7 +27,7 @@ class Settings(NamedTuple):
 
     steps: int = 20_000
     batch: int = 512
-    learning_rate: float = 1e-2
+    learning_rate: float = 5e-3
     """Peak, reached after warm-up and followed by cosine decay."""
     weight_decay: float = 1e-5
     patience: int = 10_000
@@ -39,7 +40,7 @@ class Settings(NamedTuple):
 class Progress(NamedTuple):
     """State of a run after a dispatch; `monitor` is the test error, shown and never used for a choice."""
 
-    step: int
+    step: float
     loss: float
     validation: float
     monitor: float
@@ -77,6 +78,18 @@ def data_type(precision: str) -> Any:
     return kinds[precision]
 
 
+def check(sets: Split, settings: Settings) -> None:
+    """Raises `InputError` if the settings are out of range, or the torques to be fitted do not vary."""
+    require_positive(
+        steps=settings.steps,
+        batch=settings.batch,
+        learning_rate=settings.learning_rate,
+        patience=settings.patience,
+    )
+    data_type(settings.precision)
+    torque_scale(sets.train)
+
+
 def train(
     model: Model,
     sets: Split,
@@ -97,14 +110,9 @@ def train(
         report: called after every dispatch.
 
     Raises:
-        InputError: settings out of range, data whose torques do not vary, or a checkpoint that does not fit.
+        InputError: what `check` finds, or a checkpoint that does not fit.
     """
-    fit.require_positive(
-        steps=settings.steps,
-        batch=settings.batch,
-        learning_rate=settings.learning_rate,
-        patience=settings.patience,
-    )
+    check(sets, settings)
     dtype = data_type(settings.precision)
     scale = torque_scale(sets.train).astype(dtype)
     arrays = [samples(data, dtype) for data in sets]
@@ -138,7 +146,7 @@ def train(
         began = time.perf_counter()
         if directory is not None:
             # NaN is no JSON.
-            facts = {**identity, "history": [[None if x != x else x for x in progress] for progress in history]}
+            facts = {**identity, "history": [[None if math.isnan(x) else x for x in row] for row in history]}
             checkpoints.save_tree(directory, CHECKPOINT, state, facts, number=record.step)
         report(history[-1])
         storing += time.perf_counter() - began
@@ -173,4 +181,5 @@ def _restore(directory: Path, like: fit.FitState, identity: dict[str, Any]) -> t
         if manifest.get(key) != identity[key]:
             raise InputError(f"{directory}: the run was started with other {key}; {remedy} it was started with")
     state = checkpoints.load_tree(directory, CHECKPOINT, like)
-    return state, [Progress(*(float("nan") if x is None else x for x in values)) for values in manifest["history"]]
+    history = [Progress(*(math.nan if value is None else value for value in row)) for row in manifest["history"]]
+    return state, history

@@ -1,0 +1,20 @@
+"""A report as a table for the terminal."""
+
+from typing import Any
+
+from rich.table import Table
+
+from dln_jax.evaluation.report import Row
+
+
+def report_table(rows: list[Row], facts: dict[str, Any]) -> Table:
+    """One line per row; the caption states the conditions."""
+    caption = f"{facts['machine']}; {facts['dtype']}; {facts['threads']} threads; {facts['command']}"
+    table = Table("case", "quantity", "value", "unit", "reference", "to reach", "pass", caption=caption)
+    for row in rows:
+        sign = "≥" if row.at_least else "≤"
+        bound = "" if row.bound is None else f"{sign} {row.bound:.3g}"
+        reference = "" if row.reference is None else f"{row.reference:.3g}"
+        passed = {True: "yes", False: "[bold red]no[/]", None: ""}[row.passed]
+        table.add_row(row.case, row.quantity, f"{row.value:.3g}", row.unit, reference, bound, passed)
+    return table

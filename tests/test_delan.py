@@ -1,0 +1,133 @@
+"""The structured model: physics for random parameters, and no work for what a scene lacks."""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dln_jax.mechanics import lagrangian
+from dln_jax.models.delan import make_delan
+from dln_jax.models.features import joint_features
+from dln_jax.types import Needs
+
+
+@functools.cache
+def small(d, friction=False, gravity=True, prismatic=False):
+    joints = ("prismatic" if prismatic else "revolute",) * d
+    needs = Needs(joints, gravity=gravity, friction=friction)
+    return make_delan(needs, width=6, depth=2, dtype=jnp.float64)
+
+
+@functools.cache
+def checks(d):
+    """Mass matrix, residual of inverse after forward, energy rate minus power, structured minus generic torque."""
+    model = small(d)
+
+    @jax.jit
+    def evaluate(seed, q, qd, tau):
+        system = model.apply(model.init(jax.random.key(seed)))
+        qdd = system.forward_dynamics(q, qd, tau)
+        again = system.inverse_dynamics(q, qd, qdd)
+        rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
+
+        def L(q, qd):
+            kinetic = 0.5 * qd @ system.mass_matrix(q) @ qd
+            return 2 * kinetic - system.energy(q, qd)
+
+        generic = lagrangian.inverse_dynamics(L, q, qd, qdd)
+        total = sum(system.decompose(q, qd, qdd))
+        return system.mass_matrix(q), again - tau, rate - qd @ tau, generic - tau, total - tau
+
+    return evaluate
+
+
+@settings(max_examples=60, deadline=None)
+@given(d=st.integers(1, 6), seed=st.integers(0, 2**16))
+def test_physics_holds_for_random_parameters(d, seed):
+    state = np.random.default_rng(seed).normal(size=(3, d))
+    mass, *residuals = checks(d)(seed, *state)
+    np.testing.assert_allclose(mass, mass.T, atol=1e-14)
+    assert np.linalg.eigvalsh(mass).min() > 0
+    for residual in residuals:
+        assert np.abs(residual).max() < 1e-10
+
+
+def test_dissipation_takes_power_away():
+    model = small(2, friction=True)
+    parameters = model.init(jax.random.key(0))
+    system = model.apply(parameters)
+    q, qd = jnp.array([[0.3, -0.7], [1.0, 2.0]])
+    qdd = system.forward_dynamics(q, qd, jnp.zeros(2))
+    rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
+    coefficients = jax.nn.softplus(next(iter(parameters["~"].values())))
+    assert float(rate) == pytest.approx(-float(coefficients @ qd**2), rel=1e-10)
+    assert float(rate) < 0
+
+
+def flops(**kinds):
+    """Floating-point operations and parameters of the inverse model."""
+    model = small(3, **kinds)
+    parameters = jax.eval_shape(model.init, jax.random.key(0))
+    states = (jax.ShapeDtypeStruct((3,), jnp.float64),) * 3
+    compiled = jax.jit(lambda p, *s: model.apply(p).inverse_dynamics(*s)).lower(parameters, *states).compile()
+    return compiled.cost_analysis()["flops"], sum(leaf.size for leaf in jax.tree.leaves(parameters))
+
+
+def test_absent_terms_cost_nothing():
+    full, full_parameters = flops(friction=True)
+    frictionless, frictionless_parameters = flops()
+    weightless, weightless_parameters = flops(gravity=False)
+    assert weightless < 0.75 * frictionless < 0.75 * full
+    potential = 6 * 6 + 6 + 6 * 6 + 6 + 6 + 1
+    assert full_parameters - frictionless_parameters == 3
+    assert frictionless_parameters - weightless_parameters == potential
+
+
+def test_prismatic_joints_take_no_trigonometry():
+    def text(**kinds):
+        model = small(2, **kinds)
+        q = jnp.zeros(2)
+        return str(jax.make_jaxpr(model.apply(model.init(jax.random.key(0))).mass_matrix)(q))
+
+    assert " cos" in text() and " sin" in text()
+    assert " cos" not in text(prismatic=True) and " sin" not in text(prismatic=True)
+    mixed = joint_features(Needs(("prismatic", "revolute")), jnp.array([2.0, 0.0]))
+    np.testing.assert_array_equal(mixed, [1.0, 0.0, 2.0])
+
+
+def test_a_full_turn_changes_nothing():
+    system = small(2).apply(small(2).init(jax.random.key(1)))
+    q, qd, qdd = jnp.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]])
+    turned = q + 2 * jnp.pi * jnp.array([1.0, -3.0])
+    np.testing.assert_allclose(
+        system.inverse_dynamics(q, qd, qdd), system.inverse_dynamics(turned, qd, qdd), rtol=1e-11
+    )
+
+
+def test_the_forward_model_is_a_diffrax_vector_field():
+    model = small(2)
+    system = model.apply(model.init(jax.random.key(2)))
+
+    def field(t, state, args):
+        q, qd = state
+        return qd, system.forward_dynamics(q, qd, jnp.zeros_like(q))
+
+    start = (jnp.array([0.5, -0.2]), jnp.zeros(2))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        diffrax.Dopri8(),
+        t0=0.0,
+        t1=2.0,
+        dt0=None,
+        y0=start,
+        saveat=diffrax.SaveAt(ts=jnp.linspace(0, 2, 9)),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
+    )
+    energies = jax.vmap(system.energy)(*solution.ys)
+    assert np.abs(energies - energies[0]).max() < 1e-8
+    assert np.abs(solution.ys[0][-1] - start[0]).max() > 1e-2

@@ -1,0 +1,283 @@
+"""The one pass against autodiff of a plain network, its cost, its ensembles and its Haiku front."""
+
+from functools import partial
+from itertools import pairwise
+
+import haiku as hk
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.nn import activations, differential_mlp, ensembles, haiku_layers
+from dln_jax.nn.differential_mlp import value, value_and_jacobian, value_jacobian_and_hessian
+from dln_jax.types import InputError
+
+PLAIN = {
+    "softplus": lambda x: jnp.logaddexp(x, 0.0),
+    "tanh": jnp.tanh,
+    "cos": jnp.cos,
+    "sin": jnp.sin,
+    "silu": jax.nn.silu,
+    "gelu": partial(jax.nn.gelu, approximate=False),
+    "linear": lambda x: x,
+    "quadratic": jnp.square,
+    "cubic": lambda x: x**3,
+}
+TANH = activations.tanh
+# Each program here is compiled for one call: a quick compilation is worth more than fast code (4 times, measured).
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+compiled = partial(jax.jit, compiler_options=QUICK)
+
+
+def plain_network(layers, x, function):
+    for weight, bias in layers[:-1]:
+        x = function(x @ weight + bias)
+    return x @ layers[-1][0] + layers[-1][1]
+
+
+def plain_derivatives(layers, x, function):
+    """Value, Jacobian and Hessian by autodiff."""
+    network = lambda x: plain_network(layers, x, function)  # noqa: E731
+    return network(x), jax.jacfwd(network)(x), jax.hessian(network)(x)
+
+
+def random_network(sizes, batch=()):
+    """Layers with biases, and x, made by NumPy: nothing to compile."""
+    random = np.random.default_rng(0)
+    layers = tuple(
+        (jnp.asarray(random.normal(size=(a, b)) / np.sqrt(a)), jnp.asarray(random.normal(size=b) / 2))
+        for a, b in pairwise(sizes)
+    )
+    return layers, jnp.asarray(random.normal(size=(*batch, sizes[0])))
+
+
+def assert_close(got, expected, tolerance=1e-12):
+    """Relative to the largest entry of each array, and absolute below 1."""
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    for ours, theirs in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert ours.shape == theirs.shape and ours.dtype == theirs.dtype
+        scale = max(1.0, np.abs(np.asarray(theirs)).max())
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * scale)
+
+
+# (activation, n, m, depth): all pairs (n, depth), (n, m) and (m, depth), and each activation three times or more.
+CASES = [
+    (list(PLAIN)[(7 * depth + inputs) % 9], inputs, 1 + (inputs + depth) % 3, depth)
+    for depth in range(1, 5)
+    for inputs in range(1, 8)
+]
+
+
+@pytest.mark.parametrize(("name", "inputs", "outputs", "depth"), CASES)
+def test_equals_autodiff_of_a_plain_network(name, inputs, outputs, depth):
+    layers, x = random_network((inputs, *(5, 4, 6, 3)[:depth], outputs))
+    activation = activations.ALL[name]
+
+    @compiled
+    def all_ways(layers, x):
+        return (
+            value_and_jacobian(layers, x, activation=activation),
+            value_jacobian_and_hessian(layers, x, activation=activation),
+            plain_derivatives(layers, x, PLAIN[name]),
+        )
+
+    without_hessian, one_pass, expected = all_ways(layers, x)
+    assert_close(one_pass, expected)
+    assert_close(without_hessian, expected[:2])
+
+
+def test_cases_cover_every_value_and_both_sweeps():
+    names, inputs, outputs, depths = (set(column) for column in zip(*CASES, strict=True))
+    assert names == set(PLAIN) == set(activations.ALL) - {"relu"}
+    assert (inputs, outputs, depths) == (set(range(1, 8)), {1, 2, 3}, {1, 2, 3, 4})
+    assert len({(n, m) for _, n, m, _ in CASES}) == 21 and len({(m, depth) for _, _, m, depth in CASES}) == 12
+    for rule in (differential_mlp.cheaper_jacobian, differential_mlp.cheaper_hessian):
+        assert {rule((n, *(5, 4, 6, 3)[:depth], m)) for _, n, m, depth in CASES} == {"forward", "backward"}
+
+
+@pytest.mark.parametrize("sweep", ["forward", "backward"])
+def test_either_sweep_is_exact_in_a_batch(sweep, monkeypatch):
+    monkeypatch.setattr(differential_mlp, "cheaper_jacobian", lambda sizes: sweep)
+    monkeypatch.setattr(differential_mlp, "cheaper_hessian", lambda sizes: sweep)
+    layers, xs = random_network((3, 5, 4, 2), batch=(6,))
+
+    @compiled
+    @partial(jax.vmap, in_axes=(None, 0))
+    def both(layers, x):
+        one_pass = value_jacobian_and_hessian(layers, x, activation=TANH)
+        first = value_and_jacobian(layers, x, activation=TANH)
+        plain = plain_derivatives(layers, x, jnp.tanh)
+        return (one_pass, first, value(layers, x, activation=TANH)), (plain, plain[:2], plain[0])
+
+    assert_close(*both(layers, xs))
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes"),
+    [
+        ("tanh", (2, 5, 4, 1)),
+        ("silu", (3, 5, 4, 2)),
+        ("gelu", (1, 5, 4, 3)),  # second derivatives go forward
+        ("cos", (7, 6, 1)),
+        ("softplus", (2, 5, 4, 3)),
+    ],
+)
+def test_parameter_gradients_equal_those_through_autodiff(name, sizes):
+    """A loss on value, Jacobian and Hessian; in reverse, and forward as Levenberg-Marquardt may want it."""
+    layers, x = random_network(sizes)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(np.cos(leaf)), layers)
+
+    def loss(layers, derivatives):
+        return sum(jnp.sum(jnp.sin(each)) + jnp.sum(each**2) for each in derivatives(layers))
+
+    ours = lambda layers: value_jacobian_and_hessian(layers, x, activation=activations.ALL[name])  # noqa: E731
+    theirs = lambda layers: plain_derivatives(layers, x, PLAIN[name])  # noqa: E731
+
+    @compiled
+    def gradients(layers):
+        _, along = jax.jvp(lambda layers: loss(layers, ours), (layers,), (direction,))
+        return jax.grad(loss)(layers, ours), jax.grad(loss)(layers, theirs), along
+
+    got, expected, along = gradients(layers)
+    assert_close(got, expected, tolerance=1e-11)
+    products = jax.tree.map(np.vdot, expected, direction)
+    assert_close(along, sum(jax.tree.leaves(products)), tolerance=1e-11)
+
+
+@pytest.mark.parametrize("sizes", [(2, 6, 5, 1), (1, 6, 5, 3)])
+def test_relu_has_no_curvature(sizes):
+    layers, xs = random_network(sizes, batch=(20,))
+    network = jax.vmap(partial(value_jacobian_and_hessian, activation=activations.relu), in_axes=(None, 0))
+    plain = jax.vmap(partial(plain_derivatives, function=jax.nn.relu), in_axes=(None, 0))
+    result = compiled(network)(layers, xs)
+    assert_close(result, compiled(plain)(layers, xs))
+    assert not result[2].any() and result[1].any()
+
+
+def test_without_hidden_layers_it_is_a_linear_map():
+    layers, x = random_network((3, 2))
+    weight, bias = layers[0]
+    expected = x @ weight + bias, weight.T, jnp.zeros((2, 3, 3))
+    assert_close(value_jacobian_and_hessian(layers, x, activation=TANH), expected)
+    assert_close(value_and_jacobian(layers, x, activation=TANH), expected[:2])
+
+
+def test_dtype_is_that_of_the_parameters():
+    def network(key, dtype):
+        layers = differential_mlp.init(key, (2, 4, 4, 1), dtype=dtype)
+        return layers, value_jacobian_and_hessian(layers, jnp.ones(2, dtype), activation=activations.gelu)
+
+    for dtype, expected in ((jnp.float32, jnp.float32), (float, jnp.float64)):  # float: JAX's default, 64 bits here
+        results = jax.eval_shape(partial(network, dtype=dtype), jax.random.key(0))
+        assert {each.dtype for each in jax.tree.leaves(results)} == {jnp.dtype(expected)}
+
+
+def flops(function, *arguments) -> float:
+    return compiled(function).lower(*arguments).compile().cost_analysis()["flops"]
+
+
+def training_loss(derivatives, layers, xs):
+    results = jax.vmap(lambda x: derivatives(layers, x))(xs)
+    return sum(jnp.mean(each**2) for each in results)
+
+
+@pytest.mark.parametrize("inputs", [2, 7])
+def test_one_pass_takes_fewer_operations_than_autodiff(inputs):
+    """Value, Jacobian and Hessian: matrix products 2 + n against 4 + 2n of each weight between hidden layers.
+    Gradient of a training loss: the same, three times."""
+    layers, xs = random_network((inputs, 64, 64, 1), batch=(32,))
+    ours = partial(value_jacobian_and_hessian, activation=TANH)
+    theirs = partial(plain_derivatives, function=jnp.tanh)
+    for wrap in (training_loss, jax.grad(training_loss, argnums=1)):
+        assert flops(partial(wrap, ours), layers, xs) < 0.75 * flops(partial(wrap, theirs), layers, xs)
+
+
+@pytest.mark.parametrize("sizes", [(1, 32, 32, 3), (2, 32, 32, 1), (5, 32, 32, 2), (3, 8, 48, 40)])
+def test_rules_choose_the_sweep_with_fewer_operations(sizes, monkeypatch):
+    layers, xs = random_network(sizes, batch=(16,))
+    for rule, function in (
+        ("cheaper_jacobian", value_and_jacobian),
+        ("cheaper_hessian", value_jacobian_and_hessian),
+    ):
+        chosen, counts = getattr(differential_mlp, rule)(sizes), {}
+        for sweep in ("forward", "backward"):
+            monkeypatch.setattr(differential_mlp, rule, lambda _, sweep=sweep: sweep)
+            counts[sweep] = flops(partial(training_loss, partial(function, activation=TANH)), layers, xs)
+        assert counts[chosen] == min(counts.values()), (rule, counts)
+
+
+def test_ensemble_equals_a_loop_over_its_members():
+    sizes, members, key = (2, 5, 4, 2), 4, jax.random.key(7)
+    normal = jax.nn.initializers.normal(0.5)
+    init = compiled(partial(differential_mlp.init, sizes=sizes, bias=normal))
+    stacked = compiled(partial(ensembles.init, sizes=sizes, members=members, bias=normal))(key)
+    x = jnp.asarray([0.3, -0.8])
+    network = partial(value_jacobian_and_hessian, activation=TANH)
+    single = compiled(network)
+    outputs = []
+    for index, own in enumerate(jax.random.split(key, members)):
+        member = jax.tree.map(lambda leaf, index=index: jnp.asarray(np.asarray(leaf)[index]), stacked)
+        assert_close(member, init(own))
+        outputs.append(jax.tree.map(np.asarray, single(member, x)))
+    statistics = compiled(partial(ensembles.mean_and_spread, network))(stacked, x)
+    for order, of_members in enumerate(zip(*outputs, strict=True)):
+        mean = sum(of_members) / members
+        variance = sum((each - mean) ** 2 for each in of_members) / (members - 1)
+        assert_close(statistics.mean[order], mean)
+        assert_close(statistics.spread[order], np.sqrt(variance))
+
+
+def test_haiku_front_is_the_same_network():
+    def forward(x):
+        first = haiku_layers.layers((2, 5, 1), name="potential", bias=jax.nn.initializers.ones)
+        second = haiku_layers.layers((2, 3, 1), name="potential")
+        results = value_jacobian_and_hessian(first, x, activation=TANH)
+        return results, value(second, x, activation=TANH)
+
+    transformed, x = hk.transform(forward), jnp.asarray([0.3, -0.8])
+    parameters = compiled(transformed.init)(jax.random.key(0), x)
+    assert jax.tree.map(jnp.shape, parameters) == {
+        "potential/layer_0": {"w": (2, 5), "b": (5,)},
+        "potential/layer_1": {"w": (5, 1), "b": (1,)},
+        "potential_1/layer_0": {"w": (2, 3), "b": (3,)},
+        "potential_1/layer_1": {"w": (3, 1), "b": (1,)},
+    }
+    assert parameters["potential/layer_0"]["b"].tolist() == [1.0] * 5
+    assert {leaf.dtype for leaf in jax.tree.leaves(parameters)} == {jnp.dtype(jnp.float64)}
+    layers = tuple((parameters[f"potential/layer_{i}"]["w"], parameters[f"potential/layer_{i}"]["b"]) for i in (0, 1))
+    results, _ = compiled(transformed.apply)(parameters, None, x)
+    assert_close(results, compiled(partial(value_jacobian_and_hessian, activation=TANH))(layers, x))
+
+
+def test_initial_weights_follow_glorot():
+    sizes = (3, 200, 100, 1)
+    layers = compiled(partial(differential_mlp.init, sizes=sizes))(jax.random.key(0))
+    assert [weight.shape for weight, _ in layers] == list(pairwise(sizes))
+    for weight, bias in jax.tree.map(np.asarray, layers):
+        limit = np.sqrt(6 / sum(weight.shape))
+        assert np.abs(weight).max() <= limit and not bias.any()
+        assert float(weight.std()) == pytest.approx(limit / np.sqrt(3), rel=0.15)
+
+
+@pytest.mark.parametrize("function", [value, value_and_jacobian, value_jacobian_and_hessian])
+@pytest.mark.parametrize("shape", [(), (3,), (5, 2), (2, 1)])
+def test_x_of_wrong_shape(function, shape):
+    layers, _ = random_network((2, 4, 1))
+    with pytest.raises(InputError, match=r"x has shape .*expected \(2,\), one state"):
+        function(layers, jnp.zeros(shape), activation=TANH)
+
+
+def test_wrong_layers_and_sizes():
+    (first, last), x = random_network((2, 4, 1))
+    for layers in ((), (last, first), ((first[0], last[1]), last)):
+        with pytest.raises(InputError, match="expected one network"):
+            value(layers, x, activation=TANH)
+    members = jax.tree.map(lambda leaf: leaf[None], (first, last))
+    with pytest.raises(InputError, match=r"ensemble need jax\.vmap"):
+        value_and_jacobian(members, x, activation=TANH)
+    with pytest.raises(InputError, match="1 member; its spread needs two"):
+        ensembles.mean_and_spread(partial(value, activation=TANH), members, x)
+    for sizes in ((), (2,), (2, 0, 1)):
+        with pytest.raises(InputError, match="sizes are"):
+            differential_mlp.init(jax.random.key(0), sizes)
