@@ -30,8 +30,11 @@ def line_fit(optimiser, *, steps=300, batch=16, validate=None, **keywords):
         x, y = batch
         return jnp.mean((parameters[0] * x + parameters[1] - y) ** 2)
 
-    validate = validate or (lambda parameters: loss(parameters, LINE))
-    return fit.make_fit(loss, optimiser, LINE, steps=steps, batch=batch, validate=validate, **keywords)
+    def score(parameters):
+        value = loss(parameters, LINE)
+        return (validate(parameters) if validate else value), value
+
+    return fit.make_fit(loss, optimiser, LINE, steps=steps, batch=batch, score=score, **keywords)
 
 
 def run(prepared, state=None, patience=10**6, until=None):

@@ -45,7 +45,7 @@ class Record(NamedTuple):
     """Mean training loss over the dispatch."""
     validation: float
     monitor: float
-    """Value that is shown and never used for a choice; NaN where nothing is monitored."""
+    """Value that is shown and never used for a choice."""
 
 
 class Stop(NamedTuple):
@@ -76,8 +76,7 @@ def make_fit(
     *,
     steps: int,
     batch: int,
-    validate: Callable[[Parameters], Array],
-    monitor: Callable[[Parameters], Array] | None = None,
+    score: Callable[[Parameters], tuple[Array, Array]],
     steps_per_dispatch: int = 200,
 ) -> Fit:
     """Prepares a fit of `loss(parameters, batch) -> scalar` over minibatches without replacement.
@@ -88,8 +87,7 @@ def make_fit(
         train: arrays with samples on axis 0; a batch larger than that is the whole set.
         steps: steps to take, rounded up to whole epochs.
         batch: samples per step; what is left over of an epoch's permutation is not used in that epoch.
-        validate: value by which the best parameters are chosen, once per dispatch.
-        monitor: value to show beside it, once per dispatch.
+        score: once per dispatch, the value by which the best parameters are chosen, and one that is only shown.
         steps_per_dispatch: steps between two validations, rounded up to whole epochs.
     """
     samples = jax.tree.leaves(train)[0].shape[0]
@@ -129,32 +127,31 @@ def make_fit(
         failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
         # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
         state = _choose(failed_step < 0, state, before)._replace(failed_step=failed_step)
-        value = validate(state.parameters)
+        value, shown = score(state.parameters)
         better = value < state.best_validation
         state = state._replace(
             best_parameters=_choose(better, state.parameters, state.best_parameters),
             best_validation=jnp.where(better, value, state.best_validation),
             best_step=jnp.where(better, state.step, state.best_step),
         )
-        shown = jnp.nan if monitor is None else monitor(state.parameters)
         return state, jnp.stack([jnp.asarray(v, dtype) for v in (total / count, value, shown)])
 
     def init(parameters: Parameters, seed: int) -> FitState:
         value = jnp.asarray(jnp.inf, jnp.result_type(*jax.tree.leaves(parameters)))
         return FitState(
-            parameters=jax.tree.map(jnp.copy, parameters),  # the caller's own are not to be donated
+            parameters=parameters,
             optimiser=optimiser.init(parameters),
             key=jax.random.key_data(jax.random.key(seed)),
             epoch=jnp.zeros((), jnp.int32),
             step=jnp.zeros((), jnp.int32),
-            best_parameters=jax.tree.map(jnp.copy, parameters),
+            best_parameters=parameters,
             best_validation=value,
             best_step=jnp.zeros((), jnp.int32),
             failed_step=jnp.asarray(-1, jnp.int32),
         )
 
     return Fit(
-        init=init,
+        init=jax.jit(init, static_argnums=1),
         dispatch=jax.jit(dispatch, donate_argnums=0),
         epochs=epochs,
         epochs_per_dispatch=min(epochs, -(-steps_per_dispatch // batches)),

@@ -50,7 +50,11 @@ def torque_residual(dynamics: Dynamics, sample: Samples, scale: Vector) -> Vecto
     return (dynamics.inverse_dynamics(sample.q, sample.qd, sample.qdd) - sample.tau) / scale
 
 
+def torque_residuals(dynamics: Dynamics, batch: Samples, scale: Vector) -> Float[Array, "N d"]:
+    """(tau_hat - tau) / scale of a batch."""
+    return vmap(lambda *sample: torque_residual(dynamics, Samples(*sample), scale))(*batch)
+
+
 def torque_loss(dynamics: Dynamics, batch: Samples, scale: Vector) -> Scalar:
     """Mean over samples of the sum of squared residuals over joints (Lutter et al. 2019)."""
-    residuals = vmap(lambda *sample: torque_residual(dynamics, Samples(*sample), scale))(*batch)
-    return jnp.mean(jnp.sum(residuals**2, axis=-1))
+    return jnp.mean(jnp.sum(torque_residuals(dynamics, batch, scale) ** 2, axis=-1))

@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import checkpoints, fit
 from dln_jax.learning.optimisers import adamw
-from dln_jax.learning.residuals import samples, torque_loss, torque_scale
+from dln_jax.learning.residuals import samples, torque_loss, torque_residuals, torque_scale
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
@@ -115,19 +115,23 @@ def train(
     check(sets, settings)
     dtype = data_type(settings.precision)
     scale = torque_scale(sets.train).astype(dtype)
-    arrays = [samples(data, dtype) for data in sets]
-    unit = jnp.ones_like(scale)
+    fitted, selected_by, monitored = (samples(data, dtype) for data in sets)
+    held_out = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), selected_by, monitored)
+
+    def score(parameters: Parameters) -> tuple[jax.Array, jax.Array]:
+        squares = jnp.sum(torque_residuals(model.apply(parameters), held_out, jnp.ones_like(scale)) ** 2, axis=1)
+        return squares[: len(selected_by.q)].mean(), squares[len(selected_by.q) :].mean()
+
     prepared = fit.make_fit(
         lambda parameters, batch: torque_loss(model.apply(parameters), batch, scale),
         adamw(steps=settings.steps, learning_rate=settings.learning_rate, weight_decay=settings.weight_decay),
-        arrays[0],
+        fitted,
         steps=settings.steps,
         batch=settings.batch,
-        validate=lambda parameters: torque_loss(model.apply(parameters), arrays[1], unit),
-        monitor=lambda parameters: torque_loss(model.apply(parameters), arrays[2], unit),
+        score=score,
     )
     identity = {"settings": settings._asdict(), "data": fingerprint(sets)}
-    state = prepared.init(model.init(jax.random.key(settings.seed)), settings.seed)
+    state = prepared.init(jax.jit(model.init)(jax.random.key(settings.seed)), settings.seed)
     history: list[Progress] = []
     if resume and directory is not None:
         state, history = _restore(directory, state, identity)
