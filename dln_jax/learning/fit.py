@@ -1,6 +1,6 @@
 """The fit loop: many steps per dispatch, on-device shuffling, best parameters by validation.
 
-One dispatch runs whole epochs in a loop on the device: each epoch draws a permutation from the run's key and its own
+One dispatch runs whole epochs in one loop on the device: each epoch draws a permutation from the run's key and its own
 number, so that a run that continues from a stored state takes exactly the steps of an unbroken one.
 """
 
@@ -107,22 +107,31 @@ def make_fit(
         )
         return state, value
 
-    def epoch(state: FitState) -> tuple[FitState, Array]:
-        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.epoch)
-        order = _permutation(key, samples)[: batches * batch]
-        shuffled = jax.tree.map(lambda a: a[order.reshape(batches, batch)], train)
-        state, losses = jax.lax.scan(step, state, shuffled)
-        return state._replace(epoch=state.epoch + 1), losses.mean()
+    epochs_per_dispatch = min(epochs, -(-steps_per_dispatch // batches))
+
+    def shuffled(state: FitState) -> Data:
+        """The batches of a dispatch, one permutation for each of its epochs."""
+
+        def order(epoch: Array) -> Array:
+            key = jax.random.fold_in(jax.random.wrap_key_data(state.key), epoch)
+            return _permutation(key, samples)[: batches * batch].reshape(batches, batch)
+
+        orders = jax.vmap(order)(state.epoch + jnp.arange(epochs_per_dispatch)).reshape(-1, batch)
+        return jax.tree.map(lambda a: a[orders], train)
 
     def dispatch(before: FitState, count: Array) -> tuple[FitState, Array]:
         dtype = before.best_validation.dtype
+        drawn = shuffled(before)
 
         def body(index, carry):
             state, total = carry
-            state, value = epoch(state)
+            state, value = step(state, jax.tree.map(lambda a: a[index], drawn))
             return state, total + value
 
-        state, total = jax.lax.fori_loop(0, count, body, (before, jnp.zeros((), dtype)))
+        # One flat loop, whose length is an argument: the last dispatch of a run may be shorter.
+        total_steps = count * batches
+        state, total = jax.lax.fori_loop(0, total_steps, body, (before, jnp.zeros((), dtype)))
+        state = state._replace(epoch=before.epoch + count)
         finite = jnp.isfinite(optax.tree.norm(state.parameters))
         failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
         # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
@@ -134,7 +143,7 @@ def make_fit(
             best_validation=jnp.where(better, value, state.best_validation),
             best_step=jnp.where(better, state.step, state.best_step),
         )
-        return state, jnp.stack([jnp.asarray(v, dtype) for v in (total / count, value, shown)])
+        return state, jnp.stack([jnp.asarray(v, dtype) for v in (total / total_steps, value, shown)])
 
     def init(parameters: Parameters, seed: int) -> FitState:
         value = jnp.asarray(jnp.inf, jnp.result_type(*jax.tree.leaves(parameters)))
@@ -154,7 +163,7 @@ def make_fit(
         init=jax.jit(init, static_argnums=1),
         dispatch=jax.jit(dispatch, donate_argnums=0),
         epochs=epochs,
-        epochs_per_dispatch=min(epochs, -(-steps_per_dispatch // batches)),
+        epochs_per_dispatch=epochs_per_dispatch,
     )
 
 
