@@ -34,7 +34,9 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
     """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130."""
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
-    given = tyro.cli(arguments, description=sys.modules[main.__module__].__doc__)
+    module = sys.modules[main.__module__]
+    name = module.__spec__.name if module.__spec__ else module.__name__
+    given = tyro.cli(arguments, prog=f"python -m {name}", description=module.__doc__)
     try:
         main(given)
     except InputError as error:
