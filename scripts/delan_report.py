@@ -11,7 +11,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from dln_jax.data import schema
 from dln_jax.data.splits import Split, split
@@ -26,7 +25,7 @@ from dln_jax.types import require_positive
 from scripts.command_line import new_folder, run
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.progress import progress
-from scripts.report_table import report_table
+from scripts.report_table import print_report
 
 # Published results (mean of 10 seeds), and the published implementation measured on two cores.
 PUBLISHED = {
@@ -77,9 +76,8 @@ def main(given: Arguments) -> None:
         rows += delan_rows(f"structured-delan/{name}/seed-{seed}", its_sets, Settings(steps=given.steps, seed=seed))
     facts = conditions(dtype="float32; textbook float64", seeds=list(range(given.seeds)), call_path="default jit")
     write_report(folder / "report.json", rows, facts)
-    console = Console(soft_wrap=True, highlight=False)
-    console.print(report_table(rows, facts))
-    console.print(f"report: {folder / 'report.json'}")
+    print_report(rows, facts)
+    print(f"report: {folder / 'report.json'}")
 
 
 def delan_rows(case: str, sets: Split, settings: Settings) -> list[Row]:

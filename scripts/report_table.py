@@ -1,10 +1,18 @@
 """A report as a table for the terminal."""
 
+import sys
 from typing import Any
 
+from rich.console import Console
 from rich.table import Table
 
 from dln_jax.evaluation.report import Row
+
+
+def print_report(rows: list[Row], facts: dict[str, Any]) -> None:
+    """Prints the table; a file or a pipe has no width to keep to."""
+    width = None if sys.stdout.isatty() else 160
+    Console(highlight=False, width=width).print(report_table(rows, facts))
 
 
 def report_table(rows: list[Row], facts: dict[str, Any]) -> Table:

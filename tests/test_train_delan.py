@@ -20,7 +20,7 @@ from scripts import make_data, train_delan
 from scripts.command_line import run
 
 ROOT = Path(__file__).parent.parent
-TINY = ("--steps", "40", "--width", "4", "--batch", "64")
+TINY = ("--steps", "40", "--width", "4", "--depth", "1", "--batch", "64")
 FILES = {
     "config.json",
     "metrics.json",
@@ -82,7 +82,7 @@ def test_a_run_writes_all_its_files(trained):
     metrics = json.loads((trained / "metrics.json").read_text())
     assert set(metrics) >= METRICS
     assert all(isinstance(value, int | float) for value in metrics.values())
-    assert metrics["parameters"] == (4 * 4 + 4 + 4 * 4 + 4) * 2 + (4 * 3 + 3) + (4 + 1)
+    assert metrics["parameters"] == (4 * 4 + 4) * 2 + (4 * 3 + 3) + (4 + 1)
     for figure in trained.glob("*.png"):
         assert figure.read_bytes().startswith(b"\x89PNG")
     config = json.loads((trained / "config.json").read_text())
@@ -122,7 +122,19 @@ def test_resuming_with_other_settings_or_nothing_is_refused(trained, workplace, 
 
 def test_a_killed_run_resumes_to_the_same_parameters(workplace):
     """SIGKILL after the first checkpoint, then --resume: the model equals an unbroken run's to the last bit."""
-    settings = ("--steps", "1200", "--width", "8", "--batch", "32", "--no-figures", "--scene", "pendulum")
+    settings = (
+        "--steps",
+        "1200",
+        "--width",
+        "8",
+        "--depth",
+        "1",
+        "--batch",
+        "32",
+        "--no-figures",
+        "--scene",
+        "pendulum",
+    )
     command(train_delan, *settings, "--out", "unbroken")
     process = subprocess.Popen(
         [sys.executable, "-m", "scripts.train_delan", *settings, "--out", str(workplace / "killed")],

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from dln_jax.mechanics import natural
 from dln_jax.mechanics.natural import NaturalSystem
@@ -63,6 +64,12 @@ def make_delan(
     )
 
 
+def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
+    """Lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the rest of the entries below it."""
+    diagonal = jax.nn.softplus(entries[:d] + shift) + floor
+    return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
+
+
 def _networks(
     needs: Needs, width: int, depth: int, activation: Activation, shift: float, floor: float
 ) -> hk.MultiTransformed:
@@ -74,9 +81,7 @@ def _networks(
         return layers(joint_features(needs, q))
 
     def cholesky(q: Vector) -> Matrix:
-        entries = network("cholesky", d * (d + 1) // 2, q)
-        diagonal = jax.nn.softplus(entries[:d] + shift) + floor
-        return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
+        return cholesky_factor(network("cholesky", d * (d + 1) // 2, q), d, shift=shift, floor=floor)
 
     def potential(q: Vector) -> Scalar:
         return network("potential", 1, q)[0]
