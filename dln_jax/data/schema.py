@@ -15,12 +15,13 @@ Samples of all trajectories are concatenated on axis 0.
 """
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.data import archive
+from dln_jax.data.archive import numeric
 from dln_jax.data.derivatives import time_derivative
 from dln_jax.types import InputError, Needs
 
@@ -59,21 +60,7 @@ def load(path: str | Path) -> Trajectories:
     Raises:
         InputError: the file is missing, is no npz, holds pickled objects, or breaks the schema.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the path of an npz file")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a readable npz file without pickled objects ({type(error).__name__}); "
-            "write it with numpy.savez and plain numeric or string arrays"
-        ) from error
-    try:
-        return from_arrays(arrays)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    return archive.load(path, from_arrays)
 
 
 def from_arrays(arrays: dict[str, Any]) -> Trajectories:
@@ -82,13 +69,13 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     Raises:
         InputError: names the key, what it holds, what was expected and what to do.
     """
-    q = _numeric(arrays, "q", None)
+    q = numeric(arrays, "q")
     if q.ndim != 2 or q.shape[1] == 0:
         raise InputError(f"q has shape {q.shape}; expected [N, d] with d >= 1: one column per coordinate")
     samples = q.shape[0]
     if samples < 2:
         raise InputError(f"q has {samples} sample(s); expected at least 2: record longer trajectories")
-    t = _numeric(arrays, "t", (samples,))
+    t = numeric(arrays, "t", (samples,))
     trajectory, label = _trajectory_names(arrays, samples)
     _require_increasing_time(t, trajectory, label)
 
@@ -96,13 +83,13 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     estimated = []
     for key, source in zip(RATES, ("q", "qd"), strict=True):
         if key in arrays:
-            checked[key] = _numeric(arrays, key, q.shape)
+            checked[key] = numeric(arrays, key, q.shape)
         else:
             checked[key] = time_derivative(t, checked[source], trajectory, name=key)
             estimated.append(key)
     for key in OPTIONAL:
         if key in arrays:
-            checked[key] = _numeric(arrays, key, q.shape)
+            checked[key] = numeric(arrays, key, q.shape)
     if "tau" not in arrays:
         checked["tau"] = np.zeros_like(q)
         estimated.append("tau")
@@ -160,27 +147,8 @@ def needs_from_json(stated: Any) -> Needs:
     return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation})
 
 
-def _numeric(arrays: dict[str, Any], key: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    if key not in arrays:
-        raise InputError(f"key '{key}' is missing (found: {', '.join(sorted(arrays)) or 'nothing'}); add it")
-    array = np.asarray(arrays[key])
-    if array.dtype.kind not in "fiu":
-        raise InputError(f"{key} has type {array.dtype}; expected real numbers")
-    if shape is not None and array.shape != shape:
-        raise InputError(f"{key} has shape {array.shape}; expected {shape} to match q")
-    array = array.astype(np.float64)
-    finite = np.isfinite(array)
-    if not finite.all():
-        first = int(np.argwhere(~finite)[0][0])
-        count = int((~finite).sum())
-        raise InputError(
-            f"{key} has {count} NaN or infinite value(s), the first at sample {first}; remove or repair them"
-        )
-    return array
-
-
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
-    trajectory = _numeric(arrays, "trajectory", (samples,))
+    trajectory = numeric(arrays, "trajectory", (samples,))
     if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0:
         raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
     trajectory = trajectory.astype(np.int64)

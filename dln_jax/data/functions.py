@@ -1,0 +1,158 @@
+"""Samples of functions with their derivatives, for regression: read from npz, or drawn from two textbook functions.
+
+| key | shape | |
+|---|---|---|
+| `x` | [N, n] | inputs |
+| `y` | [N, m] | values |
+| `dy` | [N, m, n] | optional Jacobians dy/dx; [N, n] will do when m = 1 |
+| `d2y` | [N, m, n, n] | optional Hessians d²y/dx²; [N, n, n] will do when m = 1 |
+
+Units are the user's own.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.data import archive
+from dln_jax.data.archive import numeric
+from dln_jax.types import InputError, require_positive
+
+
+class FunctionSamples(NamedTuple):
+    """Samples of one function of n inputs and m outputs, float64; shapes as in the module's table."""
+
+    x: np.ndarray
+    """[N, n]"""
+    y: np.ndarray
+    """[N, m]"""
+    dy: np.ndarray | None = None
+    """[N, m, n]"""
+    d2y: np.ndarray | None = None
+    """[N, m, n, n]"""
+
+    @property
+    def inputs(self) -> int:
+        """n."""
+        return self.x.shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """m."""
+        return self.y.shape[1]
+
+
+class SampleSplit(NamedTuple):
+    """Disjoint samples: fitted to, and selected by."""
+
+    train: FunctionSamples
+    validation: FunctionSamples
+
+
+def load(path: str | Path) -> FunctionSamples:
+    """Reads and checks a file; never unpickles.
+
+    Raises:
+        InputError: the file is missing, is no npz, holds pickled objects, or its arrays do not fit the table above.
+    """
+    return archive.load(path, from_arrays)
+
+
+def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
+    """Checks arrays against the table above.
+
+    Raises:
+        InputError: names the key, what it holds, what was expected and what to do.
+    """
+    x, y = numeric(arrays, "x"), numeric(arrays, "y")
+    for key, array, letter in (("x", x, "n"), ("y", y, "m")):
+        if array.ndim != 2 or array.shape[1] == 0:
+            remedy = f"a single column is {key}[:, None]" if array.ndim == 1 else "one row per sample"
+            raise InputError(f"{key} has shape {array.shape}; expected [N, {letter}] with {letter} >= 1: {remedy}")
+    if len(x) != len(y):
+        raise InputError(f"y has {len(y)} samples, but x has {len(x)}; expected as many: keep one row per sample")
+    if len(x) < 2:
+        raise InputError(f"x has {len(x)} sample(s); expected at least 2: add samples")
+    return FunctionSamples(x, y, _derivative(arrays, "dy", x, y, 1), _derivative(arrays, "d2y", x, y, 2))
+
+
+def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0) -> SampleSplit:
+    """Draws validation samples by the seed; at least one, and at least one is left to train on.
+
+    For samples that are independent of each other. Raises InputError for a share outside (0, 1).
+    """
+    if not 0 < validation_share < 1:
+        raise InputError(f"validation share is {validation_share}; expected a number between 0 and 1")
+    samples = len(data.x)
+    count = min(max(1, round(validation_share * samples)), samples - 1)
+    order = np.random.default_rng((seed, samples)).permutation(samples)
+    return SampleSplit(train=select(data, np.sort(order[count:])), validation=select(data, np.sort(order[:count])))
+
+
+def select(data: FunctionSamples, indices: np.ndarray) -> FunctionSamples:
+    """The samples with these indices, or where this mask is true."""
+    dy, d2y = (None if array is None else array[indices] for array in (data.dy, data.d2y))
+    return FunctionSamples(data.x[indices], data.y[indices], dy, d2y)
+
+
+def sine(*, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0) -> FunctionSamples:
+    """f(x) = sin x at x uniform in [-bound, bound], with independent Gaussian noise on everything that is stored.
+
+    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'; the
+    stored x is the noisy one, so that even the true function leaves residuals. The Hessian, which the published
+    losses do not read, has the same noise.
+    Raises InputError for samples or a bound that are not positive, or negative noise.
+    """
+    return _noisy_samples(_exact_sine, 1, samples, noise, bound, seed)
+
+
+def cosine_sine(*, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0) -> FunctionSamples:
+    """f(x) = cos x_1 sin x_2 on [-bound, bound]², drawn as for `sine`."""
+    return _noisy_samples(_exact_cosine_sine, 2, samples, noise, bound, seed)
+
+
+def sine_grid(*, points: int = 100, bound: float = np.pi) -> FunctionSamples:
+    """sin x with exact derivatives at evenly spaced points of [-bound, bound], ends included."""
+    return _exact_sine(np.linspace(-bound, bound, points)[:, None])
+
+
+def cosine_sine_grid(*, points: int = 50, bound: float = np.pi) -> FunctionSamples:
+    """cos x_1 sin x_2 with exact derivatives on a grid of points² over [-bound, bound]², x_1 the slower index."""
+    axis = np.linspace(-bound, bound, points)
+    return _exact_cosine_sine(np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2))
+
+
+def _exact_sine(x: np.ndarray) -> FunctionSamples:
+    value, slope = np.sin(x), np.cos(x)
+    return FunctionSamples(x, value, slope[:, :, None], -value[:, :, None, None])
+
+
+def _exact_cosine_sine(x: np.ndarray) -> FunctionSamples:
+    (c1, s1), (c2, s2) = ((np.cos(column), np.sin(column)) for column in x.T)
+    gradient = np.stack([-s1 * s2, c1 * c2], axis=-1)
+    hessian = np.stack([np.stack([-c1 * s2, -s1 * c2], -1), np.stack([-s1 * c2, -c1 * s2], -1)], -1)
+    return FunctionSamples(x, (c1 * s2)[:, None], gradient[:, None], hessian[:, None])
+
+
+def _noisy_samples(exact, n: int, samples: int, noise: float, bound: float, seed: int) -> FunctionSamples:
+    require_positive(samples=samples, bound=bound)
+    if not noise >= 0:
+        raise InputError(f"noise is {noise}; expected a standard deviation, zero or positive")
+    random = np.random.default_rng(seed)
+    clean = exact(random.uniform(-bound, bound, (samples, n)))
+    noisy = [array + noise * random.normal(size=array.shape) for array in clean]
+    rows, columns = np.tril_indices(n)
+    noisy[3][..., rows, columns] = noisy[3][..., columns, rows]  # a Hessian stays symmetric
+    return FunctionSamples(*noisy)
+
+
+def _derivative(arrays: dict[str, Any], key: str, x: np.ndarray, y: np.ndarray, order: int) -> np.ndarray | None:
+    if key not in arrays:
+        return None
+    inputs, outputs = x.shape[1], y.shape[1]
+    shape = (len(x), outputs, *(inputs,) * order)
+    array = np.asarray(arrays[key])
+    if outputs == 1 and array.shape == (len(x), *(inputs,) * order):
+        array = array.reshape(shape)
+    return numeric({**arrays, key: array}, key, shape, to_match=f"x {x.shape} and y {y.shape}")

@@ -1,0 +1,81 @@
+"""A trained differential network as one jitted function."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.deploy.load import MODEL
+from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
+from dln_jax.learning.train import data_type
+from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn.activations import activation
+from dln_jax.nn.differential_mlp import Layers
+from dln_jax.types import InputError
+
+KIND = "differential-mlp"
+KEYS = {"kind", "sizes", "activation", "members", "precision"}
+
+
+class Derivatives(NamedTuple):
+    """What the function returns at one x [n]; of an ensemble, the means over its members."""
+
+    value: Float[Array, "m"]
+    jacobian: Float[Array, "m n"]
+    hessian: Float[Array, "m n n"]
+
+
+class LoadedFunction(NamedTuple):
+    """A network, or an ensemble of them, read from a run folder."""
+
+    layers: Layers
+    """With the members on the leading axis, also when there is one."""
+    description: dict[str, Any]
+    """Of the model, as it was saved."""
+    derivatives: Callable[[Array], Derivatives]
+    """Jitted: x [n] -> value, Jacobian and Hessian, in the precision of the training."""
+
+
+def save_function(directory: Path, layers: Layers, *, activation: str, precision: str) -> None:
+    """Writes `model.safetensors` and `model.json` into an existing folder.
+
+    `layers` have the members of the ensemble on their leading axis, also when there is one.
+    """
+    members = layers[0][0].shape[0]
+    sizes = [layers[0][0].shape[1], *(weight.shape[2] for weight, _ in layers)]
+    description = dict(kind=KIND, sizes=sizes, activation=activation, members=members, precision=precision)
+    save_tree(directory, MODEL, layers, {"model": description})
+
+
+def load_function(directory: str | Path) -> LoadedFunction:
+    """The differential network of a trained run.
+
+    Raises:
+        InputError: no such model in the folder, or one that is damaged, altered or of another schema.
+    """
+    directory = Path(directory)
+    description = load_manifest(directory, MODEL).get("model")
+    if not isinstance(description, dict) or description.get("kind") != KIND:
+        raise InputError(f"{directory / MODEL}.json: describes no {KIND}; give the folder of a train_diffnet run")
+    if missing := KEYS - set(description):
+        raise InputError(
+            f"{directory / MODEL}.json: lacks {', '.join(sorted(missing))}; train again or restore the file"
+        )
+    dtype, function = data_type(description["precision"]), activation(description["activation"])
+    like = jax.eval_shape(
+        lambda key: ensembles.init(key, description["sizes"], members=description["members"], dtype=dtype),
+        jax.random.key(0),
+    )
+    layers = load_tree(directory, MODEL, like)
+
+    @jax.jit
+    def derivatives(x):
+        x = jnp.asarray(x, dtype)
+        every = jax.vmap(lambda ours: differential_mlp.value_jacobian_and_hessian(ours, x, activation=function))(layers)
+        return Derivatives(*(array.mean(axis=0) for array in every))
+
+    return LoadedFunction(layers, description, derivatives)

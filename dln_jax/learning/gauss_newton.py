@@ -1,0 +1,199 @@
+"""Gauss-Newton training: a host loop around the compiled Levenberg-Marquardt iterations.
+
+    optimiser = make_levenberg_marquardt(sample_residual)
+    result = minimise(optimiser, optimiser.init(parameters), (q, qd, qdd, tau), iterations=200)
+
+Several seeds train in one program where the state has a leading axis: `jax.vmap(optimiser.init)(parameters, keys)`.
+The loop itself keeps nothing: a run that starts from the state of a dispatch continues bit for bit.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from dln_jax.learning.levenberg_marquardt import (
+    QUICK_COMPILATION,
+    LevenbergMarquardt,
+    State,
+    Status,
+    make_levenberg_marquardt,
+)
+from dln_jax.learning.normal_equations import jacobian_bytes
+from dln_jax.types import InputError
+
+__all__ = [
+    "QUICK_COMPILATION",
+    "LevenbergMarquardt",
+    "Progress",
+    "Result",
+    "State",
+    "Statistics",
+    "Status",
+    "jacobian_bytes",
+    "make_levenberg_marquardt",
+    "minimise",
+]
+
+_REASONS = {
+    Status.GRADIENT: "the gradient is as small as asked",
+    Status.STEP: "the step is as small as asked",
+    Status.IMPROVEMENT: "an iteration improves as little as asked",
+    Status.STALLED: "no damping lowers the loss any more: it is at its floor in this precision, or the derivatives are "
+    "wrong",
+    Status.NON_FINITE: "the loss is not finite; the parameters are the last with a finite loss. Check the data, "
+    "or start with more damping",
+    Status.ITERATIONS: "the iterations asked for are done",
+    Status.TIME: "the time asked for is over",
+}
+
+
+class Progress(NamedTuple):
+    """What a dispatch came to; each a scalar, or [seeds]."""
+
+    iteration: np.ndarray
+    loss: np.ndarray
+    validation: np.ndarray | None
+    damping: np.ndarray
+    gradient_norm: np.ndarray
+    seconds: float
+    """Since the call of `minimise`, compilation included."""
+
+
+class Statistics(NamedTuple):
+    """What a run took; counts are scalars or [seeds], over all runs that led to the state."""
+
+    iterations: np.ndarray
+    trials: np.ndarray
+    fallbacks: np.ndarray
+    seconds: float
+    """Of this call, compilation included."""
+    compile_seconds: float
+    """Of these, until the optimiser was compiled."""
+
+
+class Result(NamedTuple):
+    """Parameters, what they are worth, why the run ended, and what it took."""
+
+    parameters: Any
+    """Those with the least validation, or the last ones where there is no validation."""
+    value: np.ndarray
+    """Their validation, or the loss; scalar or [seeds]."""
+    status: np.ndarray
+    """`Status` as an integer, scalar or [seeds]."""
+    reason: str
+    """The same in words; a line per seed."""
+    statistics: Statistics
+    state: State
+    """The last state, to continue from."""
+
+
+def minimise(
+    optimiser: LevenbergMarquardt,
+    state: State,
+    arrays: tuple[Array | np.ndarray, ...],
+    *,
+    iterations: int,
+    seconds: float = math.inf,
+    dispatch: int = 10,
+    validation: Callable[[Any], Array] | None = None,
+    report: Callable[[Progress], object] | None = None,
+    on_dispatch: Callable[[State], object] | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Result:
+    """Runs until `iterations` are done in total, time is over, or a stop rule holds.
+
+    Args:
+        optimiser: from `make_levenberg_marquardt`.
+        state: from its `init`, or of an earlier dispatch.
+        arrays: data, samples on axis 0.
+        iterations: to be done in total, those that led to `state` included.
+        seconds: after which to stop, in s; looked at between dispatches.
+        dispatch: iterations in one compiled call.
+        validation: parameters of ONE seed -> scalar, jitted here and evaluated after each dispatch; the parameters with
+            the lowest value are kept.
+        report: shows progress after each dispatch.
+        on_dispatch: stores the state after each dispatch.
+        clock: seconds, for `seconds` and the statistics.
+
+    Raises:
+        InputError: a dispatch of no iterations, or what the optimiser refuses in parameters and data.
+    """
+    if dispatch < 1:
+        raise InputError(f"dispatch is {dispatch}; expected at least 1 iteration in a compiled call")
+    start = clock()
+    arrays = tuple(jnp.asarray(array) for array in arrays)
+    several = state.iteration.ndim == 1
+    evaluate = None
+    if validation is not None:
+        # One seed after the other: a validation that calls LAPACK must not do so for a batch (see the optimiser).
+        evaluate = jax.jit((lambda stacked: lax.map(validation, stacked)) if several else validation)
+    state = jax.block_until_ready(optimiser.run(state, arrays, 0))
+    compile_seconds = clock() - start
+
+    while remaining := _remaining(state, iterations):
+        if clock() - start >= seconds:
+            break
+        state = jax.block_until_ready(optimiser.run(state, arrays, min(dispatch, remaining)))
+        values = None
+        if evaluate is not None:
+            values = evaluate(state.parameters)
+            state = _keep_best(state, values)
+        if on_dispatch is not None:
+            on_dispatch(state)
+        if report is not None:
+            report(
+                Progress(
+                    iteration=np.asarray(state.iteration),
+                    loss=np.asarray(state.loss),
+                    validation=None if values is None else np.asarray(values),
+                    damping=np.asarray(state.damping),
+                    gradient_norm=np.asarray(state.gradient_norm),
+                    seconds=clock() - start,
+                )
+            )
+
+    ended_by = Status.TIME if _remaining(state, iterations) else Status.ITERATIONS
+    status = np.where(np.asarray(state.status) == Status.RUNNING, int(ended_by), np.asarray(state.status))
+    validated = validation is not None
+    return Result(
+        parameters=state.best_parameters if validated else state.parameters,
+        value=np.asarray(state.best_validation if validated else state.loss),
+        status=status,
+        reason="\n".join(
+            f"iteration {iteration}: {_REASONS[Status(code)]}"
+            for iteration, code in zip(np.ravel(state.iteration), np.ravel(status), strict=True)
+        ),
+        statistics=Statistics(
+            iterations=np.asarray(state.iteration),
+            trials=np.asarray(state.trials),
+            fallbacks=np.asarray(state.fallbacks),
+            seconds=clock() - start,
+            compile_seconds=compile_seconds,
+        ),
+        state=state,
+    )
+
+
+def _remaining(state: State, iterations: int) -> int:
+    """Iterations that the seeds which still run have to go."""
+    done = np.ravel(state.iteration)[np.ravel(state.status) == Status.RUNNING]
+    return max(iterations - int(done.min()), 0) if done.size else 0
+
+
+@jax.jit
+def _keep_best(state: State, values: Array) -> State:
+    better = values < state.best_validation  # False for NaN
+
+    def keep(best: Array, new: Array) -> Array:
+        return jnp.where(jnp.reshape(better, better.shape + (1,) * (new.ndim - better.ndim)), new, best)
+
+    return state._replace(
+        best_parameters=jax.tree.map(keep, state.best_parameters, state.parameters),
+        best_validation=keep(state.best_validation, values),
+    )

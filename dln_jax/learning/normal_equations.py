@@ -1,0 +1,234 @@
+"""Normal equations of a least-squares problem, summed over chunks of samples, and their factorisation.
+
+A problem is a function of ONE sample, `sample_residual(parameters, *sample) -> [r]`. For N samples and P parameters
+the Jacobian has N r rows; here it is J [P, rows], parameters first, the layout in which J Jᵀ multiplies fastest.
+Only one piece of it is alive at a time, unless the caller wants it kept; `jacobian_bytes` states the memory.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float, Int
+
+from dln_jax.types import InputError
+
+SampleResidual = Callable[..., Array]
+"""(parameters, *sample) -> residuals of one sample, [r] or any other shape."""
+
+# J Jᵀ is symmetric: this many rows of blocks, each as wide as the lower triangle needs, save up to half the products.
+_ROWS_PER_BLOCK = 200
+
+
+class Chunks(NamedTuple):
+    """Samples in `k` equal chunks of `c`; the last one is filled up with samples of weight 0."""
+
+    arrays: tuple[Array, ...]
+    """Each [k, c, ...]."""
+    weights: Array
+    """1 for a sample, 0 for a filler, [k, c]."""
+
+
+class NormalEquations(NamedTuple):
+    """Sums over all residuals r; the caller divides by the number of samples."""
+
+    matrix: Array
+    """J Jᵀ [P, P]; only its lower triangle is meant to be read."""
+    vector: Array
+    """J r [P]."""
+    squares: Array
+    """Sum of r²."""
+    jacobian: Array | None
+    """J as [k, blocks, P, rows of a block], or None where it was not to be kept."""
+
+
+class Factor(NamedTuple):
+    """Cholesky factor of a positive definite matrix A, scaled to unit diagonal: A = S⁻¹ L Lᵀ S⁻¹."""
+
+    lower: Array
+    """L [P, P]."""
+    scaling: Array
+    """Diagonal of S, 1 / sqrt(A_ii) [P]."""
+
+
+def count(parameters: Any) -> int:
+    """P, the number of scalars in a tree of parameters."""
+    return sum(int(np.prod(np.shape(leaf))) for leaf in jax.tree.leaves(parameters))
+
+
+def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size: int, keep: bool) -> int:
+    """Bytes in float64 of what grows with the problem: 8 (4 P² + P chunk_size b + [P N r if kept]).
+
+    P parameters, N samples of r residuals each. 4 P² is the matrix, its damped copy, its factor and one spare;
+    a piece of the Jacobian has b = 1 residual per sample by reverse mode (r < P), and b = r by forward mode.
+    The intermediate values of the residual function itself, for `chunk_size` samples, come on top.
+    """
+    size = count(parameters)
+    piece = size * min(chunk_size, samples) * (1 if _reverse_is_cheaper(size, residuals) else residuals)
+    return 8 * (4 * size**2 + piece + (size * samples * residuals if keep else 0))
+
+
+def check_precision(tree: Any, what: str) -> None:
+    """Raises InputError where a leaf is not float64."""
+    found = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
+    if found:
+        raise InputError(
+            f"{what} are {', '.join(sorted(found))}; Gauss-Newton needs float64, for normal equations square the "
+            "condition number: set jax_enable_x64 (--precision f64) before arrays are made"
+        )
+
+
+def check_data(
+    sample_residual: SampleResidual, parameters: Any, arrays: tuple[Array, ...], rows: int | None
+) -> tuple[int, int]:
+    """Samples of an iteration, and residuals of a sample.
+
+    Raises:
+        InputError: something is not float64, arrays differ in length, or there are fewer samples than `rows`.
+    """
+    check_precision(parameters, "parameters")
+    lengths = [array.shape[0] if array.ndim else 0 for array in arrays]
+    if len(set(lengths)) != 1 or lengths[0] == 0:
+        raise InputError(f"data arrays have {lengths} samples on axis 0; expected the same positive number in each")
+    if rows is not None and not 1 <= rows <= lengths[0]:
+        raise InputError(f"rows is {rows}; expected 1 to {lengths[0]}, the number of samples")
+    residual = jax.eval_shape(sample_residual, parameters, *(array[0] for array in arrays))
+    check_precision(residual, "residuals")
+    return rows or lengths[0], residual.size
+
+
+def split(arrays: tuple[Array, ...], order: Int[Array, "n"], chunk_size: int) -> Chunks:
+    """The samples `order` of each array, in as few equal chunks of at most `chunk_size` as hold them."""
+    pieces = -(-order.shape[0] // chunk_size)
+    length = -(-order.shape[0] // pieces)
+    fillers = pieces * length - order.shape[0]
+    padded = jnp.concatenate([order, jnp.broadcast_to(order[0], (fillers,))])
+    weights = jnp.concatenate([jnp.ones(order.shape), jnp.zeros(fillers)])
+    return Chunks(
+        tuple(array[padded].reshape(pieces, length, *array.shape[1:]) for array in arrays),
+        weights.reshape(pieces, length),
+    )
+
+
+def normal_equations(
+    sample_residual: SampleResidual, parameters: Any, chunks: Chunks, *, keep: bool
+) -> NormalEquations:
+    """J Jᵀ, J r and the sum of squares at `parameters`; the Jacobian too if it is to be kept.
+
+    Rows come by reverse mode, all samples of a chunk at once and one residual of each after the other, or by forward
+    mode where there are no more parameters than residuals in a sample.
+    """
+    point, unravel = ravel_pytree(parameters)
+    size = point.shape[0]
+    edges = np.linspace(0, size, -(-size // _ROWS_PER_BLOCK) + 1).astype(int)
+
+    def one(*sample):
+        return jax.vjp(lambda each: jnp.ravel(sample_residual(each, *sample)), parameters)
+
+    def forward(samples: tuple[Array, ...]) -> Array:
+        def along(direction: Array) -> Array:
+            return jax.jvp(lambda x: residuals_of(sample_residual, unravel(x), samples), (point,), (direction,))[1]
+
+        return lax.map(lambda direction: along(direction).ravel(), jnp.eye(size))
+
+    def add_chunk(sums, chunk):
+        samples, weights = chunk
+        residuals, pull_back = jax.vmap(one)(*samples)
+        rows = residuals.shape[1]
+        if not _reverse_is_cheaper(size, rows):
+            weights = jnp.tile(weights, rows)
+            sums, jacobian = add(sums, forward(samples), residuals.T.ravel(), weights)
+            return sums, None if jacobian is None else jacobian[None]
+
+        def add_residual(sums, residual):
+            cotangent, values = residual
+            # Leaves are joined after the pull-back: the transpose of splitting a vector is a sum of padded ones.
+            jacobian = jax.vmap(lambda pull: ravel_pytree(pull(cotangent)[0])[0], out_axes=-1)(pull_back)
+            return add(sums, jacobian, values, weights)
+
+        return lax.scan(add_residual, sums, (jnp.eye(rows), residuals.T))
+
+    def add(sums, jacobian: Array, residuals: Array, weights: Array):
+        matrix, vector, squares = sums
+        jacobian, residuals = jacobian * weights, residuals * weights
+        matrix = tuple(
+            block + jacobian[start:stop] @ jacobian[:stop].T
+            for block, (start, stop) in zip(matrix, pairwise(edges), strict=True)
+        )
+        sums = (matrix, vector + jacobian @ residuals, squares + residuals @ residuals)
+        return sums, jacobian if keep else None
+
+    zeros = tuple(jnp.zeros((stop - start, stop)) for start, stop in pairwise(edges))
+    (matrix, vector, squares), jacobian = lax.scan(add_chunk, (zeros, jnp.zeros(size), jnp.zeros(())), chunks)
+    lower = jnp.concatenate([jnp.pad(block, ((0, 0), (0, size - block.shape[1]))) for block in matrix])
+    return NormalEquations(lower, vector, squares, jacobian)
+
+
+def residuals_of(sample_residual: SampleResidual, parameters: Any, samples: tuple[Array, ...]) -> Float[Array, "r c"]:
+    """Residuals of c samples, one row per residual of a sample."""
+    return jax.vmap(lambda *sample: jnp.ravel(sample_residual(parameters, *sample)))(*samples).T
+
+
+def residuals(sample_residual: SampleResidual, parameters: Any, chunks: Chunks) -> Float[Array, "k r c"]:
+    """Residuals at `parameters`, those of fillers 0."""
+    return lax.map(lambda chunk: residuals_of(sample_residual, parameters, chunk[0]) * chunk[1], chunks)
+
+
+def pull_back(
+    sample_residual: SampleResidual,
+    parameters: Any,
+    chunks: Chunks,
+    jacobian: Array | None,
+    vectors: Float[Array, "k r c"],
+) -> Float[Array, "P"]:
+    """J w [P] for a vector w over the residuals: from the Jacobian if it was kept, by reverse mode if not."""
+
+    def reverse(total: Array, piece) -> tuple[Array, None]:
+        samples, vector = piece
+        _, pull = jax.vjp(lambda each: residuals_of(sample_residual, each, samples), parameters)
+        return total + ravel_pytree(pull(vector)[0])[0], None
+
+    zero = jnp.zeros(count(parameters))
+    if jacobian is None:
+        return lax.scan(reverse, zero, (chunks.arrays, vectors * chunks.weights[:, None]))[0]
+    pieces = jacobian.reshape(-1, *jacobian.shape[2:])
+    return lax.scan(
+        lambda total, piece: (total + piece[0] @ piece[1], None), zero, (pieces, vectors.reshape(len(pieces), -1))
+    )[0]
+
+
+def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:
+    """Factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
+
+    Scaled to unit diagonal, a matrix whose Cholesky factor exists and has all L_ii² > P eps is solved as it is. Else
+    it is singular to working precision: eigenvalues below P eps times the largest are raised to that, and L comes
+    from a QR decomposition, which leaves the other directions as they are. (Golub and Van Loan 2013, sections 4.2, 8.1)
+    """
+    scaling = lax.rsqrt(jnp.diagonal(matrix))
+    scaled = matrix * scaling * scaling[:, None]
+    smallest = matrix.shape[0] * jnp.finfo(matrix.dtype).eps
+    lower = lax.linalg.cholesky(scaled, symmetrize_input=False)
+    well_conditioned = jnp.min(jnp.diagonal(lower)) ** 2 > smallest  # False for the NaN of a factor that failed
+
+    def by_eigenvalues() -> Array:
+        vectors, values = lax.linalg.eigh(scaled, lower=True, symmetrize_input=False)
+        roots = jnp.sqrt(jnp.maximum(values, smallest * values[-1]))
+        return jnp.linalg.qr(roots[:, None] * vectors.T, mode="r").T
+
+    return Factor(lax.cond(well_conditioned, lambda: lower, by_eigenvalues), scaling), ~well_conditioned
+
+
+def solve(factor: Factor, b: Float[Array, "P"]) -> Float[Array, "P"]:
+    """x [P] with A x = b."""
+    forward = solve_triangular(factor.lower, factor.scaling * b, lower=True)
+    return factor.scaling * solve_triangular(factor.lower, forward, lower=True, trans="T")
+
+
+def _reverse_is_cheaper(parameters: int, residuals: int) -> bool:
+    return residuals < parameters

@@ -1,0 +1,249 @@
+"""Train a deep differential network, or an ensemble, on a function: value, gradient and Hessian from one pass.
+
+Functions: sin (1-D), cos_sin (cos x1 sin x2), both with the published noise, or an npz file of one's own with x [N, n],
+y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
+with dln_jax.deploy.load_function), and figures. --table trains all activations, losses and optimisers on both
+functions, prints the published table beside the results, and writes report.json.
+"""
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.data import functions
+from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.deploy.load_function import load_function, save_function
+from dln_jax.evaluation import function_figures as figures
+from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
+from dln_jax.evaluation.latency import one_step
+from dln_jax.learning.regression import Settings, check, steps_of, train
+from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
+from dln_jax.learning.train import Progress, Training
+from dln_jax.nn.activations import activation
+from dln_jax.types import InputError
+from scripts import diffnet_table
+from scripts.command_line import new_folder, run, write_json
+from scripts.progress import progress
+
+NAMED = {
+    "sin": (functions.sine, functions.sine_grid),
+    "cos_sin": (functions.cosine_sine, functions.cosine_sine_grid),
+}
+"""Generator and test grid of each named function."""
+RELU = (
+    "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "
+    "predicting zero and a Hessian in the loss teaches it nothing; use softplus, tanh, cos or another smooth activation"
+)
+SHARE_OF_DATA = 0.75
+"""Width of the training box over that of the shown one, for ensembles."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to train on, how, and where the results go."""
+
+    function: str = "sin"
+    """sin, cos_sin, or the path of an npz file with x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
+    loss: str = "type1"
+    """type1 fits value and gradient, type2 the value only."""
+    activation: str = "cos"
+    """relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic or cubic."""
+    derivative: Literal[1, 2] = 1
+    """2 adds the Hessian to the loss."""
+    ensemble: int = 1
+    """Networks; with more than one, sin and cos_sin are trained on ±0.75 π and shown on ±π."""
+    optimizer: Literal["adam", "gauss-newton"] = "gauss-newton"
+    """Levenberg-Marquardt on all samples (f64) for small networks, or Adam, the published recipe, for wide ones."""
+    width: int | None = None
+    """Hidden units per layer (default: 16 for gauss-newton, 128 for adam)."""
+    depth: int | None = None
+    """Hidden layers (default: 1 for one input, else 2)."""
+    steps: int = 100
+    """Gauss-Newton: iterations at most, per network."""
+    epochs: int = 500
+    """Adam: passes over the data."""
+    batch: int = 512
+    """Adam: samples per step."""
+    learning_rate: float = 1e-3
+    """Adam: constant rate."""
+    weight_decay: float = 1e-6
+    """Adam: decoupled weight decay."""
+    samples: int = 25_600
+    """Samples of sin and cos_sin."""
+    noise: float = 1e-3
+    """Their standard deviation of the noise on x, f, gradient and Hessian."""
+    precision: Literal["f32", "f64"] | None = None
+    """Floating-point type (default: f64 for gauss-newton, which needs it, f32 for adam)."""
+    seed: int = 0
+    """Of the data, the validation split, the initial parameters and the shuffling."""
+    out: Path | None = None
+    """Folder of the run (default: runs/train_diffnet-1, -2, ...)."""
+    figures: bool = True
+    """Draw the figures."""
+    table: bool = False
+    """Train everything that the published table has, by both optimisers; of the other arguments --samples, --steps,
+    --epochs, --seed and --out count."""
+
+
+class Task(NamedTuple):
+    """What the arguments come to."""
+
+    name: str
+    sets: SampleSplit
+    test: FunctionSamples
+    shown: FunctionSamples
+    """What the figures show: the test, or a wider grid for an ensemble."""
+    bound: float | None
+    """Half the width of the box of the training data, where the shown grid is wider."""
+    units: Units
+    settings: Settings
+
+
+def main(given: Arguments) -> None:
+    """Trains, evaluates, and writes the run folder."""
+    console = Console(highlight=False, soft_wrap=True)
+    if given.table:
+        diffnet_table.write_table(console, given)
+        return
+    task = prepare(given)
+    folder = new_folder(given.out, "train_diffnet")
+    write_json(folder / "config.json", stored_settings(given, task))
+    announce(console, task)
+    total = steps_of(task.sets, task.settings)
+    standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
+    with progress(total) as show:
+
+        def report(at: Progress) -> None:
+            show(min(int(at.step), total), f"loss {at.loss:.3e}  validation {at.validation:.3e}")
+
+        training = train(standard, task.settings, report=report)
+    if training.stop.reason == "not finite":
+        console.print("the loss stopped being finite; the run keeps the best parameters before that")
+    layers = layers_in_own_units(training.parameters, task.units)
+    save_function(folder, layers, activation=task.settings.activation, precision=task.settings.precision)
+    metrics = evaluate(folder, task, training, draw=given.figures)
+    write_json(folder / "metrics.json", metrics)
+    console.print(results_table(metrics, task))
+    if task.settings.activation == "relu":
+        console.print(RELU)
+    console.print(f"run folder: {folder}")
+
+
+def prepare(given: Arguments) -> Task:
+    """Reads and checks everything that the arguments name, before anything is written."""
+    settings = settings_from(given)
+    if given.function in NAMED:
+        generate, grid = NAMED[given.function]
+        bound = np.pi * (SHARE_OF_DATA if given.ensemble > 1 else 1)
+        data = generate(samples=given.samples, noise=given.noise, bound=bound, seed=given.seed)
+        test, shown = grid(bound=bound), grid()
+        bound, units = (bound, own_units(data)) if given.ensemble > 1 else (None, own_units(data))
+    else:
+        if not given.function.endswith(".npz"):
+            raise InputError(f"function '{given.function}' is unknown; expected sin, cos_sin or an npz file's path")
+        everything = functions.load(given.function)
+        if len(everything.x) < 3:
+            raise InputError(f"{given.function}: {len(everything.x)} samples; training, validation and test need 3")
+        data, test = functions.split(everything, seed=given.seed)
+        shown, bound, units = test, None, standard_units(data)
+    depth = given.depth if given.depth is not None else min(data.inputs, 2)
+    settings = settings._replace(depth=depth)
+    check(data, settings)
+    return Task(given.function, functions.split(data, seed=given.seed), test, shown, bound, units, settings)
+
+
+def settings_from(given: Arguments) -> Settings:
+    """The settings that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
+    newton = given.optimizer == "gauss-newton"
+    named = {key: value for key, value in dataclasses.asdict(given).items() if key in Settings._fields}
+    named["width"] = given.width if given.width is not None else (16 if newton else 128)
+    named["precision"] = given.precision or ("f64" if newton else "f32")
+    return Settings(**{**named, "depth": 1, "members": given.ensemble})
+
+
+def stored_settings(given: Arguments, task: Task) -> dict[str, Any]:
+    """The arguments that decide the result, with the defaults that were chosen, as JSON values."""
+    values = {**dataclasses.asdict(given), **task.settings._asdict()}
+    return {key: value for key, value in values.items() if key not in ("out", "figures", "table", "members")}
+
+
+def announce(console: Console, task: Task) -> None:
+    """Says what is trained on what."""
+    data, settings = task.sets.train, task.settings
+    counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
+    terms = ["value", *(["gradient"] if settings.loss == "type1" else []), *(["Hessian"] * (settings.derivative == 2))]
+    layers = " x ".join([str(data.inputs), *[str(settings.width)] * settings.depth, str(data.outputs)])
+    networks = f"{settings.members} networks" if settings.members > 1 else "network"
+    console.print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
+    console.print(
+        f"{networks} {layers}, {settings.activation}; {settings.loss}: {', '.join(terms)}; "
+        f"{settings.optimizer}, {settings.precision}"
+    )
+    if settings.activation == "relu" and settings.derivative == 2:
+        console.print(RELU)
+
+
+def evaluate(folder: Path, task: Task, training: Training, *, draw: bool) -> dict[str, float]:
+    """Loads the stored model as a user would, measures it on the test samples, and draws it."""
+    loaded = load_function(folder)
+    function = activation(task.settings.activation)
+    tested = predictions(loaded.layers, task.test.x, activation=function)
+    shown = predictions(loaded.layers, task.shown.x, activation=function)
+    metrics = errors(tested.mean, task.test)
+    if task.bound is not None and shown.spread is not None:
+        inside = np.all(abs(task.shown.x) <= task.bound, axis=1)
+        metrics["spread_inside"] = typical_spread(shown.spread, inside)
+        metrics["spread_outside"] = typical_spread(shown.spread, ~inside)
+    latency = one_step(loaded.derivatives, [(x,) for x in task.test.x[:512]], calls=1000)
+    if draw:
+        draw_figures(folder, task, shown, training)
+    return {
+        **metrics,
+        "validation_loss": min((at.validation for at in training.history), default=float("inf")),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.layers)),
+        "steps": training.stop.step,
+        "best_step": training.best_step,
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": training.train_seconds,
+        "one_step_p50_us": latency.p50_us,
+        "one_step_p99_us": latency.p99_us,
+    }
+
+
+def draw_figures(folder: Path, task: Task, shown: Prediction, training: Training) -> None:
+    """Writes what fits the number of inputs."""
+    inputs = task.test.inputs
+    drawn = {"training": figures.training_curve(training.history)} if training.history else {}
+    if inputs == 1:
+        drawn["curves"] = figures.curves(task.shown, shown.mean)
+    elif task.name in NAMED:
+        drawn["heat_maps"] = figures.heat_maps(task.shown, shown.mean)
+        drawn["surfaces"] = figures.surfaces(task.shown, shown.mean)
+    else:
+        drawn["parity"] = figures.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
+    if task.bound is not None and shown.spread is not None:
+        drawn["ensemble"] = figures.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
+    for name, figure in drawn.items():
+        figure.savefig(folder / f"{name}.png")
+
+
+def results_table(metrics: dict[str, float], task: Task) -> Table:
+    """The figures that a user wants to see, with units."""
+    table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.settings.precision}")
+    table.columns[1].justify = "right"
+    for key, value in metrics.items():
+        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else ""
+        small = f"{value:.2e}" if re.search("_mse|_loss|spread", key) else f"{value:,.1f}"
+        table.add_row(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else small, unit)
+    return table
+
+
+if __name__ == "__main__":
+    run(main, Arguments)
