@@ -139,6 +139,15 @@ def test_linear_least_squares_in_few_iterations(ridge):
     assert result.statistics.fallbacks == 0
 
 
+def test_a_linear_problem_has_no_acceleration():
+    data = tuple(map(jnp.asarray, linear_problem(60, 7)))
+    accelerated, plain = (
+        optimiser.run(optimiser.init(jnp.zeros(7)), data, 1).parameters
+        for optimiser in (make(linear, ridge=0.3), make(linear, ridge=0.3, acceleration=0.0))
+    )
+    np.testing.assert_allclose(accelerated, plain, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("rank", "damping", "falls_back"),
     [(4, 1e-3, False), (4, 1e-18, True), (7, 1e-18, False)],
@@ -242,6 +251,15 @@ def test_factor_of_a_singular_matrix_is_that_of_the_nearest_regular_one():
     np.testing.assert_allclose(matrix, basis @ basis.T, atol=1e-14)
     b = jnp.asarray(basis @ np.ones(3))
     np.testing.assert_allclose(basis @ basis.T @ equations.solve(factor, b), b, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("gap", "falls_back"), [(0.5, True), (4.0, False)])
+def test_a_factor_of_rounding_errors_is_not_used(gap, falls_back):
+    """[[1, 1 - gap eps], [1 - gap eps, 1]]: Cholesky succeeds with L_22² = 2 gap eps, and the bound is 2 eps."""
+    correlation = 1 - gap * np.finfo(float).eps
+    factor, fell_back = equations.factorise(jnp.array([[1.0, 0.0], [correlation, 1.0]]))
+    assert fell_back == falls_back
+    assert np.isfinite(np.asarray(factor.lower)).all()
 
 
 def test_acceleration_follows_a_curved_valley():
