@@ -15,7 +15,7 @@ def adamw(
     """AdamW with linear warm-up to `learning_rate` and cosine decay to `final_share` of it after `steps` steps.
 
     The default decay of the second moment forgets within a hundred steps; residuals shrink by orders of magnitude
-    during a run, and a longer memory keeps the steps too small (validation torque MSE of a DeLaN 9e-7, against 4e-6 with
+    during a run, and a longer memory keeps the steps too small (validation torque MSE 9e-7, against 4e-6 with
     0.999 and the best of three learning rates).
     """
     warm_up = max(1, round(warm_up_share * steps))
