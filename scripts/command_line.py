@@ -1,11 +1,12 @@
 """What the command lines share: errors as one line, names for scenes, and folders for runs."""
 
+import dataclasses
 import json
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import tyro
@@ -17,6 +18,11 @@ from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
+
+CONFIG = "config.json"
+"""Name of the file in a run's folder that holds the arguments it was started with."""
+PLACES = ("out", "resume", "figures")
+"""Arguments that do not decide the result."""
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "two-link-arm": two_link_arm,
@@ -71,6 +77,33 @@ def new_folder(path: Path | None, default: str) -> Path:
     except OSError as error:
         raise InputError(f"{path}: cannot create the folder ({error.strerror}); choose another --out") from error
     return path
+
+
+def stored_arguments(given: Any) -> dict[str, Any]:
+    """The arguments that decide the result, as JSON values."""
+    values = dataclasses.asdict(given)
+    return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
+
+
+def with_stored_arguments(given: Arguments) -> Arguments:
+    """The arguments that the run in --out was started with; what is given anew must not differ.
+
+    Raises:
+        InputError: --out holds no run, or one of other arguments.
+    """
+    folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
+    if folder is None or not (folder / CONFIG).is_file():
+        raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
+    stored = json.loads((folder / CONFIG).read_text())
+    unset = stored_arguments(type(given)())
+    for key, value in stored_arguments(given).items():
+        if value not in (stored.get(key), unset[key]):
+            option = key.replace("_", "-")
+            raise InputError(f"the run in {folder} was started with {key} = {stored.get(key)}; leave --{option} out")
+    kept = {key: value for key, value in stored.items() if key in unset}
+    if kept.get("data") is not None:
+        kept["data"] = Path(kept["data"])
+    return dataclasses.replace(cast(Any, given), **kept)
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 
 from dln_jax.data import schema
 from dln_jax.data.splits import Split, split
-from dln_jax.deploy.load import build, compiled
+from dln_jax.deploy.kinds import build
+from dln_jax.deploy.load import compiled
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report

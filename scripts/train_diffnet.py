@@ -10,7 +10,7 @@ import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -23,13 +23,13 @@ from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.evaluation import function_figures as figures
 from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
-from dln_jax.learning.regression import Settings, check, steps_of, train
+from dln_jax.learning.regression import WIDTHS, Settings, check, fingerprint, grow_width, steps_of, train
+from dln_jax.learning.runs import Checkpoint, Training
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
-from dln_jax.learning.train import Progress, Training
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from scripts import diffnet_table
-from scripts.command_line import new_folder, run, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
 from scripts.progress import progress
 
 NAMED = {
@@ -62,11 +62,14 @@ class Arguments:
     optimizer: Literal["adam", "gauss-newton"] = "gauss-newton"
     """Levenberg-Marquardt on all samples (f64) for small networks, or Adam, the published recipe, for wide ones."""
     width: int | None = None
-    """Hidden units per layer (default: 16 for gauss-newton, 128 for adam)."""
+    """Hidden units per layer (default: 128 for adam; for gauss-newton grown, 2, 4, 8, 16, until the validation error
+    no longer falls)."""
     depth: int | None = None
     """Hidden layers (default: 1 for one input, else 2)."""
-    steps: int = 100
-    """Gauss-Newton: iterations at most, per network."""
+    steps: int = 40
+    """Gauss-Newton: iterations on all samples at most, per network."""
+    coarse_steps: int = 200
+    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many."""
     epochs: int = 500
     """Adam: passes over the data."""
     batch: int = 512
@@ -85,11 +88,13 @@ class Arguments:
     """Of the data, the validation split, the initial parameters and the shuffling."""
     out: Path | None = None
     """Folder of the run (default: runs/train_diffnet-1, -2, ...)."""
+    resume: bool = False
+    """Continue the run, or the table, in --out with the settings it was started with."""
     figures: bool = True
     """Draw the figures."""
     table: bool = False
     """Train everything that the published table has, by both optimisers; of the other arguments --samples, --steps,
-    --epochs, --seed and --out count."""
+    --coarse-steps, --epochs, --seed, --out and --resume count."""
 
 
 class Task(NamedTuple):
@@ -104,26 +109,25 @@ class Task(NamedTuple):
     """Half the width of the box of the training data, where the shown grid is wider."""
     units: Units
     settings: Settings
+    grown: bool
+    """Whether the width is chosen by validation."""
 
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
+    if given.resume:
+        given = with_stored_arguments(given)
     if given.table:
         diffnet_table.write_table(console, given)
         return
     task = prepare(given)
-    folder = new_folder(given.out, "train_diffnet")
-    write_json(folder / "config.json", stored_settings(given, task))
+    folder = given.out if given.resume and given.out else new_folder(given.out, "train_diffnet")
+    write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
-    total = steps_of(task.sets, task.settings)
-    standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
-    with progress(total) as show:
-
-        def report(at: Progress) -> None:
-            show(min(int(at.step), total), f"loss {at.loss:.3e}  validation {at.validation:.3e}")
-
-        training = train(standard, task.settings, report=report)
+    settings, training = fit(task, folder, resume=given.resume, console=console)
+    task = task._replace(settings=settings)
+    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": settings._asdict()})
     if training.stop.reason == "not finite":
         console.print("the loss stopped being finite; the run keeps the best parameters before that")
     layers = layers_in_own_units(training.parameters, task.units)
@@ -134,6 +138,31 @@ def main(given: Arguments) -> None:
     if task.settings.activation == "relu":
         console.print(RELU)
     console.print(f"run folder: {folder}")
+
+
+def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Settings, Training]:
+    """Trains at the width asked for, or at growing ones; the settings that were chosen, and the training."""
+    standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
+    identity = {"data": fingerprint(standard)}
+
+    def train_one(settings: Settings) -> Training:
+        total = steps_of(task.sets, settings)
+        name = f"checkpoint_width_{settings.width}"
+        checkpoint = Checkpoint(folder, {"settings": settings._asdict(), **identity}, resume, name)
+        with progress(total) as show:
+            return train(
+                standard,
+                settings,
+                checkpoint=checkpoint,
+                report=lambda at: show(min(at.step, total), f"loss {at.loss:.3e}  validation {at.validation:.3e}"),
+            )
+
+    if not task.grown:
+        return task.settings, train_one(task.settings)
+    chosen, trials = grow_width(standard, task.settings, train_one, widths=WIDTHS)
+    tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
+    console.print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
+    return chosen.candidate, chosen.outcome
 
 
 def prepare(given: Arguments) -> Task:
@@ -156,22 +185,17 @@ def prepare(given: Arguments) -> Task:
     depth = given.depth if given.depth is not None else min(data.inputs, 2)
     settings = settings._replace(depth=depth)
     check(data, settings)
-    return Task(given.function, functions.split(data, seed=given.seed), test, shown, bound, units, settings)
+    grown = given.width is None and given.optimizer == "gauss-newton"
+    return Task(given.function, functions.split(data, seed=given.seed), test, shown, bound, units, settings, grown)
 
 
 def settings_from(given: Arguments) -> Settings:
     """The settings that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
     newton = given.optimizer == "gauss-newton"
     named = {key: value for key, value in dataclasses.asdict(given).items() if key in Settings._fields}
-    named["width"] = given.width if given.width is not None else (16 if newton else 128)
+    named["width"] = given.width if given.width is not None else (WIDTHS[0] if newton else 128)
     named["precision"] = given.precision or ("f64" if newton else "f32")
     return Settings(**{**named, "depth": 1, "members": given.ensemble})
-
-
-def stored_settings(given: Arguments, task: Task) -> dict[str, Any]:
-    """The arguments that decide the result, with the defaults that were chosen, as JSON values."""
-    values = {**dataclasses.asdict(given), **task.settings._asdict()}
-    return {key: value for key, value in values.items() if key not in ("out", "figures", "table", "members")}
 
 
 def announce(console: Console, task: Task) -> None:
@@ -179,7 +203,8 @@ def announce(console: Console, task: Task) -> None:
     data, settings = task.sets.train, task.settings
     counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
     terms = ["value", *(["gradient"] if settings.loss == "type1" else []), *(["Hessian"] * (settings.derivative == 2))]
-    layers = " x ".join([str(data.inputs), *[str(settings.width)] * settings.depth, str(data.outputs)])
+    width = "grown" if task.grown else str(settings.width)
+    layers = " x ".join([str(data.inputs), *[width] * settings.depth, str(data.outputs)])
     networks = f"{settings.members} networks" if settings.members > 1 else "network"
     console.print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
     console.print(
@@ -206,7 +231,8 @@ def evaluate(folder: Path, task: Task, training: Training, *, draw: bool) -> dic
         draw_figures(folder, task, shown, training)
     return {
         **metrics,
-        "validation_loss": min((at.validation for at in training.history), default=float("inf")),
+        "validation_loss": float(training.validation),
+        "width": task.settings.width,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.layers)),
         "steps": training.stop.step,
         "best_step": training.best_step,

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.deploy.load import build, load_run, save_model
+from dln_jax.deploy.kinds import build
+from dln_jax.deploy.load import load_run, save_model
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
 from dln_jax.types import InputError
 

@@ -231,7 +231,7 @@ def test_members_of_an_ensemble_train_as_if_alone():
     for index in range(2):
         start = jax.tree.map(lambda leaf, index=index: leaf[index : index + 1], first)
         ours = [targets(data, settings) for data in sets]
-        alone = optimiser(start, *ours, settings._replace(members=1), lambda at: None)
+        alone = optimiser(start, *ours, settings._replace(members=1), None, lambda at: None)
         assert alone.best_step == together.best_step == 36
         for one, both in zip(jax.tree.leaves(alone.parameters), jax.tree.leaves(together.parameters), strict=True):
             np.testing.assert_allclose(one[0], both[index], rtol=1e-9, atol=1e-12)

@@ -341,7 +341,15 @@ def test_minimise_several_seeds():
         return sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(parameters))
 
     state = jax.vmap(lambda parameters: optimiser.init(parameters))(parameters)
-    result = minimise(optimiser, state, NETWORK_DATA, iterations=12, dispatch=2, validation=size, report=seen.append)
+    result = minimise(
+        optimiser,
+        state,
+        NETWORK_DATA,
+        iterations=12,
+        dispatch=2,
+        validation=size,
+        on_dispatch=lambda _, at: seen.append(at),
+    )
     assert result.reason.count("\n") == 2
     for seed in range(3):
         validations = [progress.validation[seed] for progress in seen]
@@ -359,8 +367,7 @@ def test_a_run_resumes_bit_for_bit(capsys):
     settings = {
         "dispatch": 4,
         "validation": lambda parameters: jnp.abs(jnp.sum(parameters["out"])),
-        "on_dispatch": lambda state: stored.append(jax.tree.map(np.asarray, state)),
-        "report": seen.append,
+        "on_dispatch": lambda state, at: (stored.append(jax.tree.map(np.asarray, state)), seen.append(at)),
     }
     start = optimiser.init(network_parameters(0), jax.random.key(7))
     unbroken = minimise(optimiser, start, NETWORK_DATA, iterations=14, **settings)
@@ -474,7 +481,7 @@ def test_non_finite_loss_stops_with_the_last_good_state():
         (inputs, targets),
         iterations=8,
         dispatch=1,
-        on_dispatch=states.append,
+        on_dispatch=lambda state, _: states.append(state),
     )
     assert result.status == Status.NON_FINITE
     assert result.reason.startswith("iteration 5: the loss is not finite")

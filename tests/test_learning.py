@@ -10,7 +10,8 @@ from dln_jax.data import generators
 from dln_jax.data.splits import split
 from dln_jax.learning import fit
 from dln_jax.learning.optimisers import adamw
-from dln_jax.learning.residuals import samples, torque_loss, torque_scale
+from dln_jax.learning.residuals import TORQUE, arrays, mean_loss, torque_scale
+from dln_jax.learning.runs import Stop
 from dln_jax.learning.train import Settings, fingerprint, train
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
@@ -58,7 +59,7 @@ def run(prepared, state=None, patience=10**6, until=None):
 def test_it_finds_the_line_and_counts_whole_epochs():
     state, stop, records, _ = run(line_fit(optax.adam(0.1), steps=301, steps_per_dispatch=100))
     np.testing.assert_allclose(state.best_parameters, [3.0, -1.0], atol=1e-3)
-    assert stop == fit.Stop("finished", 303)  # 3 batches of 16 in 50 samples
+    assert stop == Stop("finished", 303)  # 3 batches of 16 in 50 samples
     assert [record.step for record in records] == [102, 204, 303]
     assert float(state.best_validation) == pytest.approx(min(record.validation for record in records), rel=1e-5)
 
@@ -134,7 +135,7 @@ def test_torque_scale_never_divides_by_zero():
 def test_the_textbook_has_no_torque_residual():
     data = generators.uniform(two_link_arm(), samples=100)
     scale = torque_scale(data)
-    assert torque_loss(dynamics(two_link_arm()), samples(data, jnp.float64), scale) < 1e-24
+    assert mean_loss(TORQUE, dynamics(two_link_arm()), arrays(TORQUE, data, jnp.float64), scale) < 1e-24
 
 
 @pytest.fixture(scope="module")

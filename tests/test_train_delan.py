@@ -20,7 +20,7 @@ from scripts import make_data, train_delan
 from scripts.command_line import run
 
 ROOT = Path(__file__).parent.parent
-TINY = ("--steps", "40", "--width", "4", "--depth", "1", "--batch", "64")
+TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64")
 FILES = {
     "config.json",
     "metrics.json",
@@ -123,6 +123,8 @@ def test_resuming_with_other_settings_or_nothing_is_refused(trained, workplace, 
 def test_a_killed_run_resumes_to_the_same_parameters(workplace):
     """SIGKILL after the first checkpoint, then --resume: the model equals an unbroken run's to the last bit."""
     settings = (
+        "--optimizer",
+        "adam",
         "--steps",
         "1200",
         "--width",

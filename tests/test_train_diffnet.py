@@ -11,6 +11,7 @@ from test_train_delan import command, refused
 
 from dln_jax.data import functions
 from dln_jax.deploy.load_function import load_function
+from dln_jax.learning import first_order, runs, second_order
 from dln_jax.types import InputError
 from scripts import diffnet_report, diffnet_table, train_diffnet
 
@@ -29,7 +30,8 @@ def metrics_of(folder):
 
 
 def names_in(folder):
-    return {path.name for path in folder.iterdir()}
+    """Without the checkpoints."""
+    return {path.name for path in folder.iterdir() if not path.name.startswith("checkpoint")}
 
 
 @pytest.fixture
@@ -61,7 +63,8 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     metrics = metrics_of(folder)
     assert set(metrics) >= METRICS and metrics["parameters"] == 4 + 4 + 4 + 1
     config = json.loads((folder / "config.json").read_text())
-    assert (config["function"], config["optimizer"], config["precision"]) == ("sin", "gauss-newton", "f64")
+    assert (config["function"], config["optimizer"]) == ("sin", "gauss-newton")
+    assert (config["chosen"]["width"], config["chosen"]["precision"]) == (4, "f64")
     loaded = load_function(folder)
     grid = functions.sine_grid()
     answers = jax.vmap(loaded.derivatives)(grid.x)
@@ -109,6 +112,51 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
     assert metrics_of(workplace / "run")["hessian_mse"] == pytest.approx(np.mean(functions.sine_grid().d2y ** 2))
 
 
+@pytest.mark.parametrize("optimizer", ["gauss-newton", "adam"])
+def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, optimizer):
+    """Stopped after a few reports, and continued; Gauss-Newton chooses its width again."""
+    own_file("mine.npz")
+    growing = ("--coarse-steps", "6") if optimizer == "gauss-newton" else ("--width", "3")
+    wanted = (
+        "--function",
+        "mine.npz",
+        "--loss",
+        "type2",
+        "--depth",
+        "1",
+        "--optimizer",
+        optimizer,
+        "--steps",
+        "12",
+        "--epochs",
+        "6",
+        "--batch",
+        "16",
+    )
+    monkeypatch.setattr(train_diffnet, "WIDTHS", (2,))
+    command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
+    stored = runs.store
+    left = iter(range(1))
+
+    def store_and_die(*arguments):
+        stored(*arguments)
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    for module in (first_order, second_order):
+        monkeypatch.setattr(module, "store", store_and_die)
+    with pytest.raises(SystemExit) as exit_:
+        command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "broken")
+    assert exit_.value.code == 130 and not (workplace / "broken" / "model.json").exists()
+    for module in (first_order, second_order):
+        monkeypatch.setattr(module, "store", stored)
+    line = refused(capsys, train_diffnet, "--resume", "--out", "broken", "--seed", "3")
+    assert "started with seed = 0; leave --seed out" in line
+    command(train_diffnet, "--resume", "--no-figures", "--out", "broken")
+    ours, theirs = ((workplace / run / "model.safetensors").read_bytes() for run in ("broken", "unbroken"))
+    assert ours == theirs
+
+
 MISTAKES = {
     "missing file": (None, [], "no such file"),
     "missing key": ({"y": None}, [], "key 'y' is missing"),
@@ -150,9 +198,8 @@ def test_a_folder_with_another_model_is_refused(workplace):
 def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypatch, capsys):
     """With training stubbed: each row of the published table gets the best of ours and its bound."""
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
-    monkeypatch.setattr(
-        diffnet_table, "measure", lambda sets, test, settings: {**numbers, "train_seconds": 1.0, "compile_seconds": 2.0}
-    )
+    costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
+    monkeypatch.setattr(diffnet_table, "measure", lambda sets, test, settings: {**numbers, **costs})
     command(train_diffnet, "--table", "--samples", "50", "--out", "table")
     report = json.loads((workplace / "table" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
@@ -164,6 +211,9 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     assert bounds["sin/best", "value_mse"] == pytest.approx(1.7e-8 / 30)
     assert bounds["cos_sin/best", "hessian_mse"] == pytest.approx(1.7e-4 / 10)
     assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
+    # What is measured is not measured again.
+    monkeypatch.setattr(diffnet_table, "measure", None)
+    command(train_diffnet, "--table", "--resume", "--out", "table")
     out = capsys.readouterr().out
     assert out.count("published") >= 12 and "almost everywhere" in out and "…" not in out
     assert all(f"{number:.1e}" in out for row in diffnet_table.PUBLISHED["sin"]["type2"] for number in row)

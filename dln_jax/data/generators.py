@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import TypeVar, cast
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from dln_jax.data.letters import LETTERS, letter_path
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.integrators import adaptive_rollout, second_order
 from dln_jax.scenes.scene import (
     Scene,
     actuation_matrix,
@@ -26,7 +26,7 @@ from dln_jax.types import InputError, require_positive
 Function = TypeVar("Function", bound=Callable)
 
 
-def _in_float64(function: Function) -> Function:
+def in_float64(function: Function) -> Function:
     """Computes in float64, whatever the caller's default is."""
 
     @functools.wraps(function)
@@ -37,7 +37,7 @@ def _in_float64(function: Function) -> Function:
     return cast(Function, wrapped)
 
 
-@_in_float64
+@in_float64
 def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Trajectories:
     """The two-link arm's tip writes letters, one trajectory each, sampled every `dt` s.
 
@@ -70,10 +70,10 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
         for k in range(3)
     )
     trajectory = np.repeat(np.arange(len(times)), [len(t) for t in times])
-    return _complete(two_link_arm(), np.concatenate(times), q, qd, qdd, trajectory, np.array(list(letters)))
+    return completed(two_link_arm(), np.concatenate(times), q, qd, qdd, trajectory, np.array(list(letters)))
 
 
-@_in_float64
+@in_float64
 def uniform(
     scene: Scene,
     *,
@@ -107,10 +107,10 @@ def uniform(
         qdd = _batched(closed_form_forward_dynamics, scene)(q, qd, control @ matrix.T)
     order = np.arange(samples)
     label = np.array([f"state-{index}" for index in order])
-    return _complete(scene, np.zeros(samples), q, qd, np.asarray(qdd), order, label)
+    return completed(scene, np.zeros(samples), q, qd, np.asarray(qdd), order, label)
 
 
-@_in_float64
+@in_float64
 def free_swing(
     scene: Scene,
     *,
@@ -138,11 +138,11 @@ def free_swing(
     qdd = np.asarray(_batched(closed_form_forward_dynamics, scene)(q, qd, np.zeros_like(q)))
     trajectory = np.repeat(np.arange(len(starts)), steps)
     label = np.array([f"swing-{index}" for index in range(len(starts))])
-    data = _complete(scene, np.tile(t, len(starts)), q, qd, qdd, trajectory, label)
+    data = completed(scene, np.tile(t, len(starts)), q, qd, qdd, trajectory, label)
     return data._replace(tau=np.zeros_like(q))
 
 
-@_in_float64
+@in_float64
 def rollouts(
     scene: Scene,
     q: Float[np.ndarray, "K d"],
@@ -153,25 +153,13 @@ def rollouts(
 ) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
     """Reference motions of a scene without torque from K states: q and qd at the times t, which start at 0."""
 
-    def field(time, state, _):
-        return state[1], closed_form_forward_dynamics(scene, state[0], state[1], jnp.zeros_like(state[0]))
+    def acceleration(time, q, qd):
+        return closed_form_forward_dynamics(scene, q, qd, jnp.zeros_like(q))
 
     @jax.jit
     @jax.vmap
     def solve(q, qd):
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
-            diffrax.Dopri8(),
-            t0=t[0],
-            t1=t[-1],
-            dt0=None,
-            y0=(q, qd),
-            saveat=diffrax.SaveAt(ts=jnp.asarray(t)),
-            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-            max_steps=100_000,
-            throw=False,
-        )
-        return solution.ys, solution.result == diffrax.RESULTS.successful
+        return adaptive_rollout(second_order(acceleration), (q, qd), jnp.asarray(t), tolerance=tolerance)
 
     motions, successful = solve(q, qd)
     if not bool(successful.all()):
@@ -179,8 +167,8 @@ def rollouts(
     return np.asarray(motions[0]), np.asarray(motions[1])
 
 
-def _complete(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
-    """Adds exact torques, momenta and the decomposition to a motion of a scene."""
+def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
+    """Adds exact torques, momenta and the decomposition to a motion of a scene; arrays as in the schema."""
     parts = _batched(closed_form_decomposition, scene)(q, qd, qdd)
 
     def momentum(scene, q, qd, qdd):

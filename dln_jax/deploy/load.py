@@ -6,41 +6,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dln_jax.data.schema import needs_from_json
+from dln_jax.deploy.kinds import build
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
-from dln_jax.learning.train import data_type
+from dln_jax.learning.runs import data_type
 from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.models.delan import make_delan
-from dln_jax.models.model import Model, Parameters
-from dln_jax.nn.activations import activation
+from dln_jax.models.model import Parameters
 from dln_jax.types import InputError
 
 MODEL = "model"
 """Name of the file pair in a run's folder that holds the trained model."""
-
-
-def build(description: dict[str, Any]) -> Model:
-    """The model that a description, plain JSON values, stands for.
-
-    Keys: `kind` ("structured-delan"), `needs`, `width`, `depth`, `activation`, `diagonal_shift`, `diagonal_floor` and
-    `precision` (f32 or f64).
-
-    Raises:
-        InputError: an unknown kind, needs, activation or precision, or a missing or unknown key.
-    """
-    settings = dict(description)
-    kind = settings.pop("kind", None)
-    if kind != "structured-delan":
-        raise InputError(f"model kind is {kind!r}; this release knows structured-delan")
-    try:
-        return make_delan(
-            needs_from_json(settings.pop("needs")),
-            activation=activation(settings.pop("activation")),
-            dtype=data_type(settings.pop("precision")),
-            **settings,
-        )
-    except (KeyError, TypeError) as error:
-        raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error
 
 
 def save_model(directory: Path, description: dict[str, Any], parameters: Parameters) -> None:
@@ -67,9 +41,9 @@ def load_run(directory: str | Path) -> Dynamics:
 
 
 def compiled(dynamics: Dynamics, dtype) -> Dynamics:
-    """The same functions, jitted, with their arguments converted to one type."""
+    """The same functions, jitted, with their arguments converted to one type; `None` stays `None`."""
 
     def convert_and_call(function):
-        return jax.jit(lambda *state: function(*(jnp.asarray(array, dtype) for array in state)))
+        return function and jax.jit(lambda *state: function(*(jnp.asarray(array, dtype) for array in state)))
 
     return Dynamics(*map(convert_and_call, dynamics))

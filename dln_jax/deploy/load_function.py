@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from dln_jax.deploy.load import MODEL
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
-from dln_jax.learning.train import data_type
+from dln_jax.learning.runs import data_type
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import activation
 from dln_jax.nn.differential_mlp import Layers

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.train import Progress
+from dln_jax.learning.runs import Progress
 
 TRUTH, MODEL, TEST = "#111111", "#d1495b", "#2e6f95"
 PARTS = ("tau", "tau_inertial", "tau_coriolis", "tau_gravity")
@@ -70,6 +70,39 @@ def training_curve(history: Sequence[Progress], *, best_step: int) -> Figure:
     axis.set_ylabel("loss, or MSE in (N m)²")
     axis.grid(True, alpha=0.25)
     axis.legend(frameon=False)
+    return figure
+
+
+def error_against_time(curves: dict[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
+    """Error against seconds of training, a curve or a point for each name, with the Pareto front of all.
+
+    A point is on the front if nothing as quick has a lower error. Names are `model/data/optimiser`; curves of
+    one model share a colour, first-order optimisers are dashed.
+    """
+    figure = _figure(8.6, 5.0)
+    axis = figure.subplots()
+    models = sorted({name.split("/")[0] for name in curves})
+    for name, (seconds, errors) in curves.items():
+        first_order = name.endswith("adam")
+        axis.loglog(
+            seconds,
+            errors,
+            color=f"C{models.index(name.split('/')[0])}",
+            linestyle="--" if first_order else "-",
+            marker="s" if first_order else "o",
+            markevery=[len(seconds) - 1],
+            linewidth=1.4,
+            label=name.replace("/", ", "),
+        )
+    points = sorted((s, e) for seconds, errors in curves.values() for s, e in zip(seconds, errors, strict=True))
+    lowest = np.minimum.accumulate([error for _, error in points])
+    axis.step(
+        [second for second, _ in points], lowest, where="post", color="0.75", linewidth=6, zorder=0, label="front"
+    )
+    axis.set_xlabel("training, s per seed, compilation included")
+    axis.set_ylabel("test torque MSE, (N m)²")
+    axis.grid(True, which="major", alpha=0.25)
+    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.learning.train import Progress
+from dln_jax.learning.runs import Progress
 
 TRUTH, MODEL, ERROR = "#111111", "#d1495b", "#2e6f95"
 SIGNED, POSITIVE = "RdBu_r", "viridis"

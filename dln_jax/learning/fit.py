@@ -9,8 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import Array
+
+from dln_jax.learning.runs import Stop, plain
 
 Parameters = Any
 Data = Any
@@ -38,32 +41,29 @@ class FitState(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What one dispatch reports, as Python numbers."""
+    """What one dispatch reports: Python numbers, or arrays [seeds]."""
 
-    step: int
-    loss: float
+    step: Any
+    loss: Any
     """Mean training loss over the dispatch."""
-    validation: float
-    monitor: float
+    validation: Any
+    monitor: Any
     """Value that is shown and never used for a choice."""
-
-
-class Stop(NamedTuple):
-    """Why the loop ended."""
-
-    reason: str
-    """"finished", "no improvement" or "not finite"."""
-    step: int
-    """Steps taken; for "not finite" those after which the loss was not."""
 
 
 class Fit(NamedTuple):
     """The compiled parts of a fit; see `make_fit`."""
 
-    init: Callable[[Parameters, int], FitState]
+    init: Callable[[Parameters, Any], FitState]
     """(parameters, seed) -> state before the first step."""
     dispatch: Any
-    """Jitted (state, epochs) -> state, [loss, validation, monitor]; the given state's buffers are used up."""
+    """Jitted (state, epochs) -> state, [loss, validation, monitor]; the given state's buffers are used up.
+
+    States with a leading axis of seeds need the fit that `over_seeds` gives."""
+    start: Any
+    """`init` of one seed, not jitted."""
+    advance: Any
+    """`dispatch` of one seed, not jitted."""
     epochs: int
     """Epochs of a whole run."""
     epochs_per_dispatch: int
@@ -145,7 +145,7 @@ def make_fit(
         )
         return state, jnp.stack([jnp.asarray(v, dtype) for v in (total / total_steps, value, shown)])
 
-    def init(parameters: Parameters, seed: int) -> FitState:
+    def init(parameters: Parameters, seed: Any) -> FitState:
         value = jnp.asarray(jnp.inf, jnp.result_type(*jax.tree.leaves(parameters)))
         return FitState(
             parameters=parameters,
@@ -160,11 +160,25 @@ def make_fit(
         )
 
     return Fit(
-        init=jax.jit(init, static_argnums=1),
+        init=jax.jit(init),
         dispatch=jax.jit(dispatch, donate_argnums=0),
+        start=init,
+        advance=dispatch,
         epochs=epochs,
         epochs_per_dispatch=epochs_per_dispatch,
     )
+
+
+def over_seeds(fit: Fit) -> Fit:
+    """The same fit for states with a leading axis of seeds, all in one program: init takes seeds [K] as well."""
+
+    def init(parameters: Parameters, seeds: Array) -> FitState:
+        return jax.vmap(fit.start)(parameters, seeds)
+
+    def dispatch(states: FitState, count: Array) -> tuple[FitState, Array]:
+        return jax.vmap(fit.advance, (0, None))(states, count)
+
+    return fit._replace(init=jax.jit(init), dispatch=jax.jit(dispatch, donate_argnums=0))
 
 
 def run(
@@ -182,18 +196,17 @@ def run(
         patience: steps without a better validation value after which to stop.
         on_dispatch: called after every dispatch, to report and to store; the state is valid only during the call.
     """
-    while int(state.epoch) < fit.epochs:
-        if int(state.failed_step) >= 0:
-            return state, Stop("not finite", int(state.failed_step))
-        if int(state.step) - int(state.best_step) >= patience:
-            return state, Stop("no improvement", int(state.step))
-        count = min(fit.epochs_per_dispatch, fit.epochs - int(state.epoch))
-        state, values = fit.dispatch(state, count)
-        if int(state.failed_step) >= 0:
+    while (epoch := int(np.max(state.epoch))) < fit.epochs:
+        if np.all(np.asarray(state.failed_step) >= 0):
+            return state, Stop("not finite", int(np.max(state.failed_step)))
+        if np.all(np.asarray(state.step - state.best_step) >= patience):
+            return state, Stop("no improvement", int(np.max(state.step)))
+        state, values = fit.dispatch(state, min(fit.epochs_per_dispatch, fit.epochs - epoch))
+        if np.all(np.asarray(state.failed_step) >= 0):
             continue
-        loss, validation, monitor = map(float, values)
-        on_dispatch(state, Record(int(state.step), loss, validation, monitor))
-    return state, Stop("finished", int(state.step))
+        loss, validation, monitor = np.moveaxis(np.asarray(values), -1, 0)
+        on_dispatch(state, Record(*map(plain, (state.step, loss, validation, monitor))))
+    return state, Stop("finished", int(np.max(state.step)))
 
 
 def _permutation(key: Array, count: int) -> Array:

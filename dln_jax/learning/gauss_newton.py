@@ -50,6 +50,7 @@ _REASONS = {
     "or start with more damping",
     Status.ITERATIONS: "the iterations asked for are done",
     Status.TIME: "the time asked for is over",
+    Status.TARGET: "the validation is as low as asked",
 }
 
 
@@ -59,6 +60,8 @@ class Progress(NamedTuple):
     iteration: np.ndarray
     loss: np.ndarray
     validation: np.ndarray | None
+    scores: np.ndarray | None
+    """All that the validation function gave, [k] or [seeds, k]; `None` without one, or where it gives a scalar."""
     damping: np.ndarray
     gradient_norm: np.ndarray
     seconds: float
@@ -100,10 +103,11 @@ def minimise(
     *,
     iterations: int,
     seconds: float = math.inf,
+    target: float = -math.inf,
     dispatch: int = 10,
     validation: Callable[[Any], Array] | None = None,
-    report: Callable[[Progress], object] | None = None,
-    on_dispatch: Callable[[State], object] | None = None,
+    on_compiled: Callable[[float], object] | None = None,
+    on_dispatch: Callable[[State, Progress], object] | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Result:
     """Runs until `iterations` are done in total, time is over, or a stop rule holds.
@@ -114,11 +118,12 @@ def minimise(
         arrays: data, samples on axis 0.
         iterations: to be done in total, those that led to `state` included.
         seconds: after which to stop, in s; looked at between dispatches.
+        target: validation at which to stop; of several seeds the worst counts.
         dispatch: iterations in one compiled call.
         validation: parameters of ONE seed -> scalar, jitted here and evaluated after each dispatch; the parameters with
-            the lowest value are kept.
-        report: shows progress after each dispatch.
-        on_dispatch: stores the state after each dispatch.
+            the lowest value are kept. Of a vector the first entry chooses, the rest is passed on.
+        on_compiled: called with the seconds that compilation took, before the first dispatch.
+        on_dispatch: shows progress and stores the state after each dispatch.
         clock: seconds, for `seconds` and the statistics.
 
     Raises:
@@ -134,31 +139,37 @@ def minimise(
         # One seed after the other: a validation that calls LAPACK must not do so for a batch (see the optimiser).
         evaluate = jax.jit((lambda stacked: lax.map(validation, stacked)) if several else validation)
     state = jax.block_until_ready(optimiser.run(state, arrays, 0))
+    if evaluate is not None:
+        jax.block_until_ready(evaluate(state.parameters))
     compile_seconds = clock() - start
+    if on_compiled is not None:
+        on_compiled(compile_seconds)
 
+    reached = False
     while remaining := _remaining(state, iterations):
-        if clock() - start >= seconds:
+        reached = bool(np.all(np.asarray(state.best_validation) <= target))
+        if reached or clock() - start >= seconds:
             break
         state = jax.block_until_ready(optimiser.run(state, arrays, min(dispatch, remaining)))
-        values = None
+        values = scores = None
         if evaluate is not None:
-            values = evaluate(state.parameters)
+            values = np.asarray(evaluate(state.parameters))
+            if values.ndim > several:
+                values, scores = values[..., 0], values
             state = _keep_best(state, values)
         if on_dispatch is not None:
-            on_dispatch(state)
-        if report is not None:
-            report(
-                Progress(
-                    iteration=np.asarray(state.iteration),
-                    loss=np.asarray(state.loss),
-                    validation=None if values is None else np.asarray(values),
-                    damping=np.asarray(state.damping),
-                    gradient_norm=np.asarray(state.gradient_norm),
-                    seconds=clock() - start,
-                )
+            progress = Progress(
+                iteration=np.asarray(state.iteration),
+                loss=np.asarray(state.loss),
+                validation=values,
+                scores=scores,
+                damping=np.asarray(state.damping),
+                gradient_norm=np.asarray(state.gradient_norm),
+                seconds=clock() - start,
             )
+            on_dispatch(state, progress)
 
-    ended_by = Status.TIME if _remaining(state, iterations) else Status.ITERATIONS
+    ended_by = (Status.TARGET if reached else Status.TIME) if _remaining(state, iterations) else Status.ITERATIONS
     status = np.where(np.asarray(state.status) == Status.RUNNING, int(ended_by), np.asarray(state.status))
     validated = validation is not None
     return Result(

@@ -57,6 +57,7 @@ class Status(enum.IntEnum):
     NON_FINITE = 5
     ITERATIONS = 6
     TIME = 7
+    TARGET = 8
 
 
 class State(NamedTuple):

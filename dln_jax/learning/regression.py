@@ -9,19 +9,22 @@ Two optimisers: the published recipe (Adam with decoupled weight decay, minibatc
 and Levenberg-Marquardt on all samples at once, float64, for small ones, whose errors go down to what the noise leaves.
 """
 
-import time
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.learning import fit, gauss_newton
-from dln_jax.learning.train import Progress, Training, data_type
+from dln_jax.learning.first_order import train_first_order
+from dln_jax.learning.growth import Trial, grow
+from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, data_type, silent
+from dln_jax.learning.second_order import COARSE_SAMPLES, Budget, require_float64, train_second_order
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -29,6 +32,8 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 LOSSES = ("type1", "type2")
 OPTIMIZERS = ("adam", "gauss-newton")
+WIDTHS = (2, 4, 8, 16)
+"""Of hidden layers, for `grow_width`."""
 
 
 class Settings(NamedTuple):
@@ -51,8 +56,10 @@ class Settings(NamedTuple):
     batch: int = 512
     learning_rate: float = 1e-3
     weight_decay: float = 1e-6
-    steps: int = 100
-    """Iterations of Gauss-Newton for each member, at most."""
+    steps: int = 40
+    """Iterations of Gauss-Newton on all samples for each member, at most."""
+    coarse_steps: int = 200
+    """Iterations of Gauss-Newton before, at most, on a part of the samples, where there are many."""
     improvement_tolerance: float = 1e-7
     """Relative decrease of the loss in an iteration of Gauss-Newton at which a member stops."""
     precision: str = "f32"
@@ -79,8 +86,8 @@ def check(data: FunctionSamples, settings: Settings) -> None:
     require_positive(**{name: getattr(settings, name) for name in numbers})
     if settings.optimizer not in OPTIMIZERS:
         raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
-    if settings.optimizer == "gauss-newton" and settings.precision != "f64":
-        raise InputError(f"precision is {settings.precision}; gauss-newton needs f64, as it squares condition numbers")
+    if settings.optimizer == "gauss-newton":
+        require_float64(settings.precision)
     activation(settings.activation)
     data_type(settings.precision)
     _needed(data, settings)
@@ -116,15 +123,21 @@ def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scal
 
 
 def train(
-    sets: SampleSplit, settings: Settings, *, report: Callable[[Progress], None] = lambda progress: None
+    sets: SampleSplit, settings: Settings, *, checkpoint: Checkpoint | None = None, report: Report = silent
 ) -> Training:
     """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
 
     The result's parameters are layers with the ensemble's members on the leading axis, also when there is one. Adam
     shows all members the same batches and keeps one step for all; Gauss-Newton keeps the best of each.
 
+    Args:
+        sets: what to fit, and to select by.
+        settings: how to train.
+        checkpoint: where to store the run after every dispatch, and whether to continue one.
+        report: called after every dispatch, with means over the members.
+
     Raises:
-        InputError: what `check` finds.
+        InputError: what `check` finds, or a checkpoint that does not fit.
     """
     check(sets.train, settings)
     sizes = (sets.train.inputs, *(settings.width,) * settings.depth, sets.train.outputs)
@@ -133,13 +146,13 @@ def train(
     )
     ours, theirs = (targets(data, settings) for data in sets)
     start = _by_adam if settings.optimizer == "adam" else _by_gauss_newton
-    return start(layers, ours, theirs, settings, report)
+    return start(layers, ours, theirs, settings, checkpoint, report)
 
 
 def steps_of(sets: SampleSplit, settings: Settings) -> int:
     """Steps of a whole run, as `report` counts them."""
     if settings.optimizer == "gauss-newton":
-        return settings.steps
+        return settings.steps + (settings.coarse_steps if len(sets.train.x) >= 2 * COARSE_SAMPLES else 0)
     samples = len(sets.train.x)
     return settings.epochs * (samples // min(settings.batch, samples))
 
@@ -162,68 +175,110 @@ def _needed(data: FunctionSamples, settings: Settings) -> list[str]:
     return needed
 
 
-def _by_adam(layers: Layers, train: Targets, validation: Targets, settings: Settings, report) -> Training:
+def _by_adam(
+    layers: Layers,
+    train: Targets,
+    validation: Targets,
+    settings: Settings,
+    checkpoint: Checkpoint | None,
+    report: Report,
+) -> Training:
     function = activation(settings.activation)
 
     def sum_of_losses(layers: Layers, batch: Targets) -> Scalar:
         """A sum, so that each member's gradient, and with it its training, is the same as alone."""
+        if settings.members == 1:
+            # An axis of one member would make every product a batch of products, at two or three times the cost.
+            return mean_loss(jax.tree.map(lambda leaf: leaf[0], layers), batch, activation=function)
         return jax.vmap(lambda member: mean_loss(member, batch, activation=function))(layers).sum()
 
     steps = settings.epochs * (len(train.x) // min(settings.batch, len(train.x)))
-    prepared = fit.make_fit(
+    training = train_first_order(
         sum_of_losses,
         optax.adamw(settings.learning_rate, weight_decay=settings.weight_decay),
+        layers,
         train,
+        score=lambda layers: (sum_of_losses(layers, validation) / settings.members, jnp.array(jnp.nan)),
+        seed=settings.seed,
         steps=steps,
         batch=settings.batch,
-        score=lambda layers: (sum_of_losses(layers, validation) / settings.members, jnp.array(jnp.nan)),
+        patience=steps,
         steps_per_dispatch=max(1, min(450, steps // 20)),
+        checkpoint=checkpoint,
+        report=lambda at: report(_per_member(at, settings)),
     )
-    state = prepared.init(layers, settings.seed)
-    start = time.perf_counter()
-    compiled = prepared.dispatch.lower(state, prepared.epochs_per_dispatch).compile()
-    compile_seconds = time.perf_counter() - start
-    start = time.perf_counter()
-    history: list[Progress] = []
-
-    def on_dispatch(state: fit.FitState, record: fit.Record) -> None:
-        record = record._replace(loss=record.loss / settings.members)
-        history.append(Progress(*record, seconds=time.perf_counter() - start))
-        report(history[-1])
-
-    state, stop = fit.run(prepared._replace(dispatch=compiled), state, patience=steps, on_dispatch=on_dispatch)
-    return Training(state.best_parameters, history, stop, int(state.best_step), compile_seconds)
+    return training._replace(history=[_per_member(at, settings) for at in training.history])
 
 
-def _by_gauss_newton(layers: Layers, train: Targets, validation: Targets, settings: Settings, report) -> Training:
+def _per_member(at: Progress, settings: Settings) -> Progress:
+    return at._replace(loss=at.loss / settings.members)
+
+
+def _by_gauss_newton(
+    layers: Layers,
+    train: Targets,
+    validation: Targets,
+    settings: Settings,
+    checkpoint: Checkpoint | None,
+    report: Report,
+) -> Training:
     function = activation(settings.activation)
     keys = [key for key, array in train._asdict().items() if array is not None]
 
     def sample_residual(layers: Layers, *sample: Array) -> Array:
         return residual(layers, Targets(**dict(zip(keys, sample, strict=True))), activation=function)
 
-    optimiser = gauss_newton.make_levenberg_marquardt(
-        sample_residual, improvement_tolerance=settings.improvement_tolerance
-    )
-    history: list[Progress] = []
+    def mean_over_members(at: Progress) -> Progress:
+        return at._replace(loss=np.mean(at.loss), validation=np.mean(at.validation), monitor=float("nan"))
 
-    def on_progress(at: gauss_newton.Progress) -> None:
-        value = float("nan") if at.validation is None else float(at.validation.mean())
-        step = int(at.iteration.max())
-        history.append(Progress(step, float(at.loss.mean()), value, monitor=float("nan"), seconds=at.seconds))
-        report(history[-1])
-
-    result = gauss_newton.minimise(
-        optimiser,
-        jax.vmap(lambda member: optimiser.init(member))(layers),
+    training = train_second_order(
+        sample_residual,
+        layers,
         tuple(getattr(train, key) for key in keys),
-        iterations=settings.steps,
-        validation=lambda member: mean_loss(member, validation, activation=function),
-        report=on_progress,
+        score=lambda member: (mean_loss(member, validation, activation=function), jnp.array(jnp.nan)),
+        budget=Budget(settings.steps, settings.coarse_steps, improvement_tolerance=settings.improvement_tolerance),
+        seeds=True,
+        checkpoint=checkpoint,
+        report=lambda at: report(mean_over_members(at)),
     )
-    compile_seconds = result.statistics.compile_seconds
-    history = [at._replace(seconds=at.seconds - compile_seconds) for at in history]
-    failed = (result.status == gauss_newton.Status.NON_FINITE).any()
-    stop = fit.Stop("not finite" if failed else "finished", int(result.statistics.iterations.max()))
-    best = min(history, key=lambda at: at.validation, default=None)
-    return Training(result.parameters, history, stop, 0 if best is None else int(best.step), compile_seconds)
+    history = [mean_over_members(at) for at in training.history]
+    return training._replace(history=history, best_step=int(np.max(training.best_step)))
+
+
+def grow_width(
+    sets: SampleSplit, settings: Settings, fit: Callable[[Settings], Training], *, widths: Sequence[int] = WIDTHS
+) -> tuple[Trial, list[Trial]]:
+    """Trains networks of growing width by `fit` and chooses the smallest that the validation calls enough.
+
+    The outcome of each trial is its `Training`.
+    """
+
+    def fit_and_judge(candidate: Settings) -> tuple[Training, Float[np.ndarray, " N"]]:
+        training = fit(candidate)
+        return training, validation_errors(sets, candidate, training.parameters)
+
+    return grow([settings._replace(width=width) for width in widths], fit_and_judge)
+
+
+def fingerprint(sets: SampleSplit) -> str:
+    """SHA-256 of the numbers that a run reads, by which a resumed run knows its data."""
+    digest = hashlib.sha256()
+    for data in sets:
+        for array in data:
+            if array is not None:
+                digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def validation_errors(sets: SampleSplit, settings: Settings, layers: Layers) -> Float[np.ndarray, " N"]:
+    """|r|² of each validation sample, the mean over the ensemble's members."""
+    function = activation(settings.activation)
+
+    @jax.jit
+    def squares(batch: Targets) -> Array:
+        def of_member(member: Layers) -> Array:
+            return jax.vmap(lambda sample: jnp.sum(residual(member, sample, activation=function) ** 2))(batch)
+
+        return jnp.mean(jax.vmap(of_member)(layers), axis=0)
+
+    return np.asarray(squares(targets(sets.validation, settings)))

@@ -1,8 +1,11 @@
-"""What training makes small."""
+"""What training makes small: an objective names the arrays that it reads, their units, and the residuals per sample."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, vmap
 from jaxtyping import Float
 
@@ -11,18 +14,17 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, Scalar, Vector
 
 
-class Samples(NamedTuple):
-    """The arrays that a torque residual reads, on the device, [N, d] each."""
+class Objective(NamedTuple):
+    """What a model of dynamics is fitted to."""
 
-    q: Array
-    qd: Array
-    qdd: Array
-    tau: Array
-
-
-def samples(data: Trajectories, dtype) -> Samples:
-    """The samples of all trajectories as device arrays."""
-    return Samples(*(jnp.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)))
+    keys: tuple[str, ...]
+    """The arrays of `Trajectories` that the residual reads, [N, d] each."""
+    scale: Callable[[Trajectories], Float[Array, " r"]]
+    """Training data -> the unit of each residual. Raises InputError where the data cannot determine the model."""
+    residual: Callable[..., Float[Array, " r"]]
+    """(dynamics, *sample) -> residuals of one sample, in SI units."""
+    selects_by: str
+    """"torque": validation is the mean square of the residual in (N m)², as published; "scaled": in its own units."""
 
 
 def torque_scale(data: Trajectories) -> Float[Array, " d"]:
@@ -33,28 +35,83 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     Raises:
         InputError: no channel varies, so that the data cannot tell any Lagrangian from its multiples.
     """
-    deviation = data.tau.std(axis=0)
-    # Rounding leaves a constant channel with a deviation of some 1e-17 of the torques it was computed from.
-    varies = deviation > 1e-12 * abs(data.tau).max()
+    message = (
+        "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
+        "add trajectories that are driven by known, varying torques"
+    )
+    return _scale(data.tau, message)
+
+
+TORQUE = Objective(
+    keys=("q", "qd", "qdd", "tau"),
+    scale=torque_scale,
+    residual=lambda dynamics, q, qd, qdd, tau: dynamics.inverse_dynamics(q, qd, qdd) - tau,
+    selects_by="torque",
+)
+"""tau_hat(q, qd, qdd) - tau, the published loss of DeLaN."""
+
+
+def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
+    torque_scale(data)
+    if data.p is None or data.pd is None:
+        raise InputError("the data have no p, pd; a Hamiltonian is fitted to momenta, or to torques without them")
+    still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
+    return jnp.concatenate([_scale(data.qd, f"qd {still}"), _scale(data.tau, f"tau {still}")])
+
+
+def _canonical_residual(dynamics: Dynamics, q: Vector, qd: Vector, p: Vector, pd: Vector, tau: Vector) -> Array:
+    assert dynamics.hamiltonian is not None
+    slope_q, slope_p = jax.grad(dynamics.hamiltonian, argnums=(0, 1))(q, p)
+    friction = 0.0 if dynamics.friction is None else dynamics.friction(q, qd)
+    return jnp.concatenate([slope_p - qd, pd + slope_q + friction - tau])
+
+
+CANONICAL = Objective(
+    keys=("q", "qd", "p", "pd", "tau"), scale=_canonical_scale, residual=_canonical_residual, selects_by="scaled"
+)
+"""[dH/dp - qd, pd + dH/dq + friction - tau], the published loss of Hamiltonian networks with torques."""
+
+
+def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
+    still = "qdd is constant in every training sample; add trajectories that accelerate"
+    return jnp.concatenate([torque_scale(data), _scale(data.qdd, still)])
+
+
+BOTH_WAYS = Objective(
+    keys=("q", "qd", "qdd", "tau"),
+    scale=_both_scales,
+    residual=lambda dynamics, q, qd, qdd, tau: jnp.concatenate(
+        [dynamics.inverse_dynamics(q, qd, qdd) - tau, dynamics.forward_dynamics(q, qd, tau) - qdd]
+    ),
+    selects_by="scaled",
+)
+"""[tau_hat - tau, qdd_hat - qdd], for models whose inverse and forward sides are different networks."""
+
+
+def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
+    """The arrays that an objective reads, on the device."""
+    missing = [key for key in objective.keys if getattr(data, key) is None]
+    if missing:
+        raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
+    return tuple(jnp.asarray(getattr(data, key), dtype) for key in objective.keys)
+
+
+def residuals(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
+    """Residuals of a batch, in SI units."""
+    return vmap(lambda *sample: objective.residual(dynamics, *sample))(*batch)
+
+
+def mean_loss(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...], scale: Float[Array, " r"]) -> Scalar:
+    """Mean over samples of the sum of squared residuals in units of `scale` (Lutter et al. 2019)."""
+    return jnp.mean(jnp.sum((residuals(objective, dynamics, batch) / scale) ** 2, axis=-1))
+
+
+def _scale(array: np.ndarray, message: str) -> Float[Array, " d"]:
+    """Standard deviation of each column; the typical one for a column that does not vary."""
+    deviation = array.std(axis=0)
+    # Rounding leaves a constant channel with a deviation of some 1e-17 of the numbers it was computed from.
+    varies = deviation > 1e-12 * abs(array).max()
     if not varies.any():
-        raise InputError(
-            "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
-            "add trajectories that are driven by known, varying torques"
-        )
+        raise InputError(message)
     typical = (deviation[varies] ** 2).mean() ** 0.5
     return jnp.asarray([size if moves else typical for size, moves in zip(deviation, varies, strict=True)])
-
-
-def torque_residual(dynamics: Dynamics, sample: Samples, scale: Vector) -> Vector:
-    """(tau_hat - tau) / scale [d] of one sample."""
-    return (dynamics.inverse_dynamics(sample.q, sample.qd, sample.qdd) - sample.tau) / scale
-
-
-def torque_residuals(dynamics: Dynamics, batch: Samples, scale: Vector) -> Float[Array, "N d"]:
-    """(tau_hat - tau) / scale of a batch."""
-    return vmap(lambda *sample: torque_residual(dynamics, Samples(*sample), scale))(*batch)
-
-
-def torque_loss(dynamics: Dynamics, batch: Samples, scale: Vector) -> Scalar:
-    """Mean over samples of the sum of squared residuals over joints (Lutter et al. 2019)."""
-    return jnp.mean(jnp.sum(torque_residuals(dynamics, batch, scale) ** 2, axis=-1))

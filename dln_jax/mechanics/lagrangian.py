@@ -12,7 +12,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences
+from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
 
@@ -41,18 +42,12 @@ def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vecto
 def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vector:
     """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
     bias = inverse_dynamics(L, q, qd, jnp.zeros_like(qd))
-    return jnp.linalg.solve(mass_matrix(L, q, qd), tau - bias)
+    return solve(mass_matrix(L, q, qd), tau - bias)
 
 
 def decompose(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
     """Inertial, Coriolis and gravity force, each [d]; their sum is tau(q, qd, qdd) when M depends on q alone."""
-    rest = jnp.zeros_like(qd)
-    gravity = inverse_dynamics(L, q, rest, rest)
-    return Decomposition(
-        inertial=inverse_dynamics(L, q, rest, qdd) - gravity,
-        coriolis=inverse_dynamics(L, q, qd, rest) - gravity,
-        gravity=gravity,
-    )
+    return decompose_by_differences(functools.partial(inverse_dynamics, L), q, qd, qdd)
 
 
 def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
@@ -77,4 +72,5 @@ def dynamics(L: Lagrangian, *, dissipation: Dissipation | None = None) -> Dynami
         energy=functools.partial(energy, L),
         mass_matrix=functools.partial(mass_matrix, L),
         decompose=functools.partial(decompose, L),
+        friction=dissipation and functools.partial(friction_force, dissipation),
     )

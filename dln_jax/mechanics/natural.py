@@ -6,6 +6,7 @@ The factor makes M definite by construction, gives the momentum without a deriva
 into two triangular solves. The potential is `None` where a scene has none, and is then never traced.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -103,6 +104,7 @@ def dynamics(system: NaturalSystem) -> Dynamics:
         energy=lambda q, qd: energy(system, q, qd),
         mass_matrix=lambda q, qd=None: mass_matrix(system, q, qd),
         decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
+        friction=system.dissipation and functools.partial(friction_force, system.dissipation),
     )
 
 

@@ -33,6 +33,7 @@ def make_delan(
     activation: Activation = tanh,
     diagonal_shift: float = 2.0,
     diagonal_floor: float = 0.1,
+    shared_trunk: bool = False,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
     """The (init, apply) pair of a structured DeLaN.
@@ -45,9 +46,12 @@ def make_delan(
         diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; bounds M's eigenvalues
             away from zero.
+        shared_trunk: whether factor and potential are outputs of one network instead of two.
         dtype: of the parameters.
     """
-    networks = _networks(needs, width, depth, activation, diagonal_shift, diagonal_floor)
+    networks = structured_networks(
+        needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
+    )
     q = jnp.zeros(needs.degrees_of_freedom, dtype)
 
     def system(parameters: Parameters) -> NaturalSystem:
@@ -70,38 +74,51 @@ def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, f
     return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
 
 
-def _networks(
-    needs: Needs, width: int, depth: int, activation: Activation, shift: float, floor: float
+def viscous_dissipation(q: Vector, qd: Vector) -> Scalar:
+    """D = ½ Σ b qd², with one learned coefficient b = softplus(x) > 0 per coordinate; inside a transformed function."""
+    coefficients = hk.get_parameter("viscous_friction", qd.shape, qd.dtype, hk.initializers.Constant(-3.0))
+    return 0.5 * jnp.sum(jax.nn.softplus(coefficients) * qd**2)
+
+
+def structured_networks(
+    needs: Needs,
+    width: int,
+    depth: int,
+    activation: Activation,
+    shift: float,
+    floor: float,
+    *,
+    shared_trunk: bool = False,
 ) -> hk.MultiTransformed:
-    """Init of all networks, and apply of each: Cholesky factor, potential, dissipation (`None` where absent)."""
+    """Init of all networks, and apply of each: triangular factor, potential, dissipation (`None` where absent)."""
     d = needs.degrees_of_freedom
 
     def network(name: str, outputs: int, q: Vector):
         layers = hk.nets.MLP([width] * depth + [outputs], activation=activation.value, name=name)
         return layers(joint_features(needs, q))
 
+    entries = d * (d + 1) // 2
+    shared = shared_trunk and needs.gravity
+
     def cholesky(q: Vector) -> Matrix:
-        return cholesky_factor(network("cholesky", d * (d + 1) // 2, q), d, shift=shift, floor=floor)
+        outputs = network("energies", entries + 1, q)[:-1] if shared else network("cholesky", entries, q)
+        return cholesky_factor(outputs, d, shift=shift, floor=floor)
 
     def potential(q: Vector) -> Scalar:
-        return network("potential", 1, q)[0]
-
-    def dissipation(q: Vector, qd: Vector) -> Scalar:
-        coefficients = hk.get_parameter("viscous_friction", (d,), qd.dtype, hk.initializers.Constant(-3.0))
-        return 0.5 * jnp.sum(jax.nn.softplus(coefficients) * qd**2)
+        return network("energies", entries + 1, q)[-1] if shared else network("potential", 1, q)[0]
 
     def build():
         def initialise(q: Vector, qd: Vector) -> None:
             cholesky(q)
-            if needs.gravity:
+            if needs.gravity and not shared:
                 potential(q)
             if needs.friction:
-                dissipation(q, qd)
+                viscous_dissipation(q, qd)
 
         return initialise, (
             cholesky,
             potential if needs.gravity else None,
-            dissipation if needs.friction else None,
+            viscous_dissipation if needs.friction else None,
         )
 
     return hk.without_apply_rng(hk.multi_transform(build))

@@ -114,7 +114,7 @@ def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
     between = sum(a * b for a, b in pairwise(widths))
     forward = inputs * (between + widths[-1] * outputs)
     backward = outputs * (between + widths[0] * inputs)
-    return "backward" if backward < forward else "forward"
+    return "backward" if backward <= forward else "forward"
 
 
 def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
@@ -130,7 +130,7 @@ def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
     between = sum(a * b for a, b in pairwise(widths))
     backward = outputs * (between + widths[0] * inputs + sum(widths) * (inputs + inputs**2))
     forward = pairs * (between + widths[-1] * outputs + 3 * sum(widths)) + inputs * widths[-1] * outputs
-    return "backward" if backward < forward else "forward"
+    return "backward" if backward <= forward else "forward"
 
 
 def _check(layers: Layers, x: Array) -> tuple[int, ...]:

@@ -1,0 +1,81 @@
+"""The models of the zoo by name, for command lines and for files: what a name builds, and what it is fitted to.
+
+A description is plain JSON values: `kind`, `needs`, `precision` (f32 or f64), and the keywords of the kind's factory.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from dln_jax.data.schema import Trajectories, needs_from_json
+from dln_jax.learning.residuals import BOTH_WAYS, CANONICAL, TORQUE, Objective
+from dln_jax.learning.runs import data_type
+from dln_jax.models.black_box import make_black_box_lagrangian
+from dln_jax.models.delan import make_delan
+from dln_jax.models.feed_forward import make_feed_forward
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
+from dln_jax.models.model import Model
+from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.nn.activations import activation
+from dln_jax.types import InputError, Needs
+
+
+class Kind(NamedTuple):
+    """A kind of model."""
+
+    make: Callable[..., Model]
+    """(needs, **keywords) -> model."""
+    objective: Objective
+    """What it is fitted to, where the data have it; else torques."""
+    scales: dict[str, str]
+    """Keywords that are typical sizes, and the data array whose standard deviation each is."""
+
+
+KINDS = {
+    "structured-delan": Kind(make_delan, TORQUE, {}),
+    "black-box-delan": Kind(make_black_box_lagrangian, TORQUE, {"rate_scale": "qd"}),
+    "structured-hnn": Kind(make_structured_hamiltonian, CANONICAL, {}),
+    "black-box-hnn": Kind(make_black_box_hamiltonian, CANONICAL, {"momentum_scale": "p"}),
+    "feed-forward": Kind(
+        make_feed_forward, BOTH_WAYS, {"rate_scale": "qd", "acceleration_scale": "qdd", "tau_scale": "tau"}
+    ),
+    "trigonometric": Kind(make_trigonometric, TORQUE, {}),
+}
+
+
+def objective_of(kind: str, data: Trajectories) -> Objective:
+    """What a kind of model is fitted to: without momenta in the data, a Hamiltonian is fitted to torques."""
+    objective = KINDS[kind].objective
+    complete = all(getattr(data, key) is not None for key in objective.keys)
+    return objective if complete else TORQUE
+
+
+def describe(kind: str, data: Trajectories, needs: Needs, *, precision: str, **keywords: Any) -> dict[str, Any]:
+    """The description of a model for these training data: typical sizes are theirs, to three digits."""
+    scales = {}
+    for name, key in KINDS[kind].scales.items():
+        array = getattr(data, key)
+        if array is not None:
+            deviation = array.std(axis=0)
+            scales[name] = [float(f"{size:.3g}") if size > 0 else 1.0 for size in deviation]
+    return {"kind": kind, "needs": needs._asdict(), "precision": precision, **keywords, **scales}
+
+
+def build(description: dict[str, Any]) -> Model:
+    """The model that a description stands for.
+
+    Raises:
+        InputError: an unknown kind, needs, activation or precision, or a missing or unknown key.
+    """
+    keywords = dict(description)
+    kind = keywords.pop("kind", None)
+    if kind not in KINDS:
+        raise InputError(f"model kind is {kind!r}; this release knows {', '.join(KINDS)}")
+    try:
+        needs, dtype = needs_from_json(keywords.pop("needs")), data_type(keywords.pop("precision"))
+        if kind != "trigonometric":
+            keywords["activation"] = activation(keywords.pop("activation"))
+        # JSON knows no tuples, and a model's keywords are hashable.
+        keywords = {key: tuple(value) if isinstance(value, list) else value for key, value in keywords.items()}
+        return KINDS[kind].make(needs, dtype=dtype, **keywords)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error

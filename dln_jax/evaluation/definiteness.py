@@ -1,0 +1,56 @@
+"""Whether a model's mass matrix is one: a kinetic energy has a positive definite M, a black-box network need not."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.types import InputError
+
+
+class Definiteness(NamedTuple):
+    """What the mass matrices of a set of states are like."""
+
+    smallest_eigenvalue: float
+    """Over all states, in the unit of M; NaN if a matrix is not finite."""
+    share_not_definite: float
+    """Share of states, 0 to 1, whose M is indefinite, singular to rounding, or not finite."""
+    largest_condition_number: float
+    """Largest ratio of eigenvalues' magnitudes; infinite where M is singular or not finite."""
+
+
+def definiteness(
+    dynamics: Dynamics, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
+) -> Definiteness:
+    """Eigenvalues of the mass matrix at N states. Nothing is repaired: it reports, and the caller decides.
+
+    An eigenvalue counts as positive above d times the rounding unit times the largest magnitude of its matrix.
+    A Hamiltonian model gives M = H_pp⁻¹, which is not finite where H_pp is singular.
+
+    Raises:
+        InputError: a model without a mass matrix, or no states.
+    """
+    if dynamics.mass_matrix is None:
+        raise InputError("definiteness: the model has no mass matrix; give one that comes from an energy")
+    if len(q) == 0:
+        raise InputError("definiteness: q has no states; give at least one row")
+    # Eigenvalues by NumPy: batched LAPACK calls within one compiled program may wait for each other for ever.
+    masses = np.asarray(jax.jit(jax.vmap(dynamics.mass_matrix))(q, qd))
+    rounding = masses.shape[-1] * np.finfo(masses.dtype).eps
+    finite = np.isfinite(masses).all(axis=(1, 2))
+    eigenvalues = np.full(masses.shape[:2], np.nan)
+    symmetric = (masses[finite] + masses[finite].swapaxes(1, 2)) / 2
+    eigenvalues[finite] = np.linalg.eigvalsh(symmetric.astype(np.float64))
+
+    sizes = np.abs(eigenvalues)
+    largest, smallest = sizes.max(axis=1), sizes.min(axis=1)
+    definite = eigenvalues.min(axis=1) > rounding * largest
+    regular = smallest > rounding * largest
+    conditions = np.divide(largest, smallest, out=np.full_like(largest, np.inf), where=regular)
+    return Definiteness(
+        smallest_eigenvalue=float(eigenvalues.min()),
+        share_not_definite=float(np.mean(~definite)),
+        largest_condition_number=float(conditions.max()),
+    )

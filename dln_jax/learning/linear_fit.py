@@ -1,0 +1,151 @@
+"""Fitting models whose forces are linear in their parameters: one least-squares problem, no iteration.
+
+    tau = Phi(q, qd, qdd) theta,   theta minimises sum over samples of |(Phi theta - tau) / torque_scale|²
+
+Any `Model` of that kind will do, such as `models.trigonometric`. Phi is the derivative of the inverse model with
+respect to the parameters, exact because it is linear. The degree of a basis is chosen by the caller, by the error on
+validation trajectories of a fit for each.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.levenberg_marquardt import QUICK_COMPILATION
+from dln_jax.learning.normal_equations import count
+from dln_jax.learning.residuals import torque_scale
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers import least_squares
+from dln_jax.types import InputError, Vector, require_positive
+
+# Phi theta may differ from the model's force by the rounding of its sum, relative to the sum of absolute terms.
+_LINEARITY_TOLERANCE = 1e-9
+
+
+class LinearFit(NamedTuple):
+    """Identified parameters, and how well the data determine them."""
+
+    parameters: Any
+    """Of the model, in its dtype."""
+    parameter_count: int
+    """P, the number of parameters."""
+    rank: int
+    """Combinations of parameters that the data determine; the other P - rank have no part in the solution."""
+    condition: float
+    """Of the scaled columns that count: the most by which relative errors of the data can grow."""
+    torque_mse: float
+    """Mean over the fitted samples of the sum of squared errors over joints, in float64; (N m)² or N²."""
+    seconds: float
+    """Of the whole call, compilation included."""
+
+
+def design_matrix(model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
+    """Phi [d, P] = d tau / d theta of one state; columns in the order of `ravel_pytree(parameters)`.
+
+    The same for all parameters if the model is linear in them.
+    """
+    return _linearised(model, parameters, q, qd, qdd)[0]
+
+
+def fit_linear(
+    model: Model,
+    data: Trajectories,
+    *,
+    ridge: float = 0.0,
+    rank_tolerance: float | None = None,
+    chunk_size: int = 4096,
+) -> LinearFit:
+    """The parameters that minimise the torque error on the data, computed in float64 whatever the model's dtype.
+
+    Takes some N d P² operations. Where the data leave combinations of parameters undetermined, the solution is the
+    shortest one (see `solvers.least_squares`), which predicts the same forces along motions like those of the data.
+
+    Args:
+        model: linear in its parameters.
+        data: trajectories to fit; hold out those that the result is judged by.
+        ridge: dimensionless, as in `solvers.least_squares.solve`.
+        rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
+        chunk_size: samples whose design matrix is in memory at a time.
+
+    Raises:
+        InputError: the model is not linear in its parameters, the torques do not vary, or a setting is out of range.
+    """
+    require_positive(chunk_size=chunk_size)
+    start = time.perf_counter()
+    like = jax.eval_shape(model.init, jax.random.key(0))
+    with jax.enable_x64(True):
+        scale = np.asarray(torque_scale(data))
+        zero = np.zeros(count(like))
+        # One program for both passes.
+        one = functools.partial(_linearised, model)
+        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=QUICK_COMPILATION)
+
+        def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, chunk_size):
+                weighted = columns / scale[:, None]
+                yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
+
+        solution = least_squares.solve_chunks(equations(), ridge=ridge, rank_tolerance=rank_tolerance)
+        parameters = _unravel(solution.x, like)
+        squares = 0.0
+        for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):
+            rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(solution.x))
+            if not (abs(columns @ solution.x - predicted) <= rounding).all():
+                raise InputError(
+                    "the model's torque is not linear in its parameters, as a linear fit expects: "
+                    "take make_trigonometric, or train this model by its residuals"
+                )
+            squares += float(np.sum((predicted - tau) ** 2))
+    return LinearFit(
+        parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
+        parameter_count=zero.size,
+        rank=solution.rank,
+        condition=solution.condition,
+        torque_mse=squares / len(data.tau),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _linearised(
+    model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
+) -> tuple[Float[Array, "d P"], Vector]:
+    """Phi and tau of one state."""
+
+    def torque(parameters: Parameters) -> Vector:
+        return model.apply(parameters).inverse_dynamics(q, qd, qdd)
+
+    # Reverse mode: d pull-backs, where forward mode would push all P parameters.
+    tau, pull_back = jax.vjp(torque, parameters)
+    (rows,) = jax.vmap(pull_back)(np.eye(tau.shape[0], dtype=tau.dtype))
+    return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
+
+
+def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
+    """A tree like another, of the elements of a vector in the order of its leaves; NumPy, so that nothing compiles."""
+    leaves, structure = jax.tree.flatten(like)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = (vector[end - leaf.size : end].reshape(leaf.shape) for leaf, end in zip(leaves, ends, strict=True))
+    return jax.tree.unflatten(structure, parts)
+
+
+def _chunks(
+    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
+    samples = len(data.tau)
+    length = -(-samples // -(-samples // chunk_size))
+    for first in range(0, samples, length):
+        # The last chunk is filled up with its first sample, so that all are one program.
+        rows = np.arange(first, first + length)
+        rows[rows >= samples] = first
+        last = min(first + length, samples)
+        columns, tau = linearise(parameters, data.q[rows], data.qd[rows], data.qdd[rows])
+        yield np.asarray(columns)[: last - first], np.asarray(tau)[: last - first], data.tau[first:last]

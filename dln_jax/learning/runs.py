@@ -1,0 +1,143 @@
+"""What every training gives, and how a run is stored so that it can continue."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.learning import checkpoints
+from dln_jax.types import InputError
+
+CHECKPOINT = "checkpoint"
+"""Name of the file pair in a run's folder from which it can continue."""
+
+
+class Progress(NamedTuple):
+    """State of a run after a dispatch; numbers, or an array [seeds] where several train together."""
+
+    step: Any
+    loss: Any
+    validation: Any
+    monitor: Any
+    """The test error, shown and never used for a choice; NaN where nothing is monitored."""
+    seconds: float
+    """Training time so far, compilation and interruptions apart."""
+
+
+class Stop(NamedTuple):
+    """Why a run ended."""
+
+    reason: str
+    """"finished", "no improvement", "time" or "not finite"."""
+    step: int
+    """Steps taken; for "not finite" those after which the loss was not."""
+
+
+class Training(NamedTuple):
+    """What a run gives."""
+
+    parameters: Any
+    """Those with the lowest validation error; with a leading axis where several seeds trained."""
+    history: list[Progress]
+    stop: Stop
+    best_step: Any
+    """Step of the lowest validation; an integer, or an array [seeds]."""
+    compile_seconds: float
+
+    @property
+    def train_seconds(self) -> float:
+        """Training time, compilation apart."""
+        return self.history[-1].seconds if self.history else 0.0
+
+    @property
+    def validation(self) -> Any:
+        """The lowest validation error; inf before the first. A number, or an array [seeds]."""
+        values = [at.validation for at in self.history]
+        return plain(np.nanmin([np.full_like(values[0], np.inf, float), *values], axis=0)) if values else math.inf
+
+
+class Checkpoint(NamedTuple):
+    """Where a run is stored, and by what it is recognised."""
+
+    directory: Path
+    """An existing folder."""
+    identity: dict[str, Any]
+    """JSON values that decide the result: `settings` and `data`. A run of other values is not continued."""
+    resume: bool = False
+    """Continue from what is stored, if anything is."""
+    name: str = CHECKPOINT
+
+
+Report = Callable[[Progress], None]
+
+
+def silent(progress: Progress) -> None:
+    """Reports nothing."""
+
+
+def data_type(precision: str) -> Any:
+    """float32 or float64, for "f32" or "f64".
+
+    Raises:
+        InputError: another name, or f64 while JAX computes in 32 bits.
+    """
+    kinds = {"f32": jnp.float32, "f64": jnp.float64}
+    if precision not in kinds:
+        raise InputError(f"precision is '{precision}'; expected f32 or f64")
+    if precision == "f64" and not jax.config.read("jax_enable_x64"):
+        raise InputError("f64 needs jax.config.update('jax_enable_x64', True) before the first JAX call")
+    return kinds[precision]
+
+
+def plain(values: Any) -> Any:
+    """A scalar as a Python number, an array as a NumPy one."""
+    array = np.asarray(values)
+    return array if array.ndim else array.item()
+
+
+def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
+    """Writes the state of a run and what it has reported so far."""
+    facts = {**checkpoint.identity, "history": [[_json(value) for value in row] for row in history]}
+    number = int(np.max(history[-1].step)) if history else 0
+    checkpoints.save_tree(checkpoint.directory, checkpoint.name, state, facts, number=number)
+
+
+def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progress]] | None:
+    """The stored state and history, or `None` where a run is to start from the beginning.
+
+    Raises:
+        InputError: the stored run had other settings or data, or its files are damaged.
+    """
+    if checkpoint is None or not checkpoint.resume or not has_checkpoint(checkpoint.directory, checkpoint.name):
+        return None
+    manifest = checkpoints.load_manifest(checkpoint.directory, checkpoint.name)
+    for key, remedy in (("data", "give the data and test labels"), ("settings", "give the settings")):
+        if manifest.get(key) != checkpoint.identity.get(key):
+            raise InputError(
+                f"{checkpoint.directory}: the run was started with other {key}; {remedy} it was started with"
+            )
+    state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
+    return state, [Progress(*map(_number, row)) for row in manifest["history"]]
+
+
+def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
+    """Whether a run in this folder got as far as its first checkpoint."""
+    return (directory / f"{name}.json").is_file()
+
+
+def _json(value: Any) -> Any:
+    """NaN and infinity are no JSON."""
+    if np.ndim(value):
+        return [_json(each) for each in value]
+    value = plain(value)
+    return value if isinstance(value, int) or math.isfinite(value) else None
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, list):
+        return np.array([math.nan if each is None else each for each in value])
+    return math.nan if value is None else value

@@ -1,0 +1,240 @@
+"""Time stepping: `step(t, state, dt) -> state` for a state that is any pytree, and rollouts of it.
+
+| step | order | takes | keeps |
+|---|---|---|---|
+| `explicit_euler` | 1 | any field | |
+| `rk4` | 4 | any field | |
+| `implicit_midpoint` | 2 | any field | symplectic, reversible, quadratic invariants |
+| `gauss_legendre4` | 4 | any field | symplectic, reversible, quadratic invariants |
+| `symplectic_euler` | 1 | partitioned fields | symplectic if separable |
+| `stormer_verlet` | 2 | separable fields | symplectic, reversible |
+
+A field is `(t, state) -> rate` of a first-order system y' = f(t, y). A partitioned one has two halves,
+q' = velocity, p' = force; it is separable when the velocity reads p alone and the force q alone, as for
+H = T(p) + V(q). The partitioned steps are explicit. For a Hamiltonian that is not separable they would be implicit,
+or not symplectic: take `implicit_midpoint` or `gauss_legendre4`.
+
+Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration" (2006), chapters I, II and VI.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from dln_jax.solvers.newton import find_root
+from dln_jax.types import InputError, require_positive
+
+State = Any
+"""A pytree of real arrays, such as (q, qd) or (q, p)."""
+Field = Callable[[Any, Any], Any]
+"""(t, state) -> rate of the state."""
+Step = Callable[[Any, Any, Any], Any]
+"""(t, state, dt) -> state at t + dt; dt may be traced, and negative."""
+
+
+class Tableau(NamedTuple):
+    """Coefficients of a Runge-Kutta method; it is explicit when `stages` is strictly lower triangular."""
+
+    stages: tuple[tuple[float, ...], ...]
+    """a [s, s]: what each stage takes of the rates at the others."""
+    weights: tuple[float, ...]
+    """b [s]: what the step takes of the rates."""
+
+    @property
+    def nodes(self) -> tuple[float, ...]:
+        """c [s], the stages' times in units of dt: row sums of a."""
+        return tuple(sum(row) for row in self.stages)
+
+    @property
+    def is_explicit(self) -> bool:
+        """Whether every stage takes rates of earlier stages only."""
+        return not any(entry for i, row in enumerate(self.stages) for entry in row[i:])
+
+
+EULER = Tableau(stages=((0.0,),), weights=(1.0,))
+CLASSICAL = Tableau(
+    stages=((0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+    weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+)
+MIDPOINT = Tableau(stages=((0.5,),), weights=(1.0,))
+_SKEW = math.sqrt(3) / 6
+GAUSS_LEGENDRE_4 = Tableau(stages=((0.25, 0.25 - _SKEW), (0.25 + _SKEW, 0.25)), weights=(0.5, 0.5))
+
+
+def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iterations: int = 20) -> Step:
+    """One step of y' = f(t, y) by the method of a tableau.
+
+        Y_i = y + dt sum_j a_ij f(t + c_j dt, Y_j),    y <- y + dt sum_i b_i f(t + c_i dt, Y_i)
+
+    The stages of an implicit method are found by Newton's method, with derivatives by the implicit function theorem.
+    A step whose stages are not found gives NaN: take a smaller dt.
+
+    Args:
+        tableau: the method.
+        field: (t, state) -> rate.
+        tolerance: largest error of the equations for Y before the last Newton step, which about squares it, in the
+            state's units; implicit methods only.
+        iterations: Newton steps after which a step is given up; implicit methods only.
+    """
+    field = jax.jit(field)  # traced once for all stages
+    if tableau.is_explicit:
+        return functools.partial(_explicit_step, tableau, field)
+    return functools.partial(_implicit_step, tableau, field, tolerance, iterations)
+
+
+explicit_euler = functools.partial(runge_kutta, EULER)
+rk4 = functools.partial(runge_kutta, CLASSICAL)
+implicit_midpoint = functools.partial(runge_kutta, MIDPOINT)
+gauss_legendre4 = functools.partial(runge_kutta, GAUSS_LEGENDRE_4)
+
+
+def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) -> Step:
+    """Euler's method with the new momentum in the second half; state (q, p).
+
+        p <- p + dt force(t, q, p),    q <- q + dt velocity(t, q, p)
+
+    Order 1. Symplectic when the force does not read p; (q, qd) with force = qdd(t, q, qd) is the usual
+    "semi-implicit Euler" of game engines.
+    """
+
+    def step(t, state, dt):
+        q, p = state
+        p = _plus(p, dt, force(t, q, p))
+        return _plus(q, dt, velocity(t, q, p)), p
+
+    return step
+
+
+def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, Any], Any]) -> Step:
+    """Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); state (q, p).
+
+        p_half = p + dt/2 force(t, q),    q <- q + dt velocity(t + dt/2, p_half),    p <- p_half + dt/2 force(t + dt, q)
+
+    Order 2, symplectic and reversible. The halves cannot be given a field that is not separable.
+    """
+
+    def step(t, state, dt):
+        q, p = state
+        p = _plus(p, dt / 2, force(t, q))
+        q = _plus(q, dt, velocity(t + dt / 2, p))
+        return q, _plus(p, dt / 2, force(t + dt, q))
+
+    return step
+
+
+def second_order(acceleration: Callable[[Any, Array, Array], Array]) -> Field:
+    """The field of q'' = acceleration(t, q, qd), on the state (q, qd)."""
+
+    def field(t, state):
+        q, qd = state
+        return qd, acceleration(t, q, qd)
+
+    return field
+
+
+def advance(step: Step, t, state: State, duration, *, substeps: int = 1) -> State:
+    """The state after `duration`, by as many equal steps as asked for."""
+    dt = duration / substeps
+    if substeps == 1:
+        return step(t, state, dt)
+
+    def body(state, index):
+        return step(t + index * dt, state, dt), None
+
+    # A scan and not a counted loop, which has no derivative in reverse mode when the count is traced.
+    return jax.lax.scan(body, state, jnp.arange(substeps))[0]
+
+
+def rollout(step: Step, state: State, t: Float[Array, " T"], *, substeps: int = 1) -> State:
+    """States at the times t [T], the first of which is the given one; each leaf gets a leading axis T.
+
+    Args:
+        step: (t, state, dt) -> state.
+        state: at t[0].
+        t: times in s, any spacing, forward or backward.
+        substeps: steps per interval; only the states at t are kept.
+    """
+    require_positive(substeps=substeps)
+    # A step must not change the type of the state that it is given.
+    times = t.astype(jnp.result_type(*jax.tree.leaves(state)))
+
+    def interval(state, start_and_duration):
+        state = advance(step, start_and_duration[0], state, start_and_duration[1], substeps=substeps)
+        return state, state
+
+    _, later = jax.lax.scan(interval, state, (times[:-1], jnp.diff(times)))
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
+
+
+def adaptive_rollout(
+    field: Field, state: State, t: Float[Array, " T"], *, tolerance: float, max_steps: int = 100_000
+) -> tuple[State, Bool[Array, ""]]:
+    """States at the times t [T] by Dormand-Prince 8 with step-size control, and whether the integration finished.
+
+    Args:
+        field: (t, state) -> rate.
+        state: at t[0].
+        t: increasing times in s.
+        tolerance: on the error of each step, relative and absolute.
+        max_steps: after which the integration is given up; states not reached are infinite.
+    """
+    import diffrax  # here, since it takes longer to import than the rest of this package
+
+    if not tolerance > 0:
+        raise InputError(f"tolerance is {tolerance}; expected a positive number")
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, state, _: field(t, state)),
+        diffrax.Dopri8(),
+        t0=t[0],
+        t1=t[-1],
+        dt0=None,
+        y0=state,
+        saveat=diffrax.SaveAt(ts=t),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        max_steps=max_steps,
+        throw=False,
+    )
+    return solution.ys, solution.result == diffrax.RESULTS.successful
+
+
+def _plus(state: State, dt, rate: State) -> State:
+    return jax.tree.map(lambda value, slope: value + dt * slope, state, rate)
+
+
+def _combine(state: State, dt, weights: tuple[float, ...], rates: list[State]) -> State:
+    used = [(weight, rate) for weight, rate in zip(weights, rates, strict=False) if weight]
+    if not used:
+        return state
+    scaled = [jax.tree.map(lambda slope, weight=weight: weight * slope, rate) for weight, rate in used]
+    return _plus(state, dt, jax.tree.map(lambda *slopes: sum(slopes), *scaled))
+
+
+def _explicit_step(tableau: Tableau, field: Field, t, state: State, dt) -> State:
+    rates = []
+    for row, node in zip(tableau.stages, tableau.nodes, strict=True):
+        rates.append(field(t + node * dt, _combine(state, dt, row, rates)))
+    return _combine(state, dt, tableau.weights, rates)
+
+
+def _implicit_step(tableau: Tableau, field: Field, tolerance: float, iterations: int, t, state: State, dt) -> State:
+    start, unravel = ravel_pytree(state)
+    stages, weights, nodes = (jnp.asarray(entry, start.dtype) for entry in (*tableau, tableau.nodes))
+
+    def rates(values, t, dt):
+        return jax.vmap(lambda t, value: ravel_pytree(field(t, unravel(value)))[0])(t + nodes * dt, values)
+
+    # The unknowns are the states of the stages, whose size says what rounding is even where all rates vanish.
+    def equations(values, start, t, dt):
+        values = values.reshape(len(weights), -1)
+        return (values - start - dt * stages @ rates(values, t, dt)).ravel()
+
+    first = jnp.tile(start, len(weights))
+    values, info = find_root(equations, first, start, t, dt, tolerance=tolerance, iterations=iterations)
+    end = start + dt * weights @ rates(values.reshape(len(weights), -1), t, dt)
+    return unravel(jnp.where(info.converged, end, jnp.nan))

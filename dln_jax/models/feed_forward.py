@@ -1,0 +1,84 @@
+"""Feed-forward networks for inverse and forward dynamics: the baseline that knows no physics.
+
+    tau = tau_scale network([features(q), qd / rate_scale, qdd / acceleration_scale])
+    qdd = acceleration_scale network([features(q), qd / rate_scale, tau / tau_scale])
+
+The two networks are separate, so that one need not invert the other. There is no energy and no mass matrix.
+"""
+
+import functools
+
+import haiku as hk
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences
+from dln_jax.models.black_box import Scale, per_coordinate
+from dln_jax.models.features import joint_features
+from dln_jax.models.model import Model, Parameters
+from dln_jax.nn.activations import Activation, tanh
+from dln_jax.types import Needs, Vector, require_positive
+
+
+def make_feed_forward(
+    needs: Needs,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation = tanh,
+    rate_scale: Scale = 1.0,
+    acceleration_scale: Scale = 1.0,
+    tau_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """The (init, apply) pair of the two networks.
+
+    The force decomposition is that of differences of the inverse network, so friction counts as Coriolis force.
+
+    Args:
+        needs: what the scene needs; decides features. Forces are not told apart, so that an absent one leaves
+            nothing out.
+        width: hidden units per layer, of both networks.
+        depth: hidden layers, of both networks.
+        activation: of the hidden layers.
+        rate_scale: typical size of qd.
+        acceleration_scale: typical size of qdd.
+        tau_scale: typical size of tau.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: a width, depth or scale that is not positive, or scales that are not one per coordinate.
+    """
+    require_positive(width=width, depth=depth)
+    rates = per_coordinate(needs, "rate_scale", rate_scale)
+    accelerations = per_coordinate(needs, "acceleration_scale", acceleration_scale)
+    forces = per_coordinate(needs, "tau_scale", tau_scale)
+
+    def network(name: str, sizes: tuple[float, ...], output: tuple[float, ...], q: Vector, qd: Vector, x: Vector):
+        scaled = [qd / jnp.asarray(rates, qd.dtype), x / jnp.asarray(sizes, x.dtype)]
+        layers = hk.nets.MLP([width] * depth + [len(output)], activation=activation.value, name=name)
+        return jnp.asarray(output, qd.dtype) * layers(jnp.concatenate([joint_features(needs, q), *scaled]))
+
+    def build():
+        inverse = functools.partial(network, "inverse", accelerations, forces)
+        forward = functools.partial(network, "forward", forces, accelerations)
+
+        def initialise(q: Vector) -> None:
+            inverse(q, q, q)
+            forward(q, q, q)
+
+        return initialise, (inverse, forward)
+
+    networks = hk.without_apply_rng(hk.multi_transform(build))
+
+    def apply(parameters: Parameters) -> Dynamics:
+        inverse, forward = (functools.partial(function, parameters) for function in networks.apply)
+        return Dynamics(
+            inverse_dynamics=inverse,
+            forward_dynamics=forward,
+            energy=None,
+            mass_matrix=None,
+            decompose=functools.partial(decompose_by_differences, inverse),
+        )
+
+    return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), apply=apply)

@@ -1,0 +1,106 @@
+"""Linear least squares with scaled columns, by the singular value decomposition, in float64.
+
+With D the diagonal of column norms of A, y = D x and the decomposition A D⁻¹ = U S Vᵀ,
+
+    y = V (S² + ridge 1)⁻¹ S Uᵀ b        minimises |A x - b|² + ridge |D x|²
+
+Scaled columns make rank and condition independent of the units of the unknowns (Golub and Van Loan 2013, "Matrix
+Computations", sections 5.3.8 and 5.5). Singular values that are rounding alone are left out, which gives the shortest y
+of all that fit equally well. A tall A is replaced by its triangular factor first; neither forms AᵀA, whose condition
+number is squared.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.types import InputError
+
+
+class Solution(NamedTuple):
+    """The unknowns, and how well the equations determine them."""
+
+    x: np.ndarray
+    """[P]."""
+    rank: int
+    """Singular values of the scaled columns that count; fewer than P: some combination of unknowns is undetermined."""
+    condition: float
+    """Largest over smallest of them; infinite where none counts."""
+    residual: float
+    """|A x - b|."""
+
+
+def solve(
+    A: Float[np.ndarray, "N P"],
+    b: Float[np.ndarray, " N"],
+    *,
+    ridge: float = 0.0,
+    rank_tolerance: float | None = None,
+) -> Solution:
+    """The x of least |A x - b|² + ridge |D x|², shortest in |D x| where several are.
+
+    Args:
+        A: coefficients; a column of zeros gets x = 0.
+        b: right-hand side.
+        ridge: dimensionless; with orthogonal columns it divides each unknown by 1 + ridge.
+        rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
+            the decomposition, 2.2e-16 max(N, P).
+
+    Raises:
+        InputError: numbers that are not finite, a negative ridge, a tolerance outside [0, 1).
+    """
+    A, b = np.asarray(A, np.float64), np.asarray(b, np.float64)
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        raise InputError(
+            "the least-squares problem has NaN or infinite entries; expected finite ones: look at the data"
+        )
+    if not ridge >= 0:
+        raise InputError(f"ridge is {ridge}; expected a number >= 0")
+    if rank_tolerance is None:
+        rank_tolerance = float(np.finfo(np.float64).eps * max(A.shape))
+    if not 0 <= rank_tolerance < 1:
+        raise InputError(f"rank_tolerance is {rank_tolerance}; expected a number in [0, 1)")
+
+    norms = np.linalg.norm(A, axis=0)
+    scale = np.where(norms > 0, norms, 1.0)
+    scaled, rhs = A / scale, b
+    if A.shape[0] > A.shape[1] + 1:
+        triangle = triangular_factor(scaled, rhs)
+        scaled, rhs = triangle[:, :-1], triangle[:, -1]
+    left, sizes, right = np.linalg.svd(scaled, full_matrices=False)
+    counts = sizes > rank_tolerance * sizes.max(initial=0.0)
+    left, sizes, right = left[:, counts], sizes[counts], right[counts]
+    x = right.T @ (sizes / (sizes**2 + ridge) * (left.T @ rhs)) / scale
+    return Solution(
+        x=x,
+        rank=len(sizes),
+        condition=float(sizes[0] / sizes[-1]) if len(sizes) else np.inf,
+        residual=float(np.linalg.norm(A @ x - b)),
+    )
+
+
+def solve_chunks(
+    chunks: Iterable[tuple[np.ndarray, np.ndarray]], *, ridge: float = 0.0, rank_tolerance: float | None = None
+) -> Solution:
+    """`solve` for equations (A, b) that come in chunks of rows, of which only one is held at a time.
+
+    Each chunk is folded into one triangle, [triangle; A b] = Q R, which has the same solutions and residual.
+    """
+    triangle, rows = None, 0
+    for A, b in chunks:
+        rows += len(b)
+        if triangle is not None:
+            A, b = np.concatenate([triangle[:, :-1], A]), np.concatenate([triangle[:, -1], b])
+        triangle = triangular_factor(A, b)
+    if triangle is None:
+        raise InputError("there are no equations to solve; expected at least one")
+    if rank_tolerance is None:
+        rank_tolerance = float(np.finfo(np.float64).eps * max(rows, triangle.shape[1] - 1))
+    return solve(triangle[:, :-1], triangle[:, -1], ridge=ridge, rank_tolerance=rank_tolerance)
+
+
+def triangular_factor(A: Float[np.ndarray, "N P"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, "K P_and_1"]:
+    """R [min(N, P + 1), P + 1] of the augmented matrix [A b] = Q R: |A x - b| = |R (x, -1)| for every x."""
+    return np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))

@@ -1,0 +1,115 @@
+"""Roots of small systems of equations by Newton's method, differentiable by the implicit function theorem.
+
+    f(x, theta) = 0,    x <- x - J⁻¹ f,    J = df/dx        (Newton)
+    dx = -J⁻¹ (df/dtheta) dtheta                            (implicit function theorem)
+
+The derivative is that of the root and not of the iterations: it costs one linear solve, in forward and in reverse
+mode and to any order, and is as accurate as the root.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import InputError, require_positive
+
+Root = Float[Array, " n"]
+
+# A root that is right to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
+_ROUNDING_UNITS = 16
+
+
+class Info(NamedTuple):
+    """How an iteration ended."""
+
+    residual: Float[Array, ""]
+    """Largest |f_i| at the last point judged, in the unit of f; the root is one Newton step better."""
+    iterations: Int[Array, ""]
+    """Newton steps taken."""
+    converged: Bool[Array, ""]
+    """Whether the residual is within the tolerance or at the level of rounding; false for non-finite values."""
+
+
+class _State(NamedTuple):
+    x: Root
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+    running: Bool[Array, ""]
+
+
+def find_root(
+    function: Callable[..., Array], start: Root, *arguments: Any, tolerance: float = 0.0, iterations: int = 30
+) -> tuple[Root, Info]:
+    """x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
+
+    There is no line search: a start that is too far off may diverge, which `Info.converged` reports; what is
+    returned is then the last iterate. Derivatives are those of the root, with respect to the arguments and to
+    arrays that the function closes over; the start has none.
+
+    Args:
+        function: (x [n], *arguments) -> f [n].
+        start: first iterate [n].
+        arguments: pytrees handed to the function.
+        tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. The
+            point that passes is improved by one more step, which about squares its error.
+        iterations: Newton steps after which the search gives up.
+
+    Raises:
+        InputError: a negative tolerance, no iterations, or a start that is no vector.
+    """
+    require_positive(iterations=iterations)
+    if not tolerance >= 0:
+        raise InputError(f"tolerance is {tolerance}; expected a number >= 0 (0 for the accuracy of rounding)")
+
+    def search(residuals: Callable[[Root], Root], start: Root):
+        return _newton(residuals, start, tolerance, iterations)
+
+    def solve_linearised(product: Callable[[Root], Root], right: Root) -> Root:
+        return solve(jax.jacfwd(product)(right), right)
+
+    root, (residual, count, converged) = jax.lax.custom_root(
+        lambda x: function(x, *arguments), start, search, solve_linearised, has_aux=True
+    )
+    return root, Info(residual, count.astype(int), converged > 0)
+
+
+def _newton(
+    function: Callable[[Root], Root], start: Root, tolerance: float, iterations: int
+) -> tuple[Root, tuple[Array, Array, Array]]:
+    rounding = _ROUNDING_UNITS * jnp.finfo(start.dtype).eps
+
+    def value_and_jacobian(x: Root):
+        def twice(x: Root):
+            value = function(x)
+            return value, value
+
+        jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
+        return value, jacobian
+
+    def iterate(state: _State) -> _State:
+        # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
+        value, jacobian = value_and_jacobian(state.x)
+        step = solve(jacobian, value)
+        residual = jnp.max(jnp.abs(value))
+        floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(state.x))
+        converged = residual <= jnp.maximum(tolerance, floor)
+        count = state.iterations + 1
+        return _State(
+            x=jnp.where(jnp.isfinite(step).all(), state.x - step, state.x),
+            residual=residual,
+            iterations=count,
+            converged=converged,
+            running=~converged & jnp.isfinite(residual) & (count < iterations),
+        )
+
+    unknown = jnp.asarray(jnp.inf, start.dtype)
+    first = _State(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
+    last = jax.lax.while_loop(lambda state: state.running, iterate, first)
+    # `custom_root` takes real numbers only beside the root.
+    real = start.dtype
+    return last.x, (last.residual, last.iterations.astype(real), last.converged.astype(real))

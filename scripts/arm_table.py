@@ -1,0 +1,207 @@
+"""Train every model of the two-link arm on both published data sets, and print the results beside the published ones.
+
+Six models (structured and black-box Lagrangian, structured and black-box Hamiltonian, feed-forward, trigonometric), two
+data sets (letters: train 17, test e, q, v; random states: test three free swings), several seeds in one program.
+Prints a Markdown table, writes it as table.md with report.json, and draws error against training time.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from dln_jax.data import generators, schema
+from dln_jax.data.published import uniform_tests
+from dln_jax.data.splits import Split, select, split
+from dln_jax.deploy.kinds import KINDS
+from dln_jax.evaluation.figures import error_against_time
+from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError, require_positive
+from scripts.arm_models import Curve, gauss_newton_rows, measure_adam, measure_seeds, measure_trigonometric, plant_rows
+from scripts.arm_published import COLUMNS, PUBLISHED, published
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
+from scripts.default_data import CHARACTERS_TEST, default_data
+from scripts.report_table import print_report
+
+JOBS = "jobs.json"
+"""What has been measured so far, for --resume."""
+STRUCTURED = ("structured-delan", "structured-hnn")
+STRUCTURED_FACTOR = 100.0
+"""By how much the structured models are to beat their published rows."""
+VPT_SHARE = 0.98
+"""Of the true plant's valid prediction time, that a structured model is to reach."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to measure."""
+
+    data: Path | None = None
+    """Letters written by the two-link arm, in the npz schema (default: the embedded ones)."""
+    uniform: Path | None = None
+    """Training states of the hanging arm, in the npz schema (default: 3,000 generated ones)."""
+    seeds: int = 5
+    """Seeds of each model, in one program."""
+    steps: int | None = None
+    """Iterations of Gauss-Newton (default: what each model's validation error takes to level off)."""
+    adam_steps: int = 20_000
+    """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
+    timed_seeds: int = 5
+    """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
+    out: Path | None = None
+    """Folder for report.json, table.md and the figure (default: runs/arm_table-1, -2, ...)."""
+    resume: bool = False
+    """Continue the measurement in --out."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    console = Console(highlight=False, soft_wrap=True)
+    if given.resume:
+        given = with_stored_arguments(given)
+    require_positive(seeds=given.seeds)
+    if given.steps is not None:
+        require_positive(steps=given.steps)
+    sets = {"characters": letters(given.data), "uniform": states(given.uniform)}
+    folder = given.out if given.resume and given.out else new_folder(given.out, "arm_table")
+    write_json(folder / CONFIG, stored_arguments(given))
+    stored = folder / JOBS
+    found: dict[str, Any] = json.loads(stored.read_text()) if given.resume and stored.is_file() else {}
+    jobs = {}
+    for dataset, data in sets.items():
+        scene = two_link_arm(zero="horizontal" if dataset == "characters" else "hanging")
+        jobs[f"plant/{dataset}"] = lambda scene=scene, data=data: plant_rows(scene, data)
+        jobs[f"trigonometric/{dataset}"] = lambda data=data: measure_trigonometric(data)
+        for kind in PUBLISHED:
+            jobs[f"{kind}/{dataset}"] = lambda kind=kind, data=data: measure_seeds(
+                kind, data, seeds=given.seeds, steps=given.steps
+            )
+    if given.timed_seeds:
+        jobs["structured-delan/characters/gauss-newton"] = lambda: gauss_newton_rows(
+            sets["characters"], seeds=given.timed_seeds, together=given.seeds, steps=given.steps
+        )
+    if given.adam_steps:
+        for kind in PUBLISHED:
+            jobs[f"{kind}/characters/adam"] = lambda kind=kind: measure_adam(
+                kind, sets["characters"], steps=given.adam_steps
+            )
+    for number, (case, measure) in enumerate(jobs.items(), start=1):
+        if case not in found:
+            numbers, curve = measure()
+            found[case] = {"numbers": numbers, "curve": curve._asdict() if curve else None}
+            write_json(stored, found)
+        console.print(f"{number}/{len(jobs)}  {case:44s} {summary(found[case]['numbers'])}")
+    rows = [row for case, result in found.items() for row in rows_of(case, result["numbers"], found)]
+    facts = conditions(
+        dtype="float64; adam float32",
+        seeds=list(range(given.seeds)),
+        selection="sizes, iterations and stopping by validation alone",
+        data="embedded letters" if given.data is None else given.data.name,
+        statistics="medians over seeds; one program for all seeds of a model",
+    )
+    write_report(folder / "report.json", rows, facts)
+    table = markdown({case: result["numbers"] for case, result in found.items()})
+    (folder / "table.md").write_text(table)
+    curves = {case: Curve(**result["curve"]) for case, result in found.items() if result["curve"]}
+    error_against_time({case: (c.seconds, c.errors) for case, c in curves.items()}).savefig(folder / "pareto.png")
+    print_report([row for row in rows if row.bound is not None or row.reference is not None], facts)
+    print(table)
+    print(f"report: {folder / 'report.json'}, table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
+
+
+def letters(path: Path | None) -> Split:
+    """The letters, split as published."""
+    data = default_data(two_link_arm()) if path is None else schema.load(path)
+    if data.degrees_of_freedom != 2:
+        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
+    return split(data._replace(needs=two_link_arm().needs), test=CHARACTERS_TEST)
+
+
+def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:
+    """Random states of the hanging arm for training, the published free swings for the test."""
+    scene = two_link_arm(zero="hanging")
+    data = generators.uniform(scene, samples=samples) if path is None else schema.load(path)
+    if data.degrees_of_freedom != 2:
+        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
+    data = data._replace(needs=scene.needs)
+    present = np.random.default_rng(0).permutation(np.unique(data.trajectory))
+    held_out = present[: min(validation, max(1, len(present) // 10))]
+    return Split(select(data, np.setdiff1d(present, held_out)), select(data, held_out), uniform_tests())
+
+
+def summary(numbers: dict[str, float]) -> str:
+    """A line of the most telling numbers."""
+    shown = ("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
+    return "  ".join(f"{key} {numbers[key]:.3g}" for key in shown if key in numbers)
+
+
+def rows_of(case: str, numbers: dict[str, float], found: dict[str, Any]) -> list[Row]:
+    """The report's rows of a case, with the published value and the bound where there are."""
+    kind, dataset, *variant = case.split("/")
+    rows = []
+    for quantity, value in numbers.items():
+        reference = published(kind, dataset, quantity) if not variant else None
+        bound, at_least = None, False
+        if reference is not None and quantity.endswith("_mse"):
+            bound = reference / (STRUCTURED_FACTOR if kind in STRUCTURED else 1.0)
+        if kind in STRUCTURED and quantity == "vpt_seconds" and not variant:
+            ceiling = found[f"plant/{dataset}"]["numbers"]["vpt_seconds"]
+            bound, at_least = VPT_SHARE * ceiling, True
+        bound = BOUNDS.get((case, quantity), bound)
+        rows.append(Row(case, quantity, value, unit(quantity), reference, bound, at_least=at_least))
+    return rows
+
+
+BOUNDS = {
+    **{
+        ("structured-delan/characters/gauss-newton", f"seconds_to_{error:g}"): seconds
+        for error, seconds in ((1.35e-5, 7.0), (1e-8, 20.0), (1e-9, 40.0), (1e-10, 110.0))
+    },
+    ("structured-delan/characters/gauss-newton", "torque_mse_largest"): 1e-8,
+    ("structured-delan/characters/gauss-newton", "cost_of_ten_seeds"): 8.0,
+    ("trigonometric/characters", "torque_mse"): 1e-20,
+    ("trigonometric/characters", "train_seconds"): 1.0,
+    ("trigonometric/characters", "noisy_torque_mse"): 5e-5,
+}
+
+
+def unit(quantity: str) -> str:
+    """SI unit of a quantity, by its name."""
+    if "seconds" in quantity:
+        return "s"
+    if "_mse" in quantity:
+        return "1/s^4" if quantity.startswith("forward") else "W^2" if quantity.startswith("power") else "N^2 m^2"
+    return "us" if quantity.endswith("_us") else "J" if quantity.endswith("_j") else "1"
+
+
+def markdown(found: dict[str, dict[str, float]]) -> str:
+    """The published table's columns, ours beside the published numbers, and what each model costs."""
+    columns = [(dataset, quantity) for dataset, quantities in COLUMNS.items() for quantity in quantities]
+    heads = [f"{dataset} {quantity.replace('_', ' ')}" for dataset, quantity in columns]
+    lines = ["| model | " + " | ".join([*heads, "training, s", "parameters", "one step, µs"]) + " |"]
+    lines.append("|---" * (len(heads) + 4) + "|")
+    for kind in [*PUBLISHED, "trigonometric"]:
+        cells = []
+        for dataset, quantity in columns:
+            ours, theirs = found[f"{kind}/{dataset}"].get(quantity), published(kind, dataset, quantity)
+            number = "{:.2f}" if quantity == "vpt_seconds" else "{:.1e}"
+            cells.append(" / ".join(number.format(x) for x in (ours, theirs) if x is not None))
+        costs = found[f"{kind}/characters"]
+        cells += [f"{costs['train_seconds']:.1f}", f"{costs['parameters']:.0f}", f"{costs['one_step_p50_us']:.0f}"]
+        lines.append(f"| {kind} | " + " | ".join(cells) + " |")
+    ceilings = [f"{dataset} {found[f'plant/{dataset}']['vpt_seconds']:.2f} s" for dataset in COLUMNS]
+    lines.append(
+        f"\nours / published; medians over seeds. True plant's valid prediction time: {', '.join(ceilings)}.\n"
+    )
+    return "\n".join(lines)
+
+
+assert set(PUBLISHED) <= set(KINDS)
+
+
+if __name__ == "__main__":
+    run(main, Arguments)

@@ -1,0 +1,144 @@
+"""What a training of dynamics comes to: the task, its test errors and speed, figures and tables."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from dln_jax.data.splits import Split, merged
+from dln_jax.deploy.kinds import build
+from dln_jax.deploy.load import load_run
+from dln_jax.evaluation import figures
+from dln_jax.evaluation.definiteness import definiteness
+from dln_jax.evaluation.latency import Latency, one_step
+from dln_jax.evaluation.metrics import errors, predictions
+from dln_jax.evaluation.rollouts import rollout_metrics
+from dln_jax.learning.residuals import Objective
+from dln_jax.learning.runs import Training, data_type
+from dln_jax.learning.train import Settings
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.scenes.scene import Scene
+from dln_jax.types import Needs
+
+
+class Task(NamedTuple):
+    """What the arguments come to: the data, what they need, and the model to train."""
+
+    name: str
+    kind: str
+    sets: Split
+    scene: Scene | None
+    needs: Needs
+    needs_origin: str
+    description: dict[str, Any]
+    """Of the model, for `dln_jax.deploy.kinds.build`."""
+    objective: Objective
+    settings: Settings
+    optimizer_reason: str
+    """Why the optimiser is the one it is; empty where the user chose."""
+
+
+def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
+    """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
+    dtype = data_type(task.settings.precision)
+    dynamics = load_run(folder)
+    test = task.sets.test
+    predicted = predictions(dynamics, test, dtype)
+    latency = latency_of(dynamics, task)
+    if draw:
+        draw_figures(folder, task, training, predicted)
+    every = range(seeds) if seeds > 1 else ()
+    model = build(task.description)
+    of_seeds = [
+        errors(predictions(model.apply(parameters_of(training, index)), test, dtype), test)["torque_mse"]
+        for index in every
+    ]
+    spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items() if seeds > 1}
+    return {
+        **errors(predicted, test),
+        **spread,
+        **definiteness_metrics(dynamics, task),
+        **rollouts(dynamics, task),
+        **({"validation_error": float(np.min(training.validation))} if training.history else {}),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
+        "steps": training.stop.step,
+        "best_step": int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": training.train_seconds,
+        "one_step_p50_us": latency.p50_us,
+        "one_step_p99_us": latency.p99_us,
+    }
+
+
+SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
+"""Of the seeds' test errors."""
+
+
+def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
+    """Parameters and index of the seed with the lowest validation error."""
+    if seeds == 1:
+        return training.parameters, 0
+    best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
+    return parameters_of(training, best), best
+
+
+def parameters_of(training: Training, index: int) -> Any:
+    """Parameters of one of several seeds."""
+    return jax.tree.map(lambda leaf: leaf[index], training.parameters)
+
+
+def latency_of(dynamics: Dynamics, task: Task, *, calls: int = 5000) -> Latency:
+    """Of one inverse-dynamics call."""
+    test, dtype = task.sets.test, data_type(task.settings.precision)
+    states = list(zip(*(jnp.asarray(a[:512], dtype) for a in (test.q, test.qd, test.qdd)), strict=True))
+    return one_step(dynamics.inverse_dynamics, states, calls=calls)
+
+
+def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
+    """What the mass matrices of a model without structure are like on the test."""
+    if not task.kind.startswith("black-box"):
+        return {}
+    found = definiteness(dynamics, task.sets.test.q, task.sets.test.qd)
+    return {
+        "smallest_mass_eigenvalue": found.smallest_eigenvalue,
+        "share_not_definite": found.share_not_definite,
+        "largest_condition_number": found.largest_condition_number,
+    }
+
+
+def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
+    """Valid prediction times on the test, of the model and of the true plant; none for independent states."""
+    test = task.sets.test
+    if len(np.unique(test.trajectory)) == len(test.t):
+        return {}
+    return rollout_metrics(dynamics, test, dtype=data_type(task.settings.precision))
+
+
+def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[str, np.ndarray]) -> None:
+    """Writes what there is to draw."""
+    test = task.sets.test
+    figures.force_decomposition(test, predicted).savefig(folder / "decomposition.png")
+    if len(training.history) > 1:
+        figures.training_curve(training.history, best_step=training.best_step).savefig(folder / "training.png")
+    if task.scene is not None and task.scene.tip is not None:
+        paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
+        paths.savefig(folder / "tip_paths.png")
+
+
+def results_table(metrics: dict[str, float], task: Task) -> Table:
+    """The figures that a user wants to see, with units."""
+    force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
+    units = {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J"}
+    table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.settings.precision}")
+    table.columns[1].justify = "right"
+    for key, value in metrics.items():
+        unit = units.get(key, f"({force})²" if "_mse" in key else "")
+        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else unit
+        tiny = "_mse" in key or "error" in key or "eigenvalue" in key or "condition" in key
+        small = f"{value:.2e}" if tiny else f"{value:,.2f}" if key.startswith("vpt") else f"{value:,.1f}"
+        table.add_row(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else small, unit)
+    table.add_row("one-step rate", f"{1e6 / metrics['one_step_p50_us']:,.0f}", "calls/s")
+    return table

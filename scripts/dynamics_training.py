@@ -1,0 +1,245 @@
+"""What train_delan and train_hnn share: from a command line to a trained model of dynamics in a run folder."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories, needs_from_json
+from dln_jax.data.splits import Split, split
+from dln_jax.deploy.kinds import build, describe, objective_of
+from dln_jax.deploy.load import save_model
+from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.residuals import TORQUE, Objective
+from dln_jax.learning.runs import Progress, Stop, Training
+from dln_jax.learning.train import Settings, automatic_optimizer, check, train, validation_errors
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError, Needs, require_positive
+from scripts.command_line import CONFIG, new_folder, scene_named, stored_arguments, with_stored_arguments, write_json
+from scripts.default_data import CHARACTERS_TEST, default_data
+from scripts.dynamics_growth import grow_to_target
+from scripts.dynamics_metrics import Task, best_seed, evaluate, results_table
+from scripts.progress import progress
+
+DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
+DEFAULT_WIDTH = {"adam": 64, "gauss-newton": 16, "auto": 16}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to train on, how, and where the results go."""
+
+    model: str = "structured"
+    """What is learned."""
+    data: Path | None = None
+    """Trajectories in the npz schema (default: the embedded characters, or random states of --scene)."""
+    test: str | None = None
+    """Labels of the test trajectories, comma separated (default: e,q,v of the embedded set, else every sixth)."""
+    scene: str | None = None
+    """Textbook scene whose needs the data have; without --data, the scene to sample."""
+    needs: str | None = None
+    """What the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
+    (default: what the scene or the file states, else revolute joints with gravity)."""
+    optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
+    """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
+    gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
+    width: int | None = None
+    """Hidden units per layer (default: 16; 64 for adam)."""
+    depth: int = 2
+    """Hidden layers."""
+    activation: str = "tanh"
+    """Of the hidden layers: tanh, softplus, silu, gelu, sin or cos."""
+    steps: int | None = None
+    """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
+    seconds: float = float("inf")
+    """gauss-newton: seconds after which to stop, compilation included."""
+    batch: int = 512
+    """adam: samples per step."""
+    learning_rate: float = 5e-3
+    """adam: peak of the warm-up and cosine schedule."""
+    weight_decay: float = 1e-5
+    """adam: decoupled weight decay."""
+    patience: int = 10_000
+    """adam: steps without a better validation error after which training stops."""
+    precision: Literal["f32", "f64"] | None = None
+    """Floating-point type of the model and its training (default: f64; f32 for adam)."""
+    target: float | None = None
+    """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
+    from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
+    seed: int = 0
+    """Of the initial parameters, the shuffling and the validation split."""
+    seeds: int = 1
+    """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+    out: Path | None = None
+    """Folder of the run (default: runs/train_delan-1, -2, ...; runs/train_hnn-1, ...)."""
+    resume: bool = False
+    """Continue the run in --out with the settings it was started with."""
+    figures: bool = True
+    """Draw the figures."""
+
+
+def run_training(given: Arguments, script: str, kinds: dict[str, str]) -> None:
+    """Trains, evaluates, and writes the run folder; `kinds` are the kinds of model by the script's names for them."""
+    console = Console(highlight=False, soft_wrap=True)
+    if given.resume:
+        given = with_stored_arguments(given)
+    task = prepare(given, kinds)
+    folder = given.out if given.resume and given.out else new_folder(given.out, script)
+    write_json(folder / CONFIG, stored_arguments(given))
+    announce(console, task)
+    if task.kind == "trigonometric":
+        training = fit_trigonometric(task, console)
+    elif given.target is not None:
+        task, training = grow_to_target(task, given.target, folder, console, resume=given.resume)
+    else:
+        training = fit(task, given, folder)
+    chosen, best = best_seed(training, given.seeds)
+    save_model(folder, task.description, chosen)
+    metrics = evaluate(folder, task, training, seeds=given.seeds, draw=given.figures)
+    write_json(folder / "metrics.json", metrics)
+    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": {**task.description, **task.settings._asdict()}})
+    console.print(results_table(metrics, task))
+    if given.seeds > 1:
+        console.print(f"the run keeps seed {given.seed + best}, the best in validation")
+    console.print(f"run folder: {folder}")
+    warn(console, task, training, folder)
+
+
+def prepare(given: Arguments, kinds: dict[str, str]) -> Task:
+    """Reads and checks everything that the arguments name, before anything is written."""
+    if given.model not in kinds:
+        raise InputError(f"model is '{given.model}'; expected one of {', '.join(kinds)}")
+    kind = kinds[given.model]
+    scene = scene_named(given.scene) if given.scene else None
+    labels = tuple(given.test.split(",")) if given.test else None
+    if given.data is not None:
+        data, name = schema.load(given.data), str(given.data)
+    else:
+        scene = scene or two_link_arm()
+        data, name = default_data(scene), f"default data of {scene.name}"
+        if labels is None and scene.name == "two-link-arm":
+            labels = CHARACTERS_TEST
+    needs, origin = stated_needs(given, scene, data)
+    if needs.degrees_of_freedom != data.degrees_of_freedom:
+        raise InputError(
+            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
+        )
+    sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
+    objective = objective_of(kind, sets.train)
+    description, settings, reason = model_and_settings(given, kind, sets, needs, objective)
+    check(sets, settings, objective)
+    return Task(name, kind, sets, scene, needs, origin, description, objective, settings, reason)
+
+
+def model_and_settings(
+    given: Arguments, kind: str, sets: Split, needs: Needs, objective: Objective
+) -> tuple[dict[str, Any], Settings, str]:
+    """Description of the model, how to train it, and why by that optimiser."""
+    require_positive(depth=given.depth, seeds=given.seeds)
+    if given.target is not None and (kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1):
+        raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
+    if given.target is not None:
+        require_positive(target=given.target)
+    width = given.width if given.width is not None else DEFAULT_WIDTH[given.optimizer]
+    require_positive(width=width)
+    precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
+    network = {"width": width, "depth": given.depth, "activation": given.activation}
+    keywords = {"degree": 1} if kind == "trigonometric" else network
+    description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    optimizer, reason = given.optimizer, ""
+    if optimizer == "auto":
+        optimizer, reason = automatic_optimizer(build(description), sets, objective)
+        precision = given.precision or ("f32" if optimizer == "adam" else "f64")
+        description["precision"] = precision
+    given_as_is = {field: getattr(given, field) for field in Settings._fields if hasattr(given, field)}
+    stated = {
+        "optimizer": optimizer,
+        "precision": precision,
+        "steps": given.steps if given.steps is not None else DEFAULT_STEPS[optimizer],
+        "target": given.target or 0.0,
+    }
+    return description, Settings(**{**given_as_is, **stated}), reason
+
+
+def stated_needs(given: Arguments, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
+    """What the plant needs, and who says so: the command line, the scene, the file, or an assumption."""
+    if given.needs is not None:
+        try:
+            return needs_from_json(json.loads(given.needs)), "--needs"
+        except json.JSONDecodeError as error:
+            raise InputError(f"--needs is not JSON ({error}); see --help for an example") from error
+    if scene is not None:
+        return scene.needs, f"scene {scene.name}"
+    if data.needs is not None:
+        return data.needs, "the data file"
+    return Needs(joints=("revolute",) * data.degrees_of_freedom), "assumed: nothing states the needs"
+
+
+def announce(console: Console, task: Task) -> None:
+    """Says what is trained on what, and what was assumed."""
+    counts = ", ".join(f"{len(part.t)} {role}" for role, part in task.sets._asdict().items())
+    joints = "-".join(task.needs.joints)
+    terms = [name for name in ("gravity", "friction") if getattr(task.needs, name)] or ["no potential, no friction"]
+    console.print(f"{task.name}: {counts} samples")
+    console.print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
+    if task.sets.train.estimated:
+        console.print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
+    if task.kind.endswith("hnn") and task.objective is TORQUE:
+        console.print("no momenta p, pd in the data: the Hamiltonian is fitted to torques")
+    if task.kind != "trigonometric":
+        why = f" ({task.optimizer_reason})" if task.optimizer_reason else ""
+        console.print(f"{task.kind}, {task.settings.precision}, {task.settings.optimizer}{why}")
+
+
+def fit(task: Task, given: Arguments, folder: Path) -> Training:
+    """Trains the task's model, one seed or several."""
+    total = task.settings.steps
+    seeds = None if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
+    with progress(total) as show:
+        return train(
+            build(task.description),
+            task.sets,
+            task.settings,
+            objective=task.objective,
+            seeds=seeds,
+            directory=folder,
+            resume=given.resume,
+            report=lambda at: show(min(int(np.max(at.step)), total), shown(at)),
+        )
+
+
+def shown(at: Progress) -> str:
+    """A line of progress; of several seeds the median."""
+    return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
+
+
+def fit_trigonometric(task: Task, console: Console) -> Training:
+    """One least-squares problem."""
+    model = build(task.description)
+    fitted = fit_linear(model, task.sets.train)
+    console.print(
+        f"least squares: {fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
+    )
+    errors = validation_errors(model, task.sets, fitted.parameters, task.settings, task.objective)
+    at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), fitted.seconds)
+    return Training(fitted.parameters, [at], Stop("finished", 1), 1, 0.0)
+
+
+def warn(console: Console, task: Task, training: Training, folder: Path) -> None:
+    """Says what a user should know about how training ended."""
+    if training.stop.reason == "no improvement":
+        console.print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
+    if training.stop.reason == "time":
+        console.print(f"stopped after --seconds, at step {training.stop.step}")
+    if training.stop.reason == "not finite":
+        remedy = (
+            "lower --learning-rate or use --precision f64" if task.settings.optimizer == "adam" else "check the data"
+        )
+        raise InputError(
+            f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"
+        )

@@ -1,0 +1,252 @@
+"""Hamiltonian mechanics against the textbook's Lagrangian one, the Legendre transform, and the solver below them."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.hamiltonian import NaturalHamiltonian, conjugate, legendre
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.scenes import scene as textbook
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import InputError
+
+
+@pytest.mark.parametrize("n", [1, 2, 6, 17])
+def test_elimination_equals_lapack(n):
+    random = np.random.default_rng(n)
+    matrices = random.normal(size=(20, n, n))
+    # A zero diagonal, and a first column that grows downwards: wrong or lost without exchanging rows.
+    matrices[10:15] = np.roll(matrices[10:15] / 5 + np.eye(n), 1, axis=1)
+    matrices[15:, :, 0] *= 10.0 ** np.arange(n) * 1e-14 ** (np.arange(n) == 0)
+    right = random.normal(size=(20, n, 2))
+    expected = np.linalg.solve(matrices, right)
+    got = jax.jit(jax.vmap(solve))(matrices, right)
+    scale = np.linalg.cond(matrices)[:, None, None] * np.abs(expected).max(axis=(1, 2), keepdims=True)
+    assert np.max(np.abs(got - expected) / scale) < 1e-14
+
+
+def test_elimination_exchanges_rows():
+    matrix = np.array([[1e-20, 1.0], [1.0, 1.0]])
+    got = jax.jit(solve)(matrix, np.array([1.0, 2.0]))
+    np.testing.assert_allclose(got, [1.0, 1.0], rtol=1e-15)
+
+
+def test_elimination_differentiates_in_both_modes():
+    matrix, change, right = jnp.asarray(np.random.default_rng(0).normal(size=(3, 3, 3)))
+    b = right[0]
+
+    def along(s):
+        return solve(matrix + s * change, (1 + s**2) * b)
+
+    @jax.jit
+    def derivatives():
+        first = jax.jacfwd(along)
+        return first(0.0), jax.jacfwd(first)(0.0), jax.grad(lambda A: jnp.dot(right[1], solve(A, b)))(matrix)
+
+    x = np.linalg.solve(matrix, b)
+    slope = -np.linalg.solve(matrix, change @ x)
+    curvature = np.linalg.solve(matrix, 2 * b - 2 * change @ slope)
+    first, second, gradient = derivatives()
+    np.testing.assert_allclose(first, slope, rtol=1e-12)
+    np.testing.assert_allclose(second, curvature, rtol=1e-12)
+    np.testing.assert_allclose(gradient, -np.outer(np.linalg.solve(matrix.T, right[1]), x), rtol=1e-12)
+
+
+def test_elimination_does_not_hide_a_singular_matrix():
+    for matrix, b in ((np.ones((2, 2)), np.array([1.0, 2.0])), (np.zeros((2, 2)), np.zeros(2))):
+        assert not np.isfinite(jax.jit(solve)(matrix, b)).any()
+
+
+def cholesky(M):
+    """Written out: several batched LAPACK calls in one program can wait for each other for ever."""
+    d = M.shape[0]
+    L = [[jnp.zeros(())] * d for _ in range(d)]
+    for j in range(d):
+        for i in range(j, d):
+            left = M[i, j] - sum(L[i][k] * L[j][k] for k in range(j))
+            L[i][j] = jnp.sqrt(left) if i == j else left / L[j][j]
+    return jnp.array(L)
+
+
+def from_inverse_factor(scene):
+    """The scene's dynamics by the factor of its inverse mass matrix."""
+
+    def inverse_factor(q):
+        return cholesky(solve(scene.mass_matrix(q), jnp.eye(q.shape[0])))
+
+    return hamiltonian.natural_dynamics(NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation))
+
+
+def states(d, count=3):
+    return jax.random.normal(jax.random.key(d), (count, 20, d))
+
+
+def assert_equal(got, expected):
+    """To 1e-10 of the largest number; a force that the scene lacks to the same of 1."""
+    scale = float(jnp.max(jnp.abs(expected))) or 1.0
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * scale)
+
+
+CASES = [cart_pole(friction=0.3), chain(3)._replace(potential=None, gravity=None)]
+
+
+@pytest.mark.parametrize("scene", CASES, ids=lambda scene: scene.name)
+def test_natural_dynamics_equals_the_textbook(scene):
+    q, qd, third = states(scene.needs.degrees_of_freedom)
+    system = from_inverse_factor(scene)
+    natural = NaturalSystem(lambda q: cholesky(scene.mass_matrix(q)), scene.potential)
+
+    @jax.jit
+    @jax.vmap
+    def ask(q, qd, third):
+        return (
+            system.inverse_dynamics(q, qd, third),
+            system.forward_dynamics(q, qd, third),
+            system.energy(q, qd),
+            system.mass_matrix(q, qd),
+            system.decompose(q, qd, third),
+            system.hamiltonian(q, scene.mass_matrix(q) @ qd),
+            hamiltonian.natural_hamiltonian(natural)(q, scene.mass_matrix(q) @ qd),
+        )
+
+    @jax.jit
+    @jax.vmap
+    def expect(q, qd, third):
+        energy = qd @ scene.mass_matrix(q) @ qd - scene.lagrangian(q, qd)
+        tau = textbook.closed_form_inverse_dynamics(scene, q, qd, third)
+        acceleration = textbook.closed_form_forward_dynamics(scene, q, qd, third)
+        parts = textbook.closed_form_decomposition(scene, q, qd, third)
+        return tau, acceleration, energy, scene.mass_matrix(q), parts, energy, energy
+
+    jax.tree.map(assert_equal, ask(q, qd, third), expect(q, qd, third))
+
+
+@pytest.mark.parametrize("scene", [two_link_arm(), cart_pole(friction=0.3), chain(3)], ids=lambda scene: scene.name)
+def test_the_hamiltonian_of_a_lagrangian_moves_as_the_textbook(scene):
+    system = hamiltonian.dynamics(legendre(scene.lagrangian), dissipation=scene.dissipation)
+    q, qd, tau = states(scene.needs.degrees_of_freedom)
+    expected = jax.jit(jax.vmap(functools.partial(textbook.closed_form_forward_dynamics, scene)))(q, qd, tau)
+    assert_equal(jax.jit(jax.vmap(system.forward_dynamics))(q, qd, tau), expected)
+    if scene.needs.friction:
+        assert_equal(jax.jit(jax.vmap(system.inverse_dynamics))(q, qd, expected), tau)
+
+
+@pytest.mark.parametrize("scene", [two_link_arm(), cart_pole()], ids=lambda scene: scene.name)
+def test_legendre_transform_is_its_own_inverse(scene):
+    H = hamiltonian.hamiltonian_from_lagrangian(scene.lagrangian)
+    L = hamiltonian.lagrangian_from_hamiltonian(H)
+    q, qd = states(scene.needs.degrees_of_freedom, 2)
+
+    @jax.jit
+    @jax.vmap
+    def ask(q, qd):
+        return (L(q, qd), conjugate(H, q, qd)), (scene.lagrangian(q, qd), scene.mass_matrix(q) @ qd)
+
+    jax.tree.map(assert_equal, *ask(q, qd))
+
+
+def test_hamiltons_equations_are_those_of_the_textbook():
+    """(qd, pd) from the closed-form acceleration, and dH/dt = qd·tau - qd·dD/dqd along them."""
+    scene = cart_pole(friction=0.3)
+    H = legendre(scene.lagrangian)
+    q, qd, tau = states(2)
+
+    @jax.jit
+    @jax.vmap
+    def ask(q, qd, tau):
+        def momentum(q, qd):
+            return scene.mass_matrix(q) @ qd
+
+        acceleration = textbook.closed_form_forward_dynamics(scene, q, qd, tau)
+        p, pd = jax.jvp(momentum, (q, qd), (qd, acceleration))
+        friction = jax.grad(scene.dissipation, argnums=1)(q, qd)
+        field = hamiltonian.time_derivative(H, q, p, tau, dissipation=scene.dissipation)
+        again = hamiltonian.inverse(H, q, p, pd, dissipation=scene.dissipation)
+        balance = hamiltonian.energy_rate(H, q, p, tau, dissipation=scene.dissipation)
+        unforced = hamiltonian.energy_rate(H, q, p, jnp.zeros(2))
+        got = *field, again, hamiltonian.inverse(H, q, p, pd), hamiltonian.power(H, q, p, tau), balance
+        return got, (qd, pd, tau, tau - friction, qd @ tau, qd @ tau - qd @ friction), unforced
+
+    got, expected, unforced = ask(q, qd, tau)
+    jax.tree.map(assert_equal, got, expected)
+    np.testing.assert_allclose(unforced, 0, atol=1e-12)
+
+
+def test_conjugate_differentiates_as_the_implicit_function():
+    """f = a cosh x has f' = y at x = arcsinh(y / a): every derivative, also in what f closes over."""
+
+    def got(a, y):
+        return conjugate(lambda q, x: jnp.sum(a * jnp.cosh(x) + q * x), jnp.zeros(2), y, iterations=8)[0]
+
+    def expected(a, y):
+        return jnp.arcsinh(y / a)[0]
+
+    a, y = jnp.array([1.3, 0.8]), jnp.array([0.5, -0.3])
+
+    def derivatives(function):
+        third = jax.jacfwd(jax.hessian(function, argnums=1), argnums=0)
+        return jax.jit(lambda: (function(a, y), *jax.grad(function, argnums=(0, 1))(a, y), third(a, y)))()
+
+    for one, other in zip(derivatives(got), derivatives(expected), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-13)
+
+
+def test_a_relativistic_particle():
+    """H = sqrt(1 + p²) + q²: neither quadratic in p nor M constant; p = γ qd, M = γ³, tau = γ³ qdd + 2 q."""
+
+    def H(q, p):
+        return jnp.sum(jnp.sqrt(1 + p**2) + q**2)
+
+    q, qd, qdd = jnp.array([[0.4], [0.6], [-0.7]])
+    gamma = 1.25
+    system = hamiltonian.dynamics(H, iterations=8, initial_guess=lambda q, qd: qd + 0.1)
+    ask = jax.jit(
+        lambda tau: (
+            system.inverse_dynamics(q, qd, qdd),
+            system.forward_dynamics(q, qd, tau),
+            system.mass_matrix(q, qd)[0],
+            system.energy(q, qd),
+            conjugate(H, q, qd, initial_guess=lambda q, qd: gamma * qd),
+        )
+    )
+    tau = gamma**3 * qdd + 2 * q
+    for got, expected in zip(ask(tau), (tau, qdd, gamma**3, gamma + 0.4**2, gamma * qd), strict=True):
+        np.testing.assert_allclose(got, jnp.broadcast_to(expected, got.shape), rtol=1e-12)
+
+
+def test_a_charged_particle_in_a_magnetic_field():
+    """H = ½ |p - A(q)|² is no natural system: the velocity turns at the cyclotron rate."""
+
+    def H(q, p):
+        return 0.5 * jnp.sum((p - 0.85 * jnp.array([-q[1], q[0]])) ** 2)
+
+    q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
+    system = hamiltonian.dynamics(H)
+    acceleration = 1.7 * jnp.array([qd[1], -qd[0]])
+    np.testing.assert_allclose(jax.jit(system.forward_dynamics)(q, qd, jnp.zeros(2)), acceleration, rtol=1e-13)
+    inertial, coriolis, gravity = jax.jit(system.decompose)(q, qd, q)
+    np.testing.assert_allclose(inertial, q, rtol=1e-13)
+    np.testing.assert_allclose(coriolis, -acceleration, rtol=1e-13)
+    np.testing.assert_allclose(gravity, 0, atol=1e-14)
+
+
+def test_a_singular_hamiltonian_is_not_hidden():
+    """H_pp = diag(1, 0): the second coordinate has an infinite mass, and no momentum makes it move."""
+    system = hamiltonian.dynamics(lambda q, p: 0.5 * p[0] ** 2 + jnp.sum(q**2))
+    rest = jnp.zeros(2)
+    tau, mass = jax.jit(lambda: (system.inverse_dynamics(rest, rest + 1, rest), system.mass_matrix(rest, rest)))()
+    assert not jnp.isfinite(tau).all() and not jnp.isfinite(mass).all()
+
+
+def test_no_iterations_are_refused():
+    with pytest.raises(InputError, match="iterations is 0"):
+        hamiltonian.dynamics(lambda q, p: jnp.sum(p**2), iterations=0)
+    with pytest.raises(InputError, match="iterations is -1"):
+        conjugate(lambda q, p: jnp.sum(p**2), jnp.zeros(1), jnp.zeros(1), iterations=-1)
