@@ -121,7 +121,7 @@ def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[s
     """Writes what there is to draw."""
     test = task.sets.test
     figures.force_decomposition(test, predicted).savefig(folder / "decomposition.png")
-    if len(training.history) > 1:
+    if training.history and task.kind != "trigonometric":
         figures.training_curve(training.history, best_step=training.best_step).savefig(folder / "training.png")
     if task.scene is not None and task.scene.tip is not None:
         paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
