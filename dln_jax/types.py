@@ -27,6 +27,8 @@ Matrix = Float[Array, "d d"]
 
 Lagrangian = Callable[[Array, Array], Array]
 """L(q, qd) -> scalar, in J."""
+Hamiltonian = Callable[[Array, Array], Array]
+"""H(q, p) -> scalar, in J."""
 Potential = Callable[[Array], Array]
 """V(q) -> scalar, in J."""
 Dissipation = Callable[[Array, Array], Array]

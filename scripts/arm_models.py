@@ -40,11 +40,11 @@ class Size(NamedTuple):
 
 
 SIZES = {
-    "structured-delan": Size(16, 2, "tanh", 60),
-    "structured-hnn": Size(16, 2, "tanh", 60),
-    "black-box-delan": Size(16, 2, "tanh", 100),
-    "black-box-hnn": Size(16, 2, "tanh", 100),
-    "feed-forward": Size(16, 2, "tanh", 100),
+    "structured-delan": Size(8, 2, "tanh", 150),
+    "structured-hnn": Size(8, 2, "tanh", 150),
+    "black-box-delan": Size(16, 2, "tanh", 150),
+    "black-box-hnn": Size(16, 2, "tanh", 150),
+    "feed-forward": Size(16, 2, "tanh", 150),
 }
 
 

@@ -14,6 +14,9 @@ import tyro
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.henon_heiles import henon_heiles
+from dln_jax.scenes.mass_spring import mass_spring
+from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
@@ -30,6 +33,10 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "pendulum": pendulum,
     "double-pendulum": double_pendulum,
     "cart-pole": cart_pole,
+    "mass-spring": mass_spring,
+    "henon-heiles": henon_heiles,
+    "two-body": lambda: n_body(2),
+    "three-body": lambda: n_body(3),
     **{f"chain-{d}": (lambda d=d: chain(d)) for d in range(1, 13)},
 }
 

@@ -21,6 +21,7 @@ from dln_jax.learning.runs import Training, data_type
 from dln_jax.learning.train import Settings
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.scene import dynamics as scene_dynamics
 from dln_jax.types import Needs
 
 
@@ -110,11 +111,18 @@ def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
 
 
 def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
-    """Valid prediction times on the test, of the model and of the true plant; none for independent states."""
+    """Valid prediction times on the test, and the true plant's as their ceiling where the scene is known.
+
+    None for independent states, which are no motion.
+    """
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
         return {}
-    return rollout_metrics(dynamics, test, dtype=data_type(task.settings.precision))
+    found = rollout_metrics(dynamics, test, dtype=data_type(task.settings.precision))
+    if task.scene is None:
+        return found
+    plant = rollout_metrics(scene_dynamics(task.scene), test)
+    return {**found, **{key.replace("vpt", "vpt_ceiling"): plant[key] for key in plant if key.startswith("vpt")}}
 
 
 def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[str, np.ndarray]) -> None:

@@ -54,6 +54,8 @@ class Arguments:
     """Hidden layers."""
     activation: str = "tanh"
     """Of the hidden layers: tanh, softplus, silu, gelu, sin or cos."""
+    degree: int = 1
+    """trigonometric: degree of the polynomials in each joint."""
     steps: int | None = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
     seconds: float = float("inf")
@@ -149,7 +151,7 @@ def model_and_settings(
     require_positive(width=width)
     precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
     network = {"width": width, "depth": given.depth, "activation": given.activation}
-    keywords = {"degree": 1} if kind == "trigonometric" else network
+    keywords = {"degree": given.degree} if kind == "trigonometric" else network
     description = describe(kind, sets.train, needs, precision=precision, **keywords)
     optimizer, reason = given.optimizer, ""
     if optimizer == "auto":
@@ -190,7 +192,7 @@ def announce(console: Console, task: Task) -> None:
     if task.sets.train.estimated:
         console.print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
     if task.kind.endswith("hnn") and task.objective is TORQUE:
-        console.print("no momenta p, pd in the data: the Hamiltonian is fitted to torques")
+        console.print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.kind != "trigonometric":
         why = f" ({task.optimizer_reason})" if task.optimizer_reason else ""
         console.print(f"{task.kind}, {task.settings.precision}, {task.settings.optimizer}{why}")

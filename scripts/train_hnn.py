@@ -1,7 +1,7 @@
 """Train a Hamiltonian network on trajectories, and report its errors, its rollouts and its speed.
 
-Models: structured (H = ½ pᵀ M⁻¹(q) p + V(q)) and black-box (a network is H). Data with momenta p, pd are fitted in
-Hamilton's equations, (q, p, tau) -> (qd, pd); without them torques are fitted, through the Legendre transform. Errors
+Models: structured (H = ½ pᵀ M⁻¹(q) p + V(q)) and black-box (a network is H). Data with momenta p are fitted in
+Hamilton's equations, (q, p, tau) -> (qd, qdd); without them torques are fitted, through the Legendre transform. Errors
 are those of torques and accelerations in coordinates and velocities, as for every model. Without --data it trains on
 the embedded letters; a run folder gets what train_delan writes.
 """

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import hamiltonian
-from dln_jax.mechanics.hamiltonian import NaturalHamiltonian, conjugate, legendre
+from dln_jax.mechanics import hamiltonian, natural_hamiltonian
+from dln_jax.mechanics.hamiltonian import conjugate, legendre
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.scenes import scene as textbook
 from dln_jax.scenes.cart_pole import cart_pole
@@ -81,7 +82,7 @@ def from_inverse_factor(scene):
     def inverse_factor(q):
         return cholesky(solve(scene.mass_matrix(q), jnp.eye(q.shape[0])))
 
-    return hamiltonian.natural_dynamics(NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation))
+    return natural_hamiltonian.dynamics(NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation))
 
 
 def states(d, count=3):
@@ -113,7 +114,7 @@ def test_natural_dynamics_equals_the_textbook(scene):
             system.mass_matrix(q, qd),
             system.decompose(q, qd, third),
             system.hamiltonian(q, scene.mass_matrix(q) @ qd),
-            hamiltonian.natural_hamiltonian(natural)(q, scene.mass_matrix(q) @ qd),
+            natural_hamiltonian.from_mass_factor(natural)(q, scene.mass_matrix(q) @ qd),
         )
 
     @jax.jit

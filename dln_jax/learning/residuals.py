@@ -53,23 +53,27 @@ TORQUE = Objective(
 
 def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
     torque_scale(data)
-    if data.p is None or data.pd is None:
-        raise InputError("the data have no p, pd; a Hamiltonian is fitted to momenta, or to torques without them")
     still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
-    return jnp.concatenate([_scale(data.qd, f"qd {still}"), _scale(data.tau, f"tau {still}")])
+    return jnp.concatenate([_scale(data.qd, f"qd {still}"), _scale(data.qdd, f"qdd {still}")])
 
 
-def _canonical_residual(dynamics: Dynamics, q: Vector, qd: Vector, p: Vector, pd: Vector, tau: Vector) -> Array:
-    assert dynamics.hamiltonian is not None
-    slope_q, slope_p = jax.grad(dynamics.hamiltonian, argnums=(0, 1))(q, p)
-    friction = 0.0 if dynamics.friction is None else dynamics.friction(q, qd)
-    return jnp.concatenate([slope_p - qd, pd + slope_q + friction - tau])
+def _canonical_residual(dynamics: Dynamics, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
+    H = dynamics.hamiltonian
+    assert H is not None
+    pd = tau - jax.grad(H)(q, p)
+    if dynamics.friction is not None:
+        pd -= dynamics.friction(q, qd)
+    velocity, acceleration = jax.jvp(jax.grad(H, argnums=1), (q, p), (qd, pd))
+    return jnp.concatenate([velocity - qd, acceleration - qdd])
 
 
 CANONICAL = Objective(
-    keys=("q", "qd", "p", "pd", "tau"), scale=_canonical_scale, residual=_canonical_residual, selects_by="scaled"
+    keys=("q", "qd", "qdd", "p", "tau"), scale=_canonical_scale, residual=_canonical_residual, selects_by="scaled"
 )
-"""[dH/dp - qd, pd + dH/dq + friction - tau], the published loss of Hamiltonian networks with torques."""
+"""[dH/dp - qd, d/dt dH/dp - qdd] with dp/dt = tau - dH/dq - friction: Hamilton's equations, by coordinates and momenta.
+
+The published loss has dp/dt of the data instead of qdd. In the published arm data that is a difference quotient of p,
+wrong by 8e-6 (N m)² in mean square, while q, qd, qdd and tau are consistent to rounding."""
 
 
 def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:

@@ -13,9 +13,10 @@ import functools
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics import hamiltonian, natural_hamiltonian
 from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.mechanics.hamiltonian import Guess, NaturalHamiltonian
+from dln_jax.mechanics.hamiltonian import Guess
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.models.black_box import Scale, energy_networks
 from dln_jax.models.delan import structured_networks
 from dln_jax.models.model import Model, Parameters
@@ -58,7 +59,7 @@ def make_structured_hamiltonian(
             potential=potential and functools.partial(potential, parameters),
             dissipation=dissipation and functools.partial(dissipation, parameters),
         )
-        return hamiltonian.natural_dynamics(system)
+        return natural_hamiltonian.dynamics(system)
 
     return Model(init=lambda key: networks.init(key, q, q), apply=apply)
 

@@ -1,0 +1,103 @@
+"""Hamilton's equations of natural systems whose inverse mass matrix is given by its factor, for one state.
+
+    H = ½ |Lᵀ p|² + V(q),   M⁻¹ = L Lᵀ
+
+In coordinates and velocities they take triangular solves with the factor, where a general Hamiltonian
+(`mechanics.hamiltonian`) takes a Newton iteration for the momentum. The potential is `None` where a scene has none.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.lagrangian import friction_force
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Potential, Scalar, Vector
+
+
+class NaturalHamiltonian(NamedTuple):
+    """The energies of a natural system whose inverse mass matrix is given, T = ½ |Lᵀ p|² with M⁻¹ = L Lᵀ."""
+
+    inverse_factor: CholeskyFactor
+    """q -> lower triangular L [d, d] with M⁻¹ = L Lᵀ."""
+    potential: Potential | None = None
+    """q -> V, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar."""
+
+
+def hamiltonian(system: NaturalHamiltonian) -> Hamiltonian:
+    """H(q, p) = ½ |Lᵀ p|² + V(q): no solve."""
+
+    def total(q: Vector, p: Vector) -> Scalar:
+        kinetic = 0.5 * jnp.sum((system.inverse_factor(q).T @ p) ** 2)
+        return kinetic if system.potential is None else kinetic + system.potential(q)
+
+    return total
+
+
+def dynamics(system: NaturalHamiltonian) -> Dynamics:
+    """All functions of the system at once, by triangular solves with the factor.
+
+    With y = L⁻¹ qd, p = L⁻ᵀ y: qdd = dL/dt y + L (dL/dtᵀ p + Lᵀ dp/dt), and dT/dq_k = pᵀ dL/dq_k y.
+    """
+
+    def motion(q: Vector, qd: Vector):
+        """L, dL/dt y, dL/dtᵀ p and dT/dq."""
+        factor, factor_rate = jax.jvp(system.inverse_factor, (q,), (qd,))
+        _, pull_back = jax.vjp(system.inverse_factor, q)
+        y = solve_lower(factor, qd)
+        p = solve_lower_transposed(factor, y)
+        return factor, factor_rate @ y, factor_rate.T @ p, pull_back(jnp.outer(p, y))[0]
+
+    def kinetic_force(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        factor, drift, momentum_drift, slope = motion(q, qd)
+        return solve_lower_transposed(factor, solve_lower(factor, qdd - drift) - momentum_drift) + slope
+
+    def load(q: Vector, qd: Vector) -> Vector:
+        """What potential and friction add to tau."""
+        force = jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q)
+        return force if system.dissipation is None else force + friction_force(system.dissipation, q, qd)
+
+    def accelerate(q: Vector, qd: Vector, tau: Vector) -> Vector:
+        factor, drift, momentum_drift, slope = motion(q, qd)
+        return drift + factor @ (momentum_drift + factor.T @ (tau - load(q, qd) - slope))
+
+    def mass_times(q: Vector, vector: Vector) -> Vector:
+        factor = system.inverse_factor(q)
+        return solve_lower_transposed(factor, solve_lower(factor, vector))
+
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        kinetic = 0.5 * jnp.sum(solve_lower(system.inverse_factor(q), qd) ** 2)
+        return kinetic if system.potential is None else kinetic + system.potential(q)
+
+    def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+        return Decomposition(
+            inertial=mass_times(q, qdd),
+            coriolis=kinetic_force(q, qd, jnp.zeros_like(qd)),
+            gravity=jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q),
+        )
+
+    return Dynamics(
+        inverse_dynamics=lambda q, qd, qdd: kinetic_force(q, qd, qdd) + load(q, qd),
+        forward_dynamics=accelerate,
+        energy=energy,
+        mass_matrix=lambda q, qd=None: jax.vmap(lambda unit: mass_times(q, unit))(jnp.eye(q.shape[0], dtype=q.dtype)),
+        decompose=decompose,
+        hamiltonian=hamiltonian(system),
+        friction=system.dissipation and functools.partial(friction_force, system.dissipation),
+    )
+
+
+def from_mass_factor(system: NaturalSystem) -> Hamiltonian:
+    """H(q, p) = ½ |L⁻¹ p|² + V(q) of a natural system with M = L Lᵀ."""
+
+    def total(q: Vector, p: Vector) -> Scalar:
+        kinetic = 0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2)
+        return kinetic if system.potential is None else kinetic + system.potential(q)
+
+    return total

@@ -1,0 +1,102 @@
+"""Bodies that act on each other in pairs, by an energy of their distance.
+
+    H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),    U(r) = w·f(r / scale) + network(f(r / scale))
+
+q and p hold one body after the other, [bodies * dimension]. Distances alone enter: translation, rotation and
+reflection change nothing, so that total momentum and angular momentum are conserved for any parameters; nor does
+exchanging bodies that are alike.
+
+The features f are r, 1/r and log r by default: the powers of r of a constant force, of Newton's and Coulomb's law in
+space, and in the plane. Their linear term w·f holds these laws exactly and does not saturate as bodies approach, where
+a bounded activation does; the network learns the rest. To assume none of these laws, leave their features out.
+At r = 0 the energy (with 1/r or log r) and its slope are not finite: nothing is softened.
+"""
+
+import functools
+
+import haiku as hk
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+
+from dln_jax.mechanics import natural_hamiltonian
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.models.model import Model, Parameters
+from dln_jax.nn.activations import Activation, tanh
+from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
+
+FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
+"""Functions of the distance that a pair energy may see."""
+
+
+def make_pairwise_hamiltonian(
+    bodies: int,
+    dimension: int,
+    *,
+    alike: bool = True,
+    features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
+    distance_scale: float = 1.0,
+    width: int = 32,
+    depth: int = 2,
+    activation: Activation = tanh,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """The (init, apply) pair of bodies with learned masses and pair energies.
+
+    Args:
+        bodies: at least two.
+        dimension: coordinates of each.
+        alike: whether all bodies share one mass and all pairs one energy; otherwise each has its own.
+        features: names from `FEATURES`.
+        distance_scale: typical distance in m, by which distances are divided.
+        width: hidden units per layer.
+        depth: hidden layers.
+        activation: of the hidden layers; it must be smooth.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: fewer than two bodies, numbers that are not positive, or unknown, repeated or no features.
+    """
+    require_positive(dimension=dimension, distance_scale=distance_scale, width=width, depth=depth)
+    if bodies < 2:
+        raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
+    if not features or len(set(features)) < len(features) or not set(features) <= set(FEATURES):
+        raise InputError(f"features are {features}; expected some of {', '.join(FEATURES)}, each once")
+    first, second = np.triu_indices(bodies, 1)
+    # Rows subtract one body's position from another's.
+    difference = np.eye(bodies)[first] - np.eye(bodies)[second]
+    kinds = 1 if alike else len(difference)
+
+    def pair_energies(r: Float[Array, " pairs"]) -> Float[Array, "pairs kinds"]:
+        seen = jnp.stack([FEATURES[name](r / distance_scale) for name in features], axis=1)
+        network = hk.nets.MLP([width] * depth + [kinds], activation=activation.value, name="pair")
+        return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + network(seen)
+
+    def potential(q: Vector) -> Scalar:
+        positions = q.reshape(bodies, dimension)
+        separation = jnp.matmul(jnp.asarray(difference, q.dtype), positions, precision="highest")
+        energies = pair_energies(jnp.sqrt(jnp.sum(separation**2, axis=1)))
+        return jnp.sum(energies) if alike else jnp.trace(energies)
+
+    def inverse_factor(q: Vector) -> Matrix:
+        logarithm = hk.get_parameter("log_mass", (1 if alike else bodies,), q.dtype, hk.initializers.Constant(0.0))
+        return jnp.diag(jnp.repeat(jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,))), dimension))
+
+    def build():
+        def initialise(q: Vector) -> None:
+            potential(q)
+            inverse_factor(q)
+
+        return initialise, (inverse_factor, potential)
+
+    networks = hk.without_apply_rng(hk.multi_transform(build))
+
+    def apply(parameters: Parameters) -> Dynamics:
+        factor, energy = (functools.partial(function, parameters) for function in networks.apply)
+        return natural_hamiltonian.dynamics(NaturalHamiltonian(inverse_factor=factor, potential=energy))
+
+    # Where the parameters are made all bodies stand apart, so that no feature is infinite.
+    start = np.arange(bodies * dimension)
+    return Model(init=lambda key: networks.init(key, jnp.asarray(start, dtype)), apply=apply)
