@@ -73,36 +73,50 @@ def training_curve(history: Sequence[Progress], *, best_step: int) -> Figure:
     return figure
 
 
-def error_against_time(curves: dict[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
-    """Error against seconds of training, a curve or a point for each name, with the Pareto front of all.
+LEAST_ERROR_SHOWN = 1e-15
+"""Of `error_against_time`: what is exact to rounding is marked at the lower edge."""
 
-    A point is on the front if nothing as quick has a lower error. Names are `model/data/optimiser`; curves of
-    one model share a colour, first-order optimisers are dashed.
+
+def error_against_time(curves: dict[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
+    """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
+
+    Names are `model/data` or `model/data/optimiser`. A model has one colour, and Adam is dashed with squares. A point is
+    on the front if nothing as quick has a lower error; what is exact to rounding is left out of it.
     """
-    figure = _figure(8.6, 5.0)
-    axis = figure.subplots()
-    models = sorted({name.split("/")[0] for name in curves})
-    for name, (seconds, errors) in curves.items():
-        first_order = name.endswith("adam")
-        axis.loglog(
-            seconds,
-            errors,
-            color=f"C{models.index(name.split('/')[0])}",
-            linestyle="--" if first_order else "-",
-            marker="s" if first_order else "o",
-            markevery=[len(seconds) - 1],
-            linewidth=1.4,
-            label=name.replace("/", ", "),
-        )
-    points = sorted((s, e) for seconds, errors in curves.values() for s, e in zip(seconds, errors, strict=True))
-    lowest = np.minimum.accumulate([error for _, error in points])
-    axis.step(
-        [second for second, _ in points], lowest, where="post", color="0.75", linewidth=6, zorder=0, label="front"
-    )
-    axis.set_xlabel("training, s per seed, compilation included")
-    axis.set_ylabel("test torque MSE, (N m)²")
-    axis.grid(True, which="major", alpha=0.25)
-    axis.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    parts = {name: name.split("/") for name in curves}
+    models = list(dict.fromkeys(part[0] for part in parts.values()))
+    datasets = list(dict.fromkeys(part[1] for part in parts.values()))
+    figure = _figure(5.2 * len(datasets) + 1.8, 4.6)
+    axes = figure.subplots(1, len(datasets), sharey=True, squeeze=False)[0]
+    handles = {}
+    for axis, dataset in zip(axes, datasets, strict=True):
+        front = []
+        for name, (seconds, errors) in curves.items():
+            model, its_dataset, *optimiser = parts[name]
+            if its_dataset != dataset:
+                continue
+            exact = errors[-1] < LEAST_ERROR_SHOWN
+            adam = optimiser == ["adam"]
+            label = f"{model}, Adam" if adam else f"{model} (exact)" if exact else model
+            (handles[label],) = axis.loglog(
+                seconds,
+                np.maximum(errors, LEAST_ERROR_SHOWN),
+                color=f"C{models.index(model)}",
+                linestyle="--" if adam else "-",
+                marker="v" if exact else "s" if adam else "o",
+                markevery=[len(seconds) - 1],
+                linewidth=1.4,
+            )
+            front += [] if exact else list(zip(seconds, errors, strict=True))
+        front.sort()
+        lowest = np.minimum.accumulate([error for _, error in front])
+        times = [second for second, _ in front]
+        (handles["front"],) = axis.step(times, lowest, where="post", color="0.85", linewidth=7, zorder=0)
+        axis.set_title(dataset, fontsize=10)
+        axis.set_xlabel("training, s per seed, compilation included")
+        axis.grid(True, which="major", alpha=0.25)
+    axes[0].set_ylabel("test torque MSE, (N m)²")
+    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside right center")
     return figure
 
 
