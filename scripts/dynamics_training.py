@@ -27,7 +27,6 @@ from scripts.dynamics_metrics import Task, best_seed, evaluate, results_table
 from scripts.progress import progress
 
 DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
-DEFAULT_WIDTH = {"adam": 64, "gauss-newton": 16, "auto": 16}
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Arguments:
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
     gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
     width: int | None = None
-    """Hidden units per layer (default: 16; 64 for adam)."""
+    """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
     depth: int = 2
     """Hidden layers."""
     activation: str = "tanh"
@@ -147,7 +146,7 @@ def model_and_settings(
         raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
     if given.target is not None:
         require_positive(target=given.target)
-    width = given.width if given.width is not None else DEFAULT_WIDTH[given.optimizer]
+    width = given.width if given.width is not None else default_width(kind, given.optimizer)
     require_positive(width=width)
     precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
     network = {"width": width, "depth": given.depth, "activation": given.activation}
@@ -166,6 +165,13 @@ def model_and_settings(
         "target": given.target or 0.0,
     }
     return description, Settings(**{**given_as_is, **stated}), reason
+
+
+def default_width(kind: str, optimizer: str) -> int:
+    """Hidden units per layer: structure needs fewer, and first-order training more."""
+    if optimizer == "adam":
+        return 64
+    return 8 if kind.startswith("structured") else 16
 
 
 def stated_needs(given: Arguments, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:

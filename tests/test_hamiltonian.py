@@ -9,8 +9,8 @@ import pytest
 
 from dln_jax.mechanics import hamiltonian, natural_hamiltonian
 from dln_jax.mechanics.hamiltonian import conjugate, legendre
-from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.scenes import scene as textbook
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain

@@ -80,8 +80,8 @@ LEAST_ERROR_SHOWN = 1e-15
 def error_against_time(curves: dict[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
     """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
 
-    Names are `model/data` or `model/data/optimiser`. A model has one colour, and Adam is dashed with squares. A point is
-    on the front if nothing as quick has a lower error; what is exact to rounding is left out of it.
+    Names are `model/data` or `model/data/optimiser`. A model has one colour, and Adam is dashed with squares. A point
+    is on the front if nothing as quick has a lower error; what is exact to rounding is left out of it.
     """
     parts = {name: name.split("/") for name in curves}
     models = list(dict.fromkeys(part[0] for part in parts.values()))
