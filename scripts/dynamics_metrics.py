@@ -130,7 +130,9 @@ def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[s
     test = task.sets.test
     figures.force_decomposition(test, predicted).savefig(folder / "decomposition.png")
     if training.history and task.kind != "trigonometric":
-        figures.training_curve(training.history, best_step=training.best_step).savefig(folder / "training.png")
+        error = "torque MSE" if task.objective.selects_by == "torque" else "error (normalised)"
+        best = int(np.max(training.best_step))
+        figures.training_curve(training.history, best_step=best, error=error).savefig(folder / "training.png")
     if task.scene is not None and task.scene.tip is not None:
         paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
         paths.savefig(folder / "tip_paths.png")

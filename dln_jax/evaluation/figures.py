@@ -57,17 +57,20 @@ def force_decomposition(
     return figure
 
 
-def training_curve(history: Sequence[Progress], *, best_step: int) -> Figure:
-    """Training loss, validation error and test error against steps; the test error decided nothing."""
+def training_curve(history: Sequence[Progress], *, best_step: int, error: str = "torque MSE") -> Figure:
+    """Training loss, validation error and test error against steps; the test error decided nothing.
+
+    Of several seeds the medians. `error` names what validation and test measure.
+    """
     figure = _figure(7.0, 4.2)
     axis = figure.subplots()
     steps = [progress.step for progress in history]
-    curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, "validation torque MSE"))
-    for field, colour, label in (*curves, ("monitor", TEST, "test torque MSE")):
-        axis.semilogy(steps, [getattr(progress, field) for progress in history], color=colour, label=label)
+    curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, f"validation {error}"))
+    for field, colour, label in (*curves, ("monitor", TEST, f"test {error}")):
+        axis.semilogy(steps, [np.median(getattr(progress, field)) for progress in history], color=colour, label=label)
     axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
     axis.set_xlabel("optimiser step")
-    axis.set_ylabel("loss, or MSE in (N m)²")
+    axis.set_ylabel("loss, or MSE in (N m)²" if error == "torque MSE" else "loss")
     axis.grid(True, alpha=0.25)
     axis.legend(frameon=False)
     return figure

@@ -126,10 +126,14 @@ def ensemble(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamp
 
 
 def ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
-    """Mean and twice the spread of an ensemble over one input, inside and outside the data in [-bound, bound]."""
-    figure = _figure(13.0, 4.0)
+    """Mean and twice the spread of an ensemble over one input, inside and outside the data in [-bound, bound].
+
+    Below, logarithmic, the spread beside the error: of a well-trained ensemble the band above is a line.
+    """
+    figure = _figure(13.0, 6.4)
     x = truth.x[:, 0]
-    for axis, (key, title) in zip(figure.subplots(1, 3), TITLES.items(), strict=True):
+    above, below = figure.subplots(2, 3, sharex=True, height_ratios=(3, 2))
+    for axis, sizes, (key, title) in zip(above, below, TITLES.items(), strict=True):
         wanted, centre, width = (getattr(data, key).ravel() for data in (truth, mean, spread))
         axis.axvspan(-bound, bound, color="0.93", zorder=0, label="training data")
         axis.plot(x, wanted, color=TRUTH, linewidth=3.0, alpha=0.35, label="truth")
@@ -141,10 +145,15 @@ def ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: Funct
         axis.set_ylim(wanted.min() - room, wanted.max() + room)
         axis.set_xlim(x.min(), x.max())
         axis.set_title(title)
-        axis.set_xlabel("x")
         axis.grid(True, alpha=0.25)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        sizes.axvspan(-bound, bound, color="0.93", zorder=0)
+        sizes.semilogy(x, 2 * width, color=MODEL, linewidth=1.4, label="2 sd")
+        sizes.semilogy(x, np.abs(centre - wanted), color=TRUTH, linewidth=1.0, label="|mean - truth|")
+        sizes.set_xlabel("x")
+        sizes.grid(True, alpha=0.25)
+    labelled = dict(zip(*reversed(above[0].get_legend_handles_labels()), strict=True))
+    labelled.update(zip(*reversed(below[0].get_legend_handles_labels()), strict=True))
+    figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
