@@ -23,8 +23,8 @@ from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.evaluation import function_figures as figures
 from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
-from dln_jax.learning.regression import WIDTHS, Settings, check, fingerprint, grow_width, steps_of, train
-from dln_jax.learning.runs import Checkpoint, Training
+from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, steps_of, train
+from dln_jax.learning.runs import Checkpoint, Training, fingerprint
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
@@ -143,7 +143,7 @@ def main(given: Arguments) -> None:
 def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Settings, Training]:
     """Trains at the width asked for, or at growing ones; the settings that were chosen, and the training."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
-    identity = {"data": fingerprint(standard)}
+    identity = {"data": fingerprint(array for data in standard for array in data)}
 
     def train_one(settings: Settings) -> Training:
         total = steps_of(task.sets, settings)

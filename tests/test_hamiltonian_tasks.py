@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.data import hamiltonian_tasks, schema
-from dln_jax.data.hamiltonian_tasks import PROTOCOLS, reference_motion
+from dln_jax.data import hamiltonian_tasks, phase_samples, schema
+from dln_jax.data.hamiltonian_tasks import PROTOCOLS
+from dln_jax.data.phase_samples import reference_motion
 from dln_jax.mechanics import lagrangian
 from dln_jax.scenes.henon_heiles import henon_heiles
 from dln_jax.scenes.mass_spring import mass_spring
@@ -254,7 +255,7 @@ def test_circular_orbits_are_keplers():
 def test_groups_of_motions_are_put_together(monkeypatch):
     """More motions than a group, the last one not full: as they are by themselves."""
     H, t = task("spring").hamiltonian, task("spring").t
-    monkeypatch.setattr(hamiltonian_tasks, "_GROUP", 50)
+    monkeypatch.setattr(phase_samples, "_GROUP", 50)
     q, p = np.random.default_rng(1).normal(size=(2, 120, 1))
     got = reference_motion(H, q, p, t)
     cosine, sine = np.cos(2 * t), np.sin(2 * t)

@@ -1,4 +1,6 @@
-"""The published data of four Hamiltonian tasks (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks").
+"""The data of Hamiltonian tasks: four published ones, the damped oscillators, and two with two coordinates.
+
+Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 
 | task | H | trajectories x samples | t | starts | noise | test |
 |---|---|---|---|---|---|---|
@@ -16,63 +18,35 @@ noisy. The true field therefore misses them by the noise: with seed 0 its test l
 3.56e-2 on the pendulum. What tells models apart is `field`, the exact field at the noisy point. Units are those of the
 table, with masses and G of one.
 
+Of this project, by the same conventions: `damped_spring` and `damped_pendulum` (the first two with a friction of 0.1 by
+velocity), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
+
+| task | starts | t |
+|---|---|---|
+| `henon_heiles` | within 0.25 of the centre, with an energy of 0.05..0.125 (it escapes from 1/6 on) | 0..10 |
+| `double_pendulum` | at rest, each angle within 1.2 rad of hanging | 0..2.5 |
+
 The draws are made in the published order from the generator that numpy keeps frozen, so that a seed gives the
 published starts and noise. The published motions were integrated to about 1e-6; here energies are constant to 1e-9.
 """
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.generators import in_float64
-from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import select
+from dln_jax.data.phase_samples import Task, make_task
 from dln_jax.mechanics import hamiltonian
-from dln_jax.mechanics.integrators import adaptive_rollout
+from dln_jax.scenes.double_pendulum import double_pendulum as double_pendulum_scene
+from dln_jax.scenes.henon_heiles import henon_heiles as henon_heiles_scene
 from dln_jax.scenes.mass_spring import mass_spring
 from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.pendulum import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
-from dln_jax.types import Dissipation, Hamiltonian, InputError, Scalar, Vector, require_positive
-
-
-class Field(NamedTuple):
-    """Time derivatives of states."""
-
-    qd: np.ndarray
-    """[N, d]."""
-    pd: np.ndarray
-    """[N, d]."""
-
-
-class Part(NamedTuple):
-    """One side of the published split; all members have the same N samples."""
-
-    data: Trajectories
-    """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0, which is exact."""
-    clean: Trajectories
-    """The same samples without noise."""
-    field: Field
-    """The exact (qd, pd) at the noisy q, p of `data`."""
-
-
-class Task(NamedTuple):
-    """A published data set, and what it was made from."""
-
-    scene: Scene
-    hamiltonian: Hamiltonian
-    """(q, p) -> H of one state: the textbook's."""
-    published_energy: Hamiltonian
-    """(q, p) -> the quantity whose error was published as that of the energy: q² + p² for the pendulum, else H."""
-    t: np.ndarray
-    """Times of each trajectory [T], in s."""
-    train: Part
-    test: Part
+from dln_jax.types import Hamiltonian, InputError, Scalar, Vector
 
 
 @in_float64
@@ -123,56 +97,52 @@ def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e
     return _bodies(3, np.array(starts), np.linspace(0, 5, 20), tolerance)
 
 
-_GROUP = 500
+def damped_spring(seed: int = 0, *, trajectories: int = 50, friction: float = 0.1) -> Task:
+    """The mass on a spring that loses energy."""
+    return spring(seed, trajectories=trajectories, friction=friction)
+
+
+def damped_pendulum(seed: int = 0, *, trajectories: int = 50, friction: float = 0.1) -> Task:
+    """The pendulum that loses energy."""
+    return pendulum(seed, trajectories=trajectories, friction=friction)
 
 
 @in_float64
-def reference_motion(
-    H: Hamiltonian,
-    q: Float[np.ndarray, "K d"],
-    p: Float[np.ndarray, "K d"],
-    t: Float[np.ndarray, " T"],
-    *,
-    dissipation: Dissipation | None = None,
-    tolerance: float = 1e-12,
-) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
-    """Free motions (q, p) at the times t from the states at t[0], integrated adaptively to the tolerance per step.
-
-    Between steps states are interpolated, with an error of a few hundred times the tolerance.
-
-    Raises:
-        InputError: an integration does not finish, as where bodies meet.
-    """
-    require_positive(tolerance=tolerance)
-    # Motions of one call take as many steps as the slowest of them: in groups, fewer wait. The last group is filled up.
-    size = min(len(q), _GROUP)
-    groups = [np.minimum(np.arange(first, first + size), len(q) - 1) for first in range(0, len(q), size)]
-    solved = [_solve(H, dissipation, tolerance, q[group], p[group], t) for group in groups]
-    if not all(bool(successful.all()) for _, successful in solved):
-        raise InputError(f"a motion could not be integrated to {tolerance:g}; ask for less accuracy or time")
-    motions = (np.concatenate([states[half] for states, _ in solved])[: len(q)] for half in range(2))
-    return next(motions), next(motions)
+def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+    """A unit mass in the well of Hénon and Heiles, on orbits that stay in it."""
+    scene = _scene(henon_heiles_scene)
+    assert scene.potential is not None
+    random = np.random.default_rng(seed)
+    angle, direction = random.uniform(0, 2 * np.pi, (2, trajectories))
+    radius = 0.25 * np.sqrt(random.uniform(size=trajectories))
+    q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(scene.potential)(jnp.asarray(q)))
+    p = np.sqrt(2 * kinetic)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return _without_noise(scene, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
 
 
-# Compiled once for each Hamiltonian, so that further seeds start at once.
-@functools.partial(jax.jit, static_argnames=("H", "dissipation", "tolerance"))
-def _solve(H: Hamiltonian, dissipation: Dissipation | None, tolerance: float, q, p, t):
-    def motion(q, p):
-        def rate(t, state):
-            return _field(H, dissipation, *state)
-
-        return adaptive_rollout(rate, (q, p), t, tolerance=tolerance)
-
-    return jax.vmap(motion)(q, p)
+@in_float64
+def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+    """The double pendulum of 1 kg and 1 m, released from rest."""
+    q = np.random.default_rng(seed).uniform(-1.2, 1.2, (trajectories, 2))
+    starts = np.stack([q, np.zeros_like(q)], axis=1)
+    return _without_noise(_scene(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
 
 
-@functools.partial(jax.jit, static_argnames=("H", "dissipation"))
-def _fields(H: Hamiltonian, dissipation: Dissipation | None, q, p):
-    return jax.vmap(functools.partial(_field, H, dissipation))(q, p)
+def _without_noise(scene: Scene, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
+    H = _energy(scene)
+    return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
-def _field(H: Hamiltonian, dissipation: Dissipation | None, q: Vector, p: Vector) -> tuple[Vector, Vector]:
-    return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=dissipation)
+# One object for each, by which compiled functions are found again.
+@functools.cache
+def _scene(make: Callable[[], Scene]) -> Scene:
+    return make()
+
+
+@functools.cache
+def _energy(scene: Scene) -> Hamiltonian:
+    return hamiltonian.legendre(scene.lagrangian)
 
 
 def _circle(q: Vector, p: Vector) -> Scalar:
@@ -211,7 +181,7 @@ def _oscillator(
     half = trajectories // 2
     t = np.linspace(0, 3, samples)
     starts, errors = np.array(starts).reshape(-1, 2, 1), np.array(errors).reshape(-1, 2, samples, 1)
-    return _task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
+    return make_task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
 
 
 @functools.cache
@@ -227,53 +197,7 @@ def _attracting(n: int) -> tuple[Scene, Hamiltonian]:
 
 def _bodies(n: int, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
     scene, H = _attracting(n)
-    return _task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
-
-
-def _task(
-    scene: Scene,
-    H: Hamiltonian,
-    published_energy: Hamiltonian,
-    starts: np.ndarray,
-    errors: np.ndarray | None,
-    t: np.ndarray,
-    trained: slice,
-    tolerance: float,
-) -> Task:
-    """From starts (q, p) [K, 2, d] and the noise of both [K, 2, T, d]."""
-    order = np.arange(len(starts))
-    train, test = order[trained], np.setdiff1d(order, order[trained])
-    if not len(train) or not len(test):
-        raise InputError(f"trajectories is {len(starts)}; expected enough to leave some on both sides of the split")
-    d = scene.needs.degrees_of_freedom
-    motion = reference_motion(H, starts[:, 0], starts[:, 1], t, dissipation=scene.dissipation, tolerance=tolerance)
-    exact = functools.partial(_fields, H, scene.dissipation)
-    q, p = (states.reshape(-1, d) for states in motion)
-    qd, pd = (np.asarray(rate) for rate in exact(q, p))
-    clean = Trajectories(
-        t=np.tile(t, len(starts)),
-        q=q,
-        qd=qd,
-        # The masses of these scenes are constant and act on one coordinate each.
-        qdd=pd / np.diag(scene.mass_matrix(jnp.asarray(q[0]))),
-        tau=np.zeros_like(q),
-        trajectory=np.repeat(order, len(t)),
-        label=np.array([f"{scene.name}-{index}" for index in order]),
-        p=p,
-        pd=pd,
-        needs=scene.needs,
-    )
-    if errors is None:
-        data, field = clean, Field(qd, pd)
-    else:
-        data = clean._replace(q=q + errors[:, 0].reshape(-1, d), p=p + errors[:, 1].reshape(-1, d))
-        field = Field(*(np.asarray(rate) for rate in exact(data.q, data.p)))
-
-    def part(indices: np.ndarray) -> Part:
-        chosen = np.isin(clean.trajectory, indices)
-        return Part(select(data, indices), select(clean, indices), Field(field.qd[chosen], field.pd[chosen]))
-
-    return Task(scene, H, published_energy, t, part(train), part(test))
+    return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
 Protocol = Callable[..., Task]
@@ -281,6 +205,10 @@ Protocol = Callable[..., Task]
 PROTOCOLS: dict[str, Protocol] = {
     "spring": spring,
     "pendulum": pendulum,
+    "damped-spring": damped_spring,
+    "damped-pendulum": damped_pendulum,
+    "henon-heiles": henon_heiles,
+    "double-pendulum": double_pendulum,
     "two-body": two_body,
     "three-body": three_body,
 }

@@ -1,17 +1,22 @@
-"""A trained run as jitted functions."""
+"""A trained run as jitted functions: dynamics (train_delan, train_hnn), or a phase field (train_hnn --task)."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from dln_jax.deploy.kinds import build
+from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
 from dln_jax.learning.runs import data_type
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.models.model import Parameters
+from dln_jax.models.phase_field import PhaseField
 from dln_jax.types import InputError
+
+Functions = TypeVar("Functions", Dynamics, PhaseField)
 
 MODEL = "model"
 """Name of the file pair in a run's folder that holds the trained model."""
@@ -30,20 +35,34 @@ def load_run(directory: str | Path) -> Dynamics:
     Raises:
         InputError: no model in the folder, or one that is damaged, altered or of another schema.
     """
-    directory = Path(directory)
-    description = load_manifest(directory, MODEL).get("model")
-    if not isinstance(description, dict):
-        raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
-    model = build(description)
-    dtype = data_type(description["precision"])
-    like = jax.eval_shape(model.init, jax.random.key(0))
-    return compiled(model.apply(load_tree(directory, MODEL, like)), dtype)
+    model, parameters, dtype = _stored(Path(directory), build)
+    return compiled(model.apply(parameters), dtype)
 
 
-def compiled(dynamics: Dynamics, dtype) -> Dynamics:
+def load_phase_field(directory: str | Path) -> PhaseField:
+    """The jitted phase field of a run of train_hnn --task, its parameters closed over: rates, energy, dissipation.
+
+    Raises:
+        InputError: no phase model in the folder, or one that is damaged, altered or of another schema.
+    """
+    model, parameters, dtype = _stored(Path(directory), build_phase)
+    return compiled(model.apply(parameters), dtype)
+
+
+def compiled(functions: Functions, dtype) -> Functions:
     """The same functions, jitted, with their arguments converted to one type; `None` stays `None`."""
 
     def convert_and_call(function):
         return function and jax.jit(lambda *state: function(*(jnp.asarray(array, dtype) for array in state)))
 
-    return Dynamics(*map(convert_and_call, dynamics))
+    return type(functions)(*map(convert_and_call, functions))
+
+
+def _stored(directory: Path, build: Callable[[dict[str, Any]], Any]) -> tuple[Any, Parameters, Any]:
+    """The model of a folder, its parameters and their type."""
+    description = load_manifest(directory, MODEL).get("model")
+    if not isinstance(description, dict):
+        raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
+    model = build(description)
+    like = jax.eval_shape(model.init, jax.random.key(0))
+    return model, load_tree(directory, MODEL, like), data_type(description["precision"])

@@ -9,7 +9,6 @@ Two optimisers: the published recipe (Adam with decoupled weight decay, minibatc
 and Levenberg-Marquardt on all samples at once, float64, for small ones, whose errors go down to what the noise leaves.
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -258,16 +257,6 @@ def grow_width(
         return training, validation_errors(sets, candidate, training.parameters)
 
     return grow([settings._replace(width=width) for width in widths], fit_and_judge)
-
-
-def fingerprint(sets: SampleSplit) -> str:
-    """SHA-256 of the numbers that a run reads, by which a resumed run knows its data."""
-    digest = hashlib.sha256()
-    for data in sets:
-        for array in data:
-            if array is not None:
-                digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def validation_errors(sets: SampleSplit, settings: Settings, layers: Layers) -> Float[np.ndarray, " N"]:

@@ -1,7 +1,8 @@
 """What every training gives, and how a run is stored so that it can continue."""
 
+import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,6 +92,15 @@ def data_type(precision: str) -> Any:
     if precision == "f64" and not jax.config.read("jax_enable_x64"):
         raise InputError("f64 needs jax.config.update('jax_enable_x64', True) before the first JAX call")
     return kinds[precision]
+
+
+def fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
+    """SHA-256 of the numbers that a run reads, by which a resumed run knows its data."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def plain(values: Any) -> Any:

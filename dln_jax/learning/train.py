@@ -1,6 +1,5 @@
 """Training of a model of dynamics on trajectories: split in, best parameters out, resumable at any dispatch."""
 
-import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from dln_jax.learning import residuals
 from dln_jax.learning.first_order import train_first_order
 from dln_jax.learning.optimisers import adamw
 from dln_jax.learning.residuals import TORQUE, Objective
-from dln_jax.learning.runs import CHECKPOINT, Checkpoint, Report, Training, data_type, silent
+from dln_jax.learning.runs import CHECKPOINT, Checkpoint, Report, Training, data_type, fingerprint, silent
 from dln_jax.learning.second_order import Budget, choose_optimizer, require_float64, train_second_order
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
@@ -104,7 +103,8 @@ def train(
     if directory is not None:
         # Time is no part of what decides the result: a run may continue with more of it.
         stated = {**settings._asdict(), "seconds": None, **({} if seeds is None else {"seeds": list(seeds)})}
-        checkpoint = Checkpoint(directory, {"settings": stated, "data": fingerprint(sets, objective)}, resume, name)
+        numbers = fingerprint(array for data in sets for array in _numbers(data, objective))
+        checkpoint = Checkpoint(directory, {"settings": stated, "data": numbers}, resume, name)
     parameters = initial_parameters(model, settings.seed if seeds is None else seeds)
 
     if settings.optimizer == "gauss-newton":
@@ -155,15 +155,6 @@ def validation_errors(
     dtype = data_type(settings.precision)
     batch, scale = residuals.arrays(objective, sets.validation, dtype), objective.scale(sets.train).astype(dtype)
     return np.asarray(jax.jit(lambda given: _squares(objective, model, given, batch, scale))(parameters))
-
-
-def fingerprint(sets: Split, objective: Objective = TORQUE) -> str:
-    """SHA-256 of the numbers that a run reads, by which a resumed run knows its data."""
-    digest = hashlib.sha256()
-    for data in sets:
-        for array in _numbers(data, objective):
-            digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 def _numbers(data: Trajectories, objective: Objective):

@@ -1,0 +1,248 @@
+"""Trajectory matching: a phase field is fitted so that its motions pass through what was measured (multiple shooting).
+
+Trajectories are cut into short windows. A window's motion starts at a state z_w that is itself unknown:
+
+    minimise over theta and all z_w:   sum over windows and samples of |(x(t; z_w, theta) - x_measured) / state_noise|²
+                                       [ + |(rates(x(t)) - rates_measured) / rate_noise|² where rates were measured ]
+
+(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) No derivative is estimated and no noise is differentiated,
+and a free start lets noise average out where derivative matching, which evaluates the field at noisy states, is biased.
+Windows never reach across a gap, that is, a time step of more than 1.5 times the median. Gauss-Newton solves for
+theta and all starts at once; its matrix has a row for each. Adam, for networks that are too large for that, takes
+batches of windows, and its steps cost the same whatever their number.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.first_order import train_first_order
+from dln_jax.learning.optimisers import adamw
+from dln_jax.learning.runs import Checkpoint, Report, Training, silent
+from dln_jax.learning.second_order import Budget, train_second_order
+from dln_jax.mechanics.integrators import rk4, rollout
+from dln_jax.models.model import Parameters
+from dln_jax.models.phase_field import PhaseField, PhaseModel
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import InputError, Scalar, require_positive
+
+GAP = 1.5
+"""Times the median time step: a longer step is a gap."""
+START_STEPS = 3
+"""Of Gauss-Newton, to the start of a validation window."""
+
+
+class Windows(NamedTuple):
+    """Stretches of W equally long windows; the shorter ones repeat their last sample, with weight zero."""
+
+    t: np.ndarray
+    """Time since the window's first sample [W, T], in s."""
+    state: np.ndarray
+    """Measured (q, p) [W, T, 2 d]."""
+    rate: np.ndarray | None
+    """Measured (qd, pd) [W, T, 2 d]."""
+    weight: np.ndarray
+    """1 for a sample, 0 for a repeated one [W, T]."""
+
+
+class Weights(NamedTuple):
+    """Standard deviations that residuals are divided by; a larger one counts for less."""
+
+    state: tuple[float, ...] | float
+    """Of q and p, one number or 2 d; infinite for what was not measured."""
+    rate: float | None = None
+    """Of qd and pd; `None` leaves measured rates out."""
+
+
+class Adam(NamedTuple):
+    """Settings of first-order training."""
+
+    batch: int = 64
+    """Windows of a step."""
+    learning_rate: float = 5e-3
+    seed: int = 0
+    """Of the order of the windows."""
+
+
+def stretches(data: Trajectories, *, gap: float = GAP) -> list[np.ndarray]:
+    """Indices of the samples of each stretch without a gap, in order.
+
+    Raises:
+        InputError: a gap that is not longer than the median time step.
+    """
+    if not gap > 1:
+        raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
+    same = np.diff(data.trajectory) == 0
+    steps = np.diff(data.t)
+    if not same.any():
+        raise InputError("no trajectory has two samples; windows need motions: record some")
+    broken = ~same | (steps > gap * np.median(steps[same]))
+    return np.split(np.arange(len(data.t)), np.flatnonzero(broken) + 1)
+
+
+def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
+    """Consecutive windows of `length` samples; each begins with the sample that the one before it ends with.
+
+    Windows lie within stretches without a gap. What remains of a stretch is a shorter window.
+
+    Raises:
+        InputError: a length below 2, no momenta, or no two samples without a gap between them.
+    """
+    if length < 2:
+        raise InputError(f"length is {length}; expected a window of at least 2 samples")
+    if data.p is None:
+        raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
+    pieces = [
+        stretch[first : first + length]
+        for stretch in stretches(data, gap=gap)
+        for first in range(0, len(stretch) - 1, length - 1)
+    ]
+    if not pieces:
+        raise InputError("there are no two samples without a gap between them; record longer motions")
+    indices = np.stack([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
+    weight = np.stack([np.arange(length) < len(piece) for piece in pieces]).astype(float)
+    state = np.concatenate([data.q, data.p], axis=1)[indices]
+    rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
+    t = data.t[indices]
+    return Windows(t - t[:, :1], state, rate, weight)
+
+
+def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
+    """Some of the windows."""
+    rows = np.asarray(chosen, int)
+    rate = None if windows.rate is None else windows.rate[rows]
+    return Windows(windows.t[rows], windows.state[rows], rate, windows.weight[rows])
+
+
+def motion(field: PhaseField, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
+    """States (q, p) at the times t from `start` [2 d], by RK4."""
+    d = start.shape[0] // 2
+    q, p = rollout(rk4(lambda t, state: field.rates(*state)), (start[:d], start[d:]), t, substeps=substeps)
+    return jnp.concatenate([q, p], axis=1)
+
+
+def window_residual(
+    field: PhaseField, weights: Weights, start: Array, window: tuple[Array, ...], *, substeps: int
+) -> Array:
+    """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
+    t, measured, weight, *rate = window
+    states = motion(field, start, t, substeps=substeps)
+    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
+    errors = [size * (states - measured) / jnp.asarray(weights.state, start.dtype)]
+    if weights.rate is not None:
+        d = start.shape[0] // 2
+        velocity, force = jax.vmap(field.rates)(states[:, :d], states[:, d:])
+        errors.append(size * (jnp.concatenate([velocity, force], axis=1) - rate[0]) / weights.rate)
+    return jnp.concatenate([jnp.ravel(error) for error in errors])
+
+
+def match_trajectories(
+    model: PhaseModel,
+    parameters: Parameters,
+    windows: Windows,
+    validation: Windows,
+    *,
+    weights: Weights,
+    budget: Budget,
+    adam: Adam | None = None,
+    free_starts: bool = True,
+    substeps: int = 4,
+    checkpoint: Checkpoint | None = None,
+    report: Report = silent,
+) -> Training:
+    """Fits a model to windows, in float64; the `Training` holds the model's parameters alone.
+
+    Selected are the parameters whose motions come closest to the validation windows, whose starts are fitted too where
+    starts are free.
+
+    Args:
+        model: a phase model with float64 parameters.
+        parameters: to start from, such as those of derivative matching.
+        windows: to fit.
+        validation: to select by.
+        weights: of the residuals.
+        budget: when to stop; its `steps` are also Adam's.
+        adam: to take Adam in place of Gauss-Newton.
+        free_starts: whether starts are unknowns; otherwise windows start where they were measured to.
+        substeps: of RK4 between two samples.
+        checkpoint: where to store the run after every dispatch, and whether to continue one.
+        report: called after every dispatch.
+
+    Raises:
+        InputError: no windows, weights that are not positive, rates that the windows lack, or parameters in float32.
+    """
+    require_positive(substeps=substeps)
+    if adam is not None:
+        require_positive(batch=adam.batch, learning_rate=adam.learning_rate)
+    for deviation in np.ravel(weights.state):
+        require_positive(state_weight=float(deviation))
+    if weights.rate is not None:
+        require_positive(rate_weight=weights.rate)
+        if windows.rate is None or validation.rate is None:
+            raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    if not len(windows.t) or not len(validation.t):
+        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+    fitted, held_out = (_arrays(each, weights) for each in (windows, validation))
+    error = functools.partial(window_residual, weights=weights, substeps=substeps)
+
+    def residual(unknowns, index: Array, *window: Array) -> Array:
+        start = unknowns["starts"][index] if free_starts else window[1][0]
+        return error(model.apply(unknowns["model"]), start=start, window=window)
+
+    def score(unknowns) -> tuple[Scalar, Scalar]:
+        field = model.apply(unknowns["model"])
+
+        def closest(*window: Array) -> Array:
+            def from_start(start: Array) -> Array:
+                return error(field, start=start, window=window)
+
+            start = window[1][0]
+            return from_start(_nearest(from_start, start) if free_starts else start)
+
+        errors = jax.vmap(closest)(*held_out)
+        return jnp.mean(jnp.sum(errors**2, axis=1)), jnp.full((), jnp.nan)
+
+    unknowns = {"model": parameters} | ({"starts": fitted[1][:, 0]} if free_starts else {})
+    samples = (jnp.arange(len(windows.t)), *fitted)
+    if adam is None:
+        training = train_second_order(
+            residual, unknowns, samples, score=score, budget=budget, checkpoint=checkpoint, report=report
+        )
+    else:
+        training = train_first_order(
+            lambda unknowns, batch: jnp.mean(jax.vmap(lambda *each: jnp.sum(residual(unknowns, *each) ** 2))(*batch)),
+            adamw(steps=budget.steps, learning_rate=adam.learning_rate),
+            unknowns,
+            samples,
+            score=score,
+            seed=adam.seed,
+            steps=budget.steps,
+            batch=min(adam.batch, len(windows.t)),
+            patience=budget.steps,
+            checkpoint=checkpoint,
+            report=report,
+        )
+    return training._replace(parameters=training.parameters["model"])
+
+
+def _arrays(windows: Windows, weights: Weights) -> tuple[Array, ...]:
+    rates = [] if weights.rate is None or windows.rate is None else [windows.rate]
+    given = (windows.t, windows.state, windows.weight, *rates)
+    return tuple(jnp.asarray(array) for array in given)
+
+
+def _nearest(residual: Callable[[Array], Array], start: Array) -> Array:
+    """A start of lower residual, by a few steps of Gauss-Newton."""
+
+    def step(start: Array, _) -> tuple[Array, None]:
+        slope, value = jax.jacfwd(residual)(start), residual(start)
+        return start - solve(slope.T @ slope, slope.T @ value), None
+
+    return jax.lax.scan(step, start, length=START_STEPS)[0]

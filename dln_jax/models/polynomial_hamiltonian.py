@@ -1,0 +1,88 @@
+"""Hamiltonian that is linear in its parameters: polynomials of momenta and displacements, harmonics of angles.
+
+    H(q, p) = sum_k c_k phi_k(q, p)
+
+The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacement of each prismatic
+joint, and of cos(n q_j) and sin(n q_j), of degree n, for each revolute joint; without the constant, which no motion
+shows. Hamilton's equations are linear in c, so that rates of states identify it by linear least squares
+(`learning.field_matching.match_linear`). The count of terms grows with the degree to the power of the coordinates.
+"""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
+
+from dln_jax.models.model import Parameters
+from dln_jax.models.phase_field import PhaseField, PhaseModel, phase_field
+from dln_jax.types import InputError, Needs, Scalar, Vector
+
+MOST_TERMS = 5_000
+"""Of the energy; the fit's cost grows with their square."""
+
+
+class _Choice(NamedTuple):
+    """One factor of a term: a function of one variable."""
+
+    degree: int
+    place: int
+    """In the table of that variable's functions."""
+
+
+def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> PhaseModel:
+    """The (init, apply) pair; parameters are the vector c, and start at zero.
+
+    Args:
+        needs: what the scene needs; the kinds of its joints. Friction would not be linear beside H.
+        degree: the largest total degree of a term.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: a scene with friction, a degree below 2, or more than `MOST_TERMS` terms.
+    """
+    if needs.friction:
+        raise InputError(
+            "the polynomial Hamiltonian conserves energy; take a dissipative model for needs with friction"
+        )
+    if degree < 2:
+        raise InputError(f"degree is {degree}; expected at least 2, since kinetic energy is quadratic in p")
+    d = needs.degrees_of_freedom
+    # Functions of one variable: 1, then x^n, or cos nx and sin nx.
+    powers = [_Choice(n, n) for n in range(degree + 1)]
+    harmonics = [_Choice((n + 1) // 2, n) for n in range(2 * degree + 1)]
+    choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d
+    most = math.prod(len(each) for each in choices)
+    if most > MOST_TERMS * 100:
+        raise InputError(f"{d} coordinates to degree {degree} make too many terms; lower the degree")
+    terms = np.array(
+        [
+            [factor.place for factor in term]
+            for term in itertools.product(*choices)
+            if 0 < sum(factor.degree for factor in term) <= degree
+        ]
+    )
+    if len(terms) > MOST_TERMS:
+        raise InputError(f"degree {degree} makes {len(terms)} terms; the limit is {MOST_TERMS}: lower the degree")
+
+    def table(revolute: bool, x: Scalar) -> Float[Array, " functions"]:
+        if not revolute:
+            return jnp.stack([jnp.ones_like(x), *(x**n for n in range(1, degree + 1))])
+        waves = [wave(n * x) for n in range(1, degree + 1) for wave in (jnp.cos, jnp.sin)]
+        return jnp.stack([jnp.ones_like(x), *waves])
+
+    def values(q: Vector, p: Vector) -> Float[Array, " terms"]:
+        product = jnp.ones(len(terms), p.dtype)
+        for j in range(d):
+            product *= table(needs.joints[j] == "revolute", q[j])[terms[:, j]]
+            product *= table(False, p[j])[terms[:, d + j]]
+        return product
+
+    def apply(parameters: Parameters) -> PhaseField:
+        return phase_field(lambda q, p: jnp.dot(parameters, values(q, p)))
+
+    return PhaseModel(init=lambda key: jnp.zeros(len(terms), dtype), apply=apply)

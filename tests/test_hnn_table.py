@@ -1,0 +1,142 @@
+"""The table of Hamiltonian tasks: every task end to end on a tiny budget, its bookkeeping, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from test_field_matching import quick_motion
+from test_train_delan import command, refused
+
+from dln_jax.data import phase_samples, schema
+from dln_jax.evaluation.phase_metrics import Motions
+from dln_jax.types import InputError
+from scripts import hnn_measures, hnn_models, hnn_table, hnn_tasks
+from scripts.hnn_models import RECIPES, description_of, models_of
+from scripts.hnn_table import BOUNDS, PUBLISHED, TASKS, rows_of
+from scripts.hnn_tasks import pieces, problem_of
+
+KINDS = {
+    "spring": ("polynomial",),
+    "pendulum": ("baseline",),
+    "real-pendulum": ("hnn",),
+    "two-body": ("black-box-hnn",),
+    "three-body": ("hnn",),
+}
+"""Each kind of model on one task at least; a program of each takes seconds to compile."""
+
+
+def quick_prediction(model, parameters, q, p, t):
+    field = model.apply(parameters)
+    return (
+        Motions(t, *quick_motion(field.energy, q, p, t, dissipation=field.dissipation))
+        if field.energy
+        else Motions(t, *(np.tile(state[:, None], (1, len(t), 1)) for state in (q, p)))
+    )
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """A damped pendulum with gaps in place of the measured one, and recipes that take a moment."""
+    folder = tmp_path_factory.mktemp("tasks")
+    t = np.arange(160) / 6
+    t[40:] += 1 / 6
+    q = (2 * np.exp(-0.02 * t) * np.cos(2 * t))[:, None]
+    schema.save(folder / "swing.npz", schema.from_arrays({"t": t, "q": q, "trajectory": np.zeros(160)}))
+    small = {
+        name: recipe._replace(
+            width=2, depth=1, network=3, network_depth=1, window=6, substeps=1,
+            trajectory_steps=int(name in (hnn_tasks.REAL, hnn_tasks.MEASURED)),
+        )
+        for name, recipe in RECIPES.items()
+    }  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(hnn_models, "RECIPES", small)
+        patch.setattr(hnn_tasks, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
+        patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
+        patch.setattr(hnn_table, "models_of", KINDS.get)
+        patch.setattr(hnn_measures, "predict", quick_prediction)
+        for module in (phase_samples, hnn_tasks):
+            patch.setattr(module, "reference_motion", quick_motion)
+        patch.setattr(hnn_tasks, "STARTS", 2)
+        patch.setattr(hnn_tasks, "POINTS", 4)
+        patch.setattr(hnn_models, "DEGREES", (2, 3))
+        yield folder
+
+
+TINY = ("--seeds", "1", "--steps", "1", "--trajectories", "10")
+
+
+def test_every_task_runs_and_reports(workplace, capsys):
+    command(hnn_table, *TINY, "--real-pendulum", "swing.npz", "--out", "all")
+    report = json.loads((workplace / "all" / "report.json").read_text())
+    rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
+    for task in TASKS:
+        assert (workplace / "all" / f"{task}.png").read_bytes().startswith(b"\x89PNG")
+        for kind in KINDS[task]:
+            quantities = {quantity for case, quantity in rows if case == f"{task}/{kind}"}
+            assert {"energy_mse", "rollout_mse", "train_seconds", "compile_seconds", "parameters"} <= quantities
+            if task != hnn_tasks.REAL:
+                assert {"test_loss", "train_loss", "clean_field_mse", "energy_mse_standard_error"} <= quantities
+            for quantity, published in PUBLISHED[task].items():
+                if (f"{task}/{kind}", quantity) in rows:
+                    expected = published[0 if kind == "baseline" else 1]
+                    assert rows[f"{task}/{kind}", quantity]["reference"] == expected
+    # The polynomial holds the oscillator.
+    assert rows["spring/polynomial", "clean_field_mse"]["value"] < 0.1
+    assert rows["three-body/hnn", "energy_mse"]["bound"] == 4.2e-3
+    assert "published_energy_mse" in {quantity for case, quantity in rows if case == "pendulum/baseline"}
+
+
+def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch):
+    monkeypatch.setattr(hnn_table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
+    monkeypatch.setattr(hnn_table, "chosen_tasks", lambda given: list(TASKS))
+    before = (workplace / "all" / "jobs.json").read_bytes()
+    command(hnn_table, "--out", "all", "--resume")
+    assert (workplace / "all" / "jobs.json").read_bytes() == before
+
+
+def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
+    numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
+    monkeypatch.setattr(hnn_table, "measure", lambda *a, **k: (numbers, None))
+    command(hnn_table, *TINY, "--tasks", "spring,real-pendulum", "--no-figures", "--out", "part")
+    out = capsys.readouterr().out
+    assert "real-pendulum is left out" in out
+    assert not (workplace / "part" / "spring.png").exists()
+    assert "needs its data" in refused(capsys, hnn_table, "--tasks", "real-pendulum", "--out", "no")
+
+
+def test_bounds_decide():
+    rows = {row.quantity: row for row in rows_of("spring/hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})}
+    assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
+    assert all(row.bound is None for row in rows_of("spring/baseline", {"energy_mse": 1e-6}))
+    assert set(PUBLISHED) == set(BOUNDS) == set(TASKS) and set(RECIPES) == set(hnn_tasks.TASKS)
+
+
+def test_measured_motions_are_cut_at_gaps(workplace):
+    problem = problem_of(hnn_tasks.REAL, data=workplace / "swing.npz")
+    fitted = problem.fitted
+    steps = np.diff(fitted.t)[np.diff(fitted.trajectory) == 0]
+    assert steps.max() < 0.2 and len(np.unique(fitted.trajectory)) > 2
+    # A fifth of the samples is the test, predicted from its first state.
+    assert problem.truth[0].q.shape == (1, 32, 1) and len(fitted.t) == 128 and problem.truth[0].t[0] == 0
+    np.testing.assert_array_equal(fitted.p, fitted.qd)
+    assert len(np.unique(pieces(fitted, 100).trajectory)) == len(np.unique(fitted.trajectory))
+
+
+def test_mistakes_are_one_line(workplace, capsys):
+    two = schema.load("swing.npz")
+    schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
+    cases = [
+        (("--tasks", "spring,pixels"), "task 'pixels' is unknown"),
+        (("--seeds", "0"), "seeds is 0"),
+        (("--steps", "0"), "steps is 0"),
+        (("--real-pendulum", "missing.npz"), "no such file"),
+        (("--real-pendulum", "double.npz"), "has 2 coordinates"),
+        (("--tasks", "two-body", "--trajectories", "3"), "trajectories is 3"),
+    ]
+    for number, (options, message) in enumerate(cases):
+        assert message in refused(capsys, hnn_table, *options, "--out", f"no-{number}")
+    with pytest.raises(InputError, match="model 'delan' is unknown; choose from hnn"):
+        description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), "delan")
+    assert set(models_of("spring")) == {"hnn", "black-box-hnn", "baseline", "polynomial"}
