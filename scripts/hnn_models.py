@@ -5,6 +5,7 @@ trajectories with free starts, which takes away the bias of the noise. The other
 alone. Measurements have no rates, only finite differences for a first fit: the result is that to trajectories.
 """
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,6 +82,9 @@ RECIPES = {
     REAL: Recipe("separable", 4, 1, 8, 1, 40, 10_000, 30.0, 40, WINDOW[REAL], Weights(state=0.03), 1),
     MEASURED: Recipe("structured", 8, 1, 16, 1, 60, 10_000, 60.0, 60, WINDOW[MEASURED], None, 2),
 }
+ANCHOR = 30.0
+"""How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
+to choose its own momentum."""
 FRICTION_WIDTH = 4
 """Hidden units of the friction, where a scene has it; the model that is one network has one coefficient."""
 
@@ -152,7 +156,8 @@ def train(
         validation_share=VALIDATION_SHARE,
         seed=seed,
     )
-    stated = {**settings._asdict(), "model": description, "seconds": None}
+    # As JSON reads it back, lists for tuples, so that a resumed run is recognised.
+    stated = json.loads(json.dumps({**settings._asdict(), "model": description, "seconds": None}))
     numbers = fingerprint(getattr(problem.fitted, key) for key in PER_SAMPLE)
 
     def checkpoint(name: str) -> Checkpoint | None:
@@ -184,9 +189,9 @@ def train(
 
 
 def deviations(data: Trajectories) -> Weights:
-    """Weights by the spread of the data; velocities that are finite differences of q are no measurement of p."""
+    """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
     assert data.p is not None
     spread = [np.where(array.std(axis=0) > 0, array.std(axis=0), 1.0) for array in (data.q, data.p)]
     if "qd" in data.estimated and np.array_equal(data.p, data.qd):
-        spread[1] = np.full_like(spread[1], np.inf)
+        spread[1] = ANCHOR * spread[1]
     return Weights(state=tuple(float(size) for size in np.concatenate(spread)))

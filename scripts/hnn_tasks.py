@@ -125,7 +125,7 @@ def measured(name: str, data: Trajectories, file: str, needs: Needs | None) -> P
     else:
         chosen = present[5::6] if len(present) >= 6 else present[-1:]
         fitted = select(data, np.setdiff1d(present, chosen))
-        tests = [select(data, [index]) for index in chosen[:STARTS]]
+        tests = [select(data, chosen[[place]]) for place in range(min(len(chosen), STARTS))]
     length = min(len(test.t) for test in tests)
     truth = tuple(motion_of(samples_of(test, slice(0, length))) for test in tests)
     energy = real_energy if name == REAL else None

@@ -11,19 +11,22 @@ from rich.table import Table
 
 from dln_jax.data.schema import needs_from_json
 from dln_jax.deploy.load import load_phase_field, save_model
-from dln_jax.evaluation import figures
+from dln_jax.deploy.phase_kinds import build_phase
+from dln_jax.evaluation import animations, figures
 from dln_jax.evaluation.latency import one_step
+from dln_jax.evaluation.phase_figures import TRUTH
 from dln_jax.learning.runs import Progress
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import CONFIG, new_folder, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, stored_arguments, write_json
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
-from scripts.hnn_tasks import Problem, problem_of
+from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
 from scripts.progress import progress
 
 if TYPE_CHECKING:
     from scripts.train_hnn import Arguments
 
+GIF_FRAMES = 80
 UNSUITABLE = ("test", "scene", "target")
 """Options of models of torques, which a task decides itself."""
 
@@ -31,8 +34,6 @@ UNSUITABLE = ("test", "scene", "target")
 def run_task(given: "Arguments") -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
-    if given.resume:
-        given = with_stored_arguments(given)
     check(given)
     problem = problem_of(
         given.task or "", trajectories=given.trajectories, data=given.data, needs=stated_needs(given.needs)
@@ -40,6 +41,7 @@ def run_task(given: "Arguments") -> None:
     size: dict[str, Any] = {"width": given.width, "depth": given.depth if given.depth != 2 else None}
     size["degree"] = given.degree if given.model == POLYNOMIAL and given.degree > 1 else None
     description = description_of(problem, given.model, activation=given.activation, **size)
+    build_phase(description)  # refuses what does not suit, before anything is written
     folder = given.out if given.resume and given.out else new_folder(given.out, "train_hnn")
     write_json(folder / CONFIG, {**stored_arguments(given), "chosen": description})
     announce(console, problem, description)
@@ -126,7 +128,7 @@ def announce(console: Console, problem: Problem, description: dict[str, Any]) ->
     missing = [key for key in data.estimated if key != "tau"]
     if missing:
         console.print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
-    if np.array_equal(data.p if data.p is not None else 0, data.qd):
+    if problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
         console.print("momenta p are taken as qd, per unit of inertia")
 
 
@@ -142,6 +144,9 @@ def draw(folder: Path, problem: Problem, kind: str, seen: Seen, history: list[Pr
     """Writes what there is to draw."""
     name = "baseline" if kind == KINDS["baseline"] else "hnn"
     figure_of(problem, {name: seen}).savefig(folder / "motions.png")
+    truth = problem.truth[0]
+    stride = max(1, len(truth.t) // GIF_FRAMES)
+    animations.write_motion_gif(folder / "motions.gif", {TRUTH: truth, name: seen.motions}, stride=stride)
     if len(history) > 1:
         best = min(history, key=lambda at: at.validation).step
         figures.training_curve(history, best_step=best, error="error (weighted)").savefig(folder / "training.png")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from scripts import dynamics_training, phase_training
-from scripts.command_line import run
+from scripts.command_line import run, with_stored_arguments
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 
@@ -35,6 +35,8 @@ class Arguments(dynamics_training.Arguments):
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
+    if given.resume:
+        given = with_stored_arguments(given)
     if given.task is None:
         dynamics_training.run_training(given, "train_hnn", KINDS)
     else:

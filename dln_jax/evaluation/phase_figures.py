@@ -59,17 +59,24 @@ def motion_figure(
         axis.set_xlabel("q" if plane else "x, m")
         axis.set_ylabel("p" if plane else "y, m")
     t = motions[TRUTH].t
-    scale = energies[TRUTH][shown]
-    margin = 0.3 * max(float(np.ptp(scale)), 0.1 * float(np.abs(scale).max()))
     for name in motions:
         finite = np.where(np.isfinite(energies[name][shown]), energies[name][shown], np.nan)
         style = "--" if name == TRUTH else "-"
         axes[-1].plot(t, finite, style, color=COLOURS.get(name, "C0"), label=name, zorder=3 if name == TRUTH else 2)
     axes[-1].set(xlabel="t, s", ylabel=quantity, title=f"{'true ' * (quantity == 'energy')}{quantity} along each")
-    axes[-1].set_ylim(float(scale.min()) - margin, float(scale.max()) + margin)
+    axes[-1].set_ylim(*_limits(energies[TRUTH][shown], [each[shown] for each in energies.values()]))
     axes[-1].grid(True, alpha=0.25)
     axes[-1].legend(frameon=False, fontsize=8)
     return figure
+
+
+def _limits(truth: np.ndarray, curves: list[np.ndarray]) -> tuple[float, float]:
+    """Room for the truth and for most of what the others do; one that runs away leaves the picture."""
+    every = np.concatenate([each[np.isfinite(each)] for each in curves])
+    low, high = np.quantile(every, [0.03, 0.97])
+    low, high = min(low, truth.min()), max(high, truth.max())
+    margin = 0.1 * max(high - low, 0.05 * float(np.abs(truth).max()))
+    return float(low - margin), float(high + margin)
 
 
 def _paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -1,16 +1,18 @@
-"""The table of Hamiltonian tasks: every task end to end on a tiny budget, its bookkeeping, and what it refuses."""
+"""Hamiltonian tasks: the table and train_hnn end to end on tiny budgets, their bookkeeping, and what they refuse."""
 
 import json
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 from test_field_matching import quick_motion
 from test_train_delan import command, refused
 
 from dln_jax.data import phase_samples, schema
+from dln_jax.deploy.load import load_phase_field
 from dln_jax.evaluation.phase_metrics import Motions
 from dln_jax.types import InputError
-from scripts import hnn_measures, hnn_models, hnn_table, hnn_tasks
+from scripts import hnn_measures, hnn_models, hnn_table, hnn_tasks, train_hnn
 from scripts.hnn_models import RECIPES, description_of, models_of
 from scripts.hnn_table import BOUNDS, PUBLISHED, TASKS, rows_of
 from scripts.hnn_tasks import pieces, problem_of
@@ -32,6 +34,12 @@ def quick_prediction(model, parameters, q, p, t):
         if field.energy
         else Motions(t, *(np.tile(state[:, None], (1, len(t), 1)) for state in (q, p)))
     )
+
+
+def quick_training(problem, description, **options):
+    """By Adam where rates are matched, whose programs compile sooner."""
+    optimizer = "gauss-newton" if problem.name == hnn_tasks.REAL else "adam"
+    return hnn_models.train(problem, description, optimizer=optimizer, **options)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +64,7 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
         patch.setattr(hnn_table, "models_of", KINDS.get)
         patch.setattr(hnn_measures, "predict", quick_prediction)
+        patch.setattr(hnn_table, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
             patch.setattr(module, "reference_motion", quick_motion)
         patch.setattr(hnn_tasks, "STARTS", 2)
@@ -140,3 +149,58 @@ def test_mistakes_are_one_line(workplace, capsys):
     with pytest.raises(InputError, match="model 'delan' is unknown; choose from hnn"):
         description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), "delan")
     assert set(models_of("spring")) == {"hnn", "black-box-hnn", "baseline", "polynomial"}
+
+
+@pytest.fixture(scope="module")
+def positions(workplace):
+    """Six swings of which only q was measured, two with a gap."""
+    t = np.arange(40) * 0.1
+    parts = [(np.delete(t, range(15, 18)) if number < 2 else t) for number in range(6)]
+    q = [np.cos(2 * part + number) for number, part in enumerate(parts)]
+    index = np.repeat(np.arange(6), [len(part) for part in parts])
+    np.savez("positions.npz", t=np.concatenate(parts), q=np.concatenate(q)[:, None], trajectory=index)
+    forced = {"q": np.cos(t)[:, None], "tau": np.ones((40, 1))}
+    np.savez("forced.npz", t=t, trajectory=np.zeros(40), **forced)
+    return workplace / "positions.npz"
+
+
+OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": ["prismatic"]}')
+
+
+def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
+    command(train_hnn, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
+    assert "finite differences" in capsys.readouterr().out
+    folder = positions.parent / "whole"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert {"rollout_mse", "train_seconds", "one_step_p50_us", "validation_error"} <= set(metrics)
+    assert "energy_mse" not in metrics
+    stored = load_file(folder / "model.safetensors")
+    for name in ("model.json", "model.safetensors", "metrics.json"):
+        (folder / name).unlink()
+    command(train_hnn, "--out", str(folder), "--resume", "--no-figures")
+    again = load_file(folder / "model.safetensors")
+    assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
+    field = load_phase_field(folder)
+    assert field.energy is not None and field.dissipation is None
+    qd, pd = field.rates(np.ones(1), np.ones(1))
+    assert np.isfinite(qd).all() and np.isfinite(pd).all()
+
+
+def test_what_a_task_does_not_take_is_one_line(positions, capsys):
+    cases = [
+        (("--task", "juggling"), "task 'juggling' is unknown"),
+        (("--task", "measured"), "needs its data"),
+        (("--task", "measured", "--data", "forced.npz"), "applied forces"),
+        (("--task", "spring", "--data", "positions.npz"), "generates its data"),
+        ((*OWN, "--model", "pairwise"), "positions of bodies"),
+        ((*OWN, "--precision", "f32"), "leave --precision out"),
+        ((*OWN, "--seeds", "3"), "hnn_table measures several"),
+        ((*OWN, "--target", "1e-6"), "leave it out with --task"),
+        ((*OWN, "--steps", "0"), "steps is 0"),
+        ((*OWN[:4], "--needs", "{"), "--needs is not JSON"),
+        ((*OWN[:4], "--needs", '{"joints": ["revolute", "revolute"]}'), "have 2 joints"),
+        (("--model", "baseline"), "expected one of auto, structured, black-box"),
+    ]
+    for number, (options, message) in enumerate(cases):
+        assert message in refused(capsys, train_hnn, *options, "--out", f"none-{number}")
+        assert not (positions.parent / f"none-{number}").exists()
