@@ -1,28 +1,29 @@
 """Train Hamiltonian models and baselines on the published tasks, and print their errors beside the published ones.
 
-Tasks: spring, pendulum, real-pendulum, two-body and three-body. Models: hnn (what suits the scene: separable, pairwise,
-with friction where the scene has it), black-box-hnn (one network is H), baseline (a network gives the rates). Each is
-trained on the published data (those of seed 0) from several seeds; numbers are medians over these. Prints a table,
-writes report.json, and draws each task's motions and energies.
+Tasks: spring, pendulum, real-pendulum, two-body, three-body and pixels. Models: hnn (what suits the scene: separable,
+pairwise, with friction where the scene has it), black-box-hnn (one network is H), baseline (a network gives the rates).
+Each is trained on the published data (those of seed 0) from several seeds; numbers are medians over these. Prints a
+table, writes report.json and table.md, and draws each task's motions and energies.
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
+from scripts import pixel_task as pixels
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import description_of, models_of, train
-from scripts.hnn_tasks import REAL, Problem, problem_of
+from scripts.hnn_published import PIXELS, markdown, rows_of
+from scripts.hnn_tasks import REAL, problem_of
 from scripts.report_table import print_report
 
-TASKS = ("spring", "pendulum", REAL, "two-body", "three-body")
+TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published ones."""
 JOBS = "jobs.json"
 """What has been measured so far, for --resume."""
@@ -33,7 +34,7 @@ class Arguments:
     """What to measure."""
 
     tasks: str = ",".join(TASKS)
-    """Comma separated, from spring, pendulum, real-pendulum, two-body, three-body."""
+    """Comma separated, from spring, pendulum, real-pendulum, two-body, three-body, pixels."""
     real_pendulum: Path | None = None
     """The measured pendulum (Schmidt and Lipson 2009) in the npz schema; without it that task is left out."""
     seeds: int = 3
@@ -65,16 +66,12 @@ def main(given: Arguments) -> None:
     if REAL not in names and REAL in given.tasks.split(","):
         console.print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
     for name in names:
-        if all(f"{name}/{kind}" in found for kind in models_of(name)):
+        if any(case.startswith(f"{name}/") for case in found):
             continue
-        problem = problem_of(name, trajectories=given.trajectories, data=given.real_pendulum if name == REAL else None)
-        seen: dict[str, Seen] = {}
-        for kind in models_of(name):
-            numbers, seen[kind] = measure(problem, kind, seeds=range(given.seeds), steps=given.steps)
+        measured = pixel_task(given, folder) if name == PIXELS else phase_task(name, given, folder)
+        for kind, numbers in measured.items():
             found[f"{name}/{kind}"] = numbers
             console.print(f"{name}/{kind:14s} {summary(numbers)}")
-        if given.figures:
-            figure_of(problem, seen).savefig(folder / f"{name}.png")
         write_json(stored, found)
     rows = [row for case, numbers in found.items() for row in rows_of(case, numbers)]
     facts = conditions(
@@ -85,8 +82,11 @@ def main(given: Arguments) -> None:
         statistics="medians over seeds; compilation is apart from train_seconds",
     )
     write_report(folder / "report.json", rows, facts)
+    table = markdown(found)
+    (folder / "table.md").write_text(table)
     print_report([row for row in rows if row.quantity in SHOWN], facts)
-    print(f"report: {folder / 'report.json'}")
+    print(table)
+    print(f"report: {folder / 'report.json'}, table: {folder / 'table.md'}")
 
 
 def chosen_tasks(given: Arguments) -> list[str]:
@@ -108,50 +108,50 @@ def chosen_tasks(given: Arguments) -> list[str]:
     return names
 
 
-def measure(problem: Problem, kind: str, *, seeds: Sequence[int], steps: int | None) -> tuple[dict[str, float], Seen]:
-    """Medians over seeds of a model's errors and times, and what the first seed predicts."""
-    description = description_of(problem, kind)
-    # Each seed pays for its own compilation, as a user does.
-    runs = [measured_once(problem, train(problem, description, seed=seed, steps=steps)) for seed in seeds]
-    of_seeds = [numbers for numbers, _ in runs]
-    medians = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
+def phase_task(name: str, given: Arguments, folder: Path) -> dict[str, dict[str, float]]:
+    """Every model of a task in coordinates and momenta, and its figure."""
+    problem = problem_of(name, trajectories=given.trajectories, data=given.real_pendulum if name == REAL else None)
+    found: dict[str, dict[str, float]] = {}
+    seen: dict[str, Seen] = {}
+    for kind in models_of(name):
+        description = description_of(problem, kind)
+        # Each seed pays for its own compilation, as a user does.
+        runs = [
+            measured_once(problem, train(problem, description, seed=seed, steps=given.steps))
+            for seed in range(given.seeds)
+        ]
+        found[kind], seen[kind] = medians([numbers for numbers, _ in runs]), runs[0][1]
+    if given.figures:
+        figure_of(problem, seen).savefig(folder / f"{name}.png")
+    return found
+
+
+def pixel_task(given: Arguments, folder: Path) -> dict[str, dict[str, float]]:
+    """The models of pictures, and their animation and pictures."""
+    found, seen = {}, {}
+    for kind in pixels.KINDS:
+        runs = [
+            pixels.measure_pixels(kind, seed=seed, steps=given.steps, trajectories=given.trajectories)
+            for seed in range(given.seeds)
+        ]
+        found[kind], seen[kind] = medians([numbers for numbers, _ in runs]), runs[0][1]
+    found["hnn"]["energy_mse_over_baseline"] = found["hnn"]["energy_mse"] / found["baseline"]["energy_mse"]
+    if given.figures:
+        pixels.draw_pixels(seen, pixels.pixel_data(given.trajectories), folder)
+    return found
+
+
+def medians(of_seeds: list[dict[str, float]]) -> dict[str, float]:
+    """Of each quantity over the seeds, and the largest energy error."""
+    found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
     worst = {"energy_mse_largest": float(np.max([each["energy_mse"] for each in of_seeds]))}
-    return {key: value for key, value in (medians | worst).items() if not np.isnan(value)}, runs[0][1]
+    return {key: value for key, value in (found | worst).items() if not np.isnan(value)}
 
 
-PUBLISHED = {
-    "spring": {"test_loss": (3.67e-2, 3.59e-2), "energy_mse": (1.7e-1, 3.8e-4)},
-    "pendulum": {"test_loss": (3.53e-2, 3.56e-2), "published_energy_mse": (4.2e-2, 2.5e-2)},
-    REAL: {"energy_mse": (3.9e-1, 1.4e-2)},
-    "two-body": {"test_loss": (3.0e-5, 2.8e-6), "energy_mse": (6.3e-2, 3.9e-5)},
-    "three-body": {"test_loss": (3.8e-1, 4.9e-1), "energy_mse": (1.1e2, 4.2e-2)},
-}
-"""Of the published baseline and Hamiltonian network (Greydanus, Dzamba and Yosinski 2019)."""
-BOUNDS = {
-    "spring": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
-    "pendulum": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
-    REAL: {"energy_mse": 8e-4, "train_seconds": 60.0},
-    "two-body": {"energy_mse": 3.9e-6, "train_seconds": 30.0},
-    "three-body": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
-}
-"""For the model that suits the scene."""
 SHOWN = (
     *("test_loss", "clean_field_mse", "energy_mse", "energy_mse_standard_error", "energy_mse_median"),
-    *("published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
+    *("energy_mse_over_baseline", "published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
 )
-
-
-def rows_of(case: str, numbers: dict[str, float]) -> list[Row]:
-    """The report's rows of a case, with the published value and the bound where there are."""
-    task, kind = case.split("/")
-    rows = []
-    for quantity, value in numbers.items():
-        published = PUBLISHED[task].get(quantity)
-        reference = None if published is None else published[0 if kind == "baseline" else 1]
-        bound = BOUNDS[task].get(quantity) if kind == "hnn" else None
-        unit = "s" if quantity.endswith("seconds") else "1"
-        rows.append(Row(case, quantity, value, unit, reference, bound))
-    return rows
 
 
 def summary(numbers: dict[str, float]) -> str:

@@ -15,8 +15,9 @@ least-squares problem) and baseline (a network gives the rates). Friction is lea
 from dataclasses import dataclass
 from typing import Literal
 
-from scripts import dynamics_training, phase_training
+from scripts import dynamics_training, phase_training, pixel_training
 from scripts.command_line import run, with_stored_arguments
+from scripts.hnn_published import PIXELS
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 
@@ -39,6 +40,8 @@ def main(given: Arguments) -> None:
         given = with_stored_arguments(given)
     if given.task is None:
         dynamics_training.run_training(given, "train_hnn", KINDS)
+    elif given.task == PIXELS:
+        pixel_training.run_pixels(given)
     else:
         phase_training.run_task(given)
 

@@ -12,9 +12,10 @@ from dln_jax.data import phase_samples, schema
 from dln_jax.deploy.load import load_phase_field
 from dln_jax.evaluation.phase_metrics import Motions
 from dln_jax.types import InputError
-from scripts import hnn_measures, hnn_models, hnn_table, hnn_tasks, train_hnn
+from scripts import hnn_measures, hnn_models, hnn_table, hnn_tasks, pixel_task, train_hnn
 from scripts.hnn_models import RECIPES, description_of, models_of
-from scripts.hnn_table import BOUNDS, PUBLISHED, TASKS, rows_of
+from scripts.hnn_published import BOUNDS, PIXELS, PUBLISHED, markdown, rows_of
+from scripts.hnn_table import TASKS
 from scripts.hnn_tasks import pieces, problem_of
 
 KINDS = {
@@ -40,6 +41,12 @@ def quick_training(problem, description, **options):
     """By Adam where rates are matched, whose programs compile sooner."""
     optimizer = "gauss-newton" if problem.name == hnn_tasks.REAL else "adam"
     return hnn_models.train(problem, description, optimizer=optimizer, **options)
+
+
+def quick_pixels(kind):
+    """The pictures have tests of their own; here, what the table does with their numbers."""
+    numbers = dict.fromkeys(("energy_mse", "rollout_mse", "compile_seconds", "parameters", "test_loss"), 2.0)
+    return {**numbers, "energy_mse": 1e-5 if kind == "hnn" else 1e-3, "train_seconds": 1.0}
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +77,9 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_tasks, "STARTS", 2)
         patch.setattr(hnn_tasks, "POINTS", 4)
         patch.setattr(hnn_models, "DEGREES", (2, 3))
+        patch.setattr(pixel_task, "measure_pixels", lambda kind, **options: (quick_pixels(kind), None))
+        patch.setattr(pixel_task, "draw_pixels", lambda seen, data, folder: None)
+        patch.setattr(pixel_task, "pixel_data", lambda *options: None)
         yield folder
 
 
@@ -80,7 +90,9 @@ def test_every_task_runs_and_reports(workplace, capsys):
     command(hnn_table, *TINY, "--real-pendulum", "swing.npz", "--out", "all")
     report = json.loads((workplace / "all" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
-    for task in TASKS:
+    assert rows["pixels/hnn", "energy_mse_over_baseline"]["pass"] is True
+    assert "| pixels/baseline |" in (workplace / "all" / "table.md").read_text()
+    for task in KINDS:
         assert (workplace / "all" / f"{task}.png").read_bytes().startswith(b"\x89PNG")
         for kind in KINDS[task]:
             quantities = {quantity for case, quantity in rows if case == f"{task}/{kind}"}
@@ -107,7 +119,7 @@ def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch)
 
 def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
     numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
-    monkeypatch.setattr(hnn_table, "measure", lambda *a, **k: (numbers, None))
+    monkeypatch.setattr(hnn_table, "phase_task", lambda *given: {"hnn": numbers})
     command(hnn_table, *TINY, "--tasks", "spring,real-pendulum", "--no-figures", "--out", "part")
     out = capsys.readouterr().out
     assert "real-pendulum is left out" in out
@@ -116,6 +128,8 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
 
 
 def test_bounds_decide():
+    line = markdown({"spring/hnn": {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7}}).splitlines()[-1]
+    assert "1.0e-06 ± 2e-07 / 3.8e-04" in line and PIXELS in PUBLISHED
     rows = {row.quantity: row for row in rows_of("spring/hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})}
     assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
     assert all(row.bound is None for row in rows_of("spring/baseline", {"energy_mse": 1e-6}))
@@ -137,7 +151,7 @@ def test_mistakes_are_one_line(workplace, capsys):
     two = schema.load("swing.npz")
     schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
     cases = [
-        (("--tasks", "spring,pixels"), "task 'pixels' is unknown"),
+        (("--tasks", "spring,pixel"), "task 'pixel' is unknown"),
         (("--seeds", "0"), "seeds is 0"),
         (("--steps", "0"), "steps is 0"),
         (("--real-pendulum", "missing.npz"), "no such file"),

@@ -1,0 +1,151 @@
+"""Fits an autoencoder and the field in its latent plane to pictures of motions (Greydanus, Dzamba and Yosinski 2019).
+
+    loss = AE + CC + 0.1 HNN                              published weights; means over samples and components
+    AE   = |decoder(encoder(x_k)) - x_k|²                 pictures come back
+    CC   = |z_p,k - (z_q,k+1 - z_q,k)|²                   the momentum is the change of the coordinate per frame
+    HNN  = |flow_j(z_0) - z_j|²                           the field moves the latent states as the pictures do
+
+Samples are windows of frames after each other, k = 0 .. W - 1, and x_k are the frames k and k + 1. In place of the
+published forward difference, z_1 - z_0 = rates(z_0), which is off by the square of the time of a frame, the field is
+integrated by RK4 from a window's first state to each of the next: with a window of two that is the published term made
+exact, and longer ones weigh what grows in a motion. Adam has a cosine schedule; published was a constant rate.
+
+Latent states have no scale of their own: CC and HNN fall when the plane shrinks, and AE does not notice. So that
+nothing is gained by shrinking, every error is taken relative to the variance in the batch of what it is an error of
+(of z_p for CC), unless `relative` is off. The published weights then weigh other sizes: on the pendulum HNN needs 10
+in place of 0.1 before the motions, and not the decoder, are as good as they can be.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.learning.first_order import train_first_order
+from dln_jax.learning.optimisers import adamw
+from dln_jax.learning.runs import Checkpoint, Report, Training, silent
+from dln_jax.mechanics.integrators import rk4, rollout
+from dln_jax.models.latent_phase import LatentModel
+from dln_jax.models.model import Parameters
+from dln_jax.types import InputError, Scalar, require_positive
+
+
+class Weights(NamedTuple):
+    """Of the terms of the loss."""
+
+    autoencoder: float = 1.0
+    coordinate: float = 1.0
+    field: float = 0.1
+
+
+class Settings(NamedTuple):
+    """How to fit; in float32."""
+
+    steps: int = 12_000
+    window: int = 2
+    """Pictures (of two frames) of a window."""
+    batch: int = 50
+    """Windows of a step."""
+    learning_rate: float = 2e-3
+    """The largest; it falls to a thousandth by a cosine."""
+    weights: Weights = Weights()
+    relative: bool = True
+    """Whether errors of latent states are relative to their variances; published ones are not."""
+    seed: int = 0
+    """Of the initial parameters and the order of the samples."""
+
+
+class Terms(NamedTuple):
+    """The loss, before it is weighted."""
+
+    autoencoder: Scalar
+    coordinate: Scalar
+    field: Scalar
+
+
+def terms(
+    model: LatentModel, parameters: Parameters, windows: Float[Array, "N frames pixels"], relative: bool
+) -> Terms:
+    """AE, CC and HNN of windows of W + 1 frames each."""
+    system = model.apply(parameters)
+    step = rk4(lambda t, state: system.field.rates(*state))
+    pairs = jnp.concatenate([windows[:, :-1], windows[:, 1:]], axis=2)
+    q, p = jax.vmap(jax.vmap(system.encode))(pairs)
+    pictures = jax.vmap(jax.vmap(system.decode))(q, p)
+    t = jnp.arange(pairs.shape[1], dtype=q.dtype)
+    moved = jax.vmap(lambda q, p: rollout(step, (q, p), t))(q[:, 0], p[:, 0])
+    spread = [jnp.var(state) if relative else 1.0 for state in (q, p)]
+    of_q, of_p = (
+        jnp.mean((predicted - state)[:, 1:] ** 2) / size
+        for predicted, state, size in zip(moved, (q, p), spread, strict=True)
+    )
+    errors = pictures - pairs
+    return Terms(
+        jnp.mean(errors**2) / (jnp.mean(jnp.var(pairs, axis=(0, 1))) if relative else 1.0),
+        jnp.mean((p[:, :-1] - (q[:, 1:] - q[:, :-1])) ** 2) / spread[1],
+        (of_q + of_p) / 2,
+    )
+
+
+def loss(model: LatentModel, settings: Settings, parameters: Parameters, windows: Array) -> Scalar:
+    """The weighted sum of `terms`."""
+    found, weights = terms(model, parameters, windows, settings.relative), settings.weights
+    return weights.autoencoder * found.autoencoder + weights.coordinate * found.coordinate + weights.field * found.field
+
+
+def windows(frames: Float[np.ndarray, "K T pixels"], length: int) -> Float[np.ndarray, "N length pixels"]:
+    """Frames of trajectories cut to windows of a length, one after the other; what is left over ends a trajectory.
+
+    Raises:
+        InputError: trajectories shorter than a window.
+    """
+    K, T, pixels = frames.shape
+    count = T // length
+    if count == 0:
+        raise InputError(f"trajectories have {T} frames; expected at least the {length} of a window: lower window")
+    return frames[:, : count * length].reshape(K * count, length, pixels)
+
+
+def match_frames(
+    model: LatentModel,
+    train: Float[np.ndarray, "K T pixels"],
+    validation: Float[np.ndarray, "V T pixels"],
+    settings: Settings = Settings(),  # noqa: B008
+    *,
+    checkpoint: Checkpoint | None = None,
+    report: Report = silent,
+) -> Training:
+    """Fits a model to the frames of trajectories; others select the parameters, by the same loss.
+
+    Raises:
+        InputError: settings out of range, or trajectories shorter than a window.
+    """
+    require_positive(steps=settings.steps, batch=settings.batch, learning_rate=settings.learning_rate)
+    if settings.window < 2:
+        raise InputError(f"window is {settings.window}; expected at least 2 pictures, one to predict the other from")
+    fitted = jnp.asarray(windows(train, settings.window + 1))
+    held_out = jnp.asarray(windows(validation, settings.window + 1))
+    objective = functools.partial(loss, model, settings)
+
+    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+        return objective(parameters, held_out), jnp.full((), jnp.nan)
+
+    parameters = jax.jit(model.init)(jax.random.key(settings.seed))
+    return train_first_order(
+        objective,
+        adamw(steps=settings.steps, learning_rate=settings.learning_rate),
+        parameters,
+        fitted,
+        score=score,
+        seed=settings.seed,
+        steps=settings.steps,
+        batch=min(settings.batch, len(fitted)),
+        patience=settings.steps,
+        steps_per_dispatch=100,
+        checkpoint=checkpoint,
+        report=report,
+    )

@@ -1,0 +1,215 @@
+"""Phase-space models behind an autoencoder, which find coordinates in pictures (Greydanus, Dzamba and Yosinski 2019,
+"Hamiltonian Neural Networks", section on pixels).
+
+    published:  (z_q, z_p) = encoder(x_1, x_2),                    (x_1, x_2)_hat = decoder(z_q, z_p)
+    framewise:  z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
+    both:       d(z_q, z_p) / d frame = rates(z_q, z_p)
+
+x_1, x_2 [n / 2] are two frames after each other, of which the second tells the velocity. Framewise, the momentum is the
+change of the coordinate per frame for any parameters, which the published autoencoder has to learn. Both networks have
+four layers, the hidden ones residual:
+
+    h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
+
+The rates are those of an energy of one coordinate, or of the baseline's network: any `PhaseModel`. Latent time is
+counted in frames. Pictures enter and leave as differences from their mean, by their typical size.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import haiku as hk
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
+
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian
+from dln_jax.models.model import Parameters
+from dln_jax.models.phase_field import PhaseField, PhaseModel, hamiltonian_phase_model, make_phase_network
+from dln_jax.models.principal_components import Components
+from dln_jax.nn.activations import Activation, silu, tanh
+from dln_jax.types import InputError, Needs, Scalar, require_positive
+
+NEEDS = Needs(joints=("prismatic",))
+"""Of the latent plane: z_q is a number, not an angle, and nothing is applied to it or lost."""
+LAYERS = 4
+FIELDS = ("hnn", "baseline")
+
+Latent = Float[Array, "1"]
+
+
+class LatentPhase(NamedTuple):
+    """Pictures, the latent plane, and what moves in it; functions of one sample, which `vmap` takes over many."""
+
+    encode: Callable[[Array], tuple[Array, Array]]
+    """Two frames [n] -> (z_q, z_p), each [1]."""
+    decode: Callable[[Array, Array], Array]
+    """(z_q, z_p) -> two frames [n]."""
+    field: PhaseField
+    """(z_q, z_p) -> rates per frame; with an energy for "hnn"."""
+
+
+class LatentModel(NamedTuple):
+    """Pictures and their latent plane with parameters, as an (init, apply) pair."""
+
+    init: Callable[[Array], Parameters]
+    """Random key -> parameters: a dictionary of "encoder", "decoder" and "field"."""
+    apply: Callable[[Parameters], LatentPhase]
+    """Parameters -> functions."""
+    field: PhaseModel
+    """What moves in the latent plane; `parameters["field"]` are its parameters."""
+
+
+def latent_field(
+    kind: str,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation = tanh,
+    momentum_scale: float = 0.2,
+    dtype: DTypeLike = jnp.float32,
+) -> PhaseModel:
+    """A black-box energy ("hnn"), or a network for the rates ("baseline"), of one coordinate.
+
+    Args:
+        kind: "hnn" or "baseline".
+        width: hidden units per layer.
+        depth: hidden layers.
+        activation: of the hidden layers; it must be smooth.
+        momentum_scale: typical size of z_p where z_q has one of 1: 0.2 where motions take 30 frames a turn.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: another kind, or a size that is not positive.
+    """
+    if kind not in FIELDS:
+        raise InputError(f"field is '{kind}'; expected one of {', '.join(FIELDS)}")
+    size: dict[str, Any] = {"width": width, "depth": depth, "activation": activation, "dtype": dtype}
+    if kind == "hnn":
+        return _slowed(hamiltonian_phase_model(make_black_box_hamiltonian(NEEDS, **size)), momentum_scale)
+    return _slowed(make_phase_network(NEEDS, **size), momentum_scale)
+
+
+def _slowed(model: PhaseModel, rate: float) -> PhaseModel:
+    """A model whose states and rates are about one, for motions that take 1 / rate frames for what takes it one.
+
+    With P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
+    """
+
+    def apply(parameters: Parameters) -> PhaseField:
+        inner = model.apply(parameters)
+        H = inner.energy
+
+        def energy(q: Latent, p: Latent) -> Scalar:
+            assert H is not None
+            return rate**2 * H(q, p / rate)
+
+        def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
+            qd, pd = inner.rates(q, p / rate)
+            return rate * qd, rate**2 * pd
+
+        return PhaseField(rates, energy if H is not None else None)
+
+    return PhaseModel(model.init, apply)
+
+
+def make_latent_phase(
+    field: PhaseModel,
+    mean: Float[np.ndarray, " n"],
+    *,
+    framewise: bool = False,
+    scale: float = 0.2,
+    width: int = 200,
+    activation: Activation = silu,
+    momentum_scale: float = 0.2,
+    dtype: DTypeLike = jnp.float32,
+) -> LatentModel:
+    """The (init, apply) pair of an autoencoder with a phase model of one coordinate in its latent plane.
+
+    Args:
+        field: of the latent plane, as by `latent_field`.
+        mean: of the two frames, over the training data.
+        framewise: each frame by itself, in place of the published two at once.
+        scale: typical difference of a pixel from its mean.
+        width: hidden units per layer of both networks.
+        activation: of the hidden layers.
+        momentum_scale: typical size of z_p where z_q has one of 1; framewise it follows from z_q.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: a width or scale that is not positive, or no two frames.
+    """
+    require_positive(scale=scale, width=width, momentum_scale=momentum_scale)
+    n = len(mean)
+    if n % 2 or n == 0:
+        raise InputError(f"mean has {n} pixels; expected those of two frames")
+    # The networks see rows: two of one frame each, or one of both.
+    rows = 2 if framewise else 1
+    if framewise:
+        mean = (mean[: n // 2] + mean[n // 2 :]) / 2
+
+    @hk.without_apply_rng
+    @hk.transform
+    def encoder(x: Float[Array, " n"]) -> tuple[Latent, Latent]:
+        centred = (x.reshape(rows, -1) - jnp.asarray(mean, x.dtype)) / scale
+        z = _residual_network(centred, width, 2 // rows, activation, "encoder")
+        if framewise:
+            return z[0], z[1] - z[0]
+        return z[0, :1], momentum_scale * z[0, 1:]
+
+    @hk.without_apply_rng
+    @hk.transform
+    def decoder(q: Latent, p: Latent) -> Float[Array, " n"]:
+        z = jnp.stack([q, q + p]) if framewise else jnp.concatenate([q, p / momentum_scale])[None]
+        differences = _residual_network(z, width, n // rows, activation, "decoder")
+        return (jnp.asarray(mean, q.dtype) + scale * differences).ravel()
+
+    def init(key: Array) -> Parameters:
+        first, second, third = jax.random.split(key, 3)
+        z = jnp.zeros(1, dtype)
+        return {
+            "encoder": encoder.init(first, jnp.zeros(n, dtype)),
+            "decoder": decoder.init(second, z, z),
+            "field": field.init(third),
+        }
+
+    def apply(parameters: Parameters) -> LatentPhase:
+        return LatentPhase(
+            functools.partial(encoder.apply, parameters["encoder"]),
+            functools.partial(decoder.apply, parameters["decoder"]),
+            field.apply(parameters["field"]),
+        )
+
+    return LatentModel(init, apply, field)
+
+
+def through_components(model: LatentModel, components: Components) -> LatentModel:
+    """A model of pictures, with the same parameters, from one of their coefficients."""
+
+    def apply(parameters: Parameters) -> LatentPhase:
+        inner = model.apply(parameters)
+
+        def encode(x: Float[Array, " n"]) -> tuple[Latent, Latent]:
+            mean, basis = (jnp.asarray(array, x.dtype) for array in components[:2])
+            return inner.encode(((x.reshape(2, -1) - mean) @ basis.T).ravel())
+
+        def decode(q: Latent, p: Latent) -> Float[Array, " n"]:
+            mean, basis = (jnp.asarray(array, q.dtype) for array in components[:2])
+            return (mean + inner.decode(q, p).reshape(2, -1) @ basis).ravel()
+
+        return LatentPhase(encode, decode, inner.field)
+
+    return LatentModel(model.init, apply, model.field)
+
+
+def _residual_network(
+    x: Float[Array, "rows inputs"], width: int, outputs: int, activation: Activation, name: str
+) -> Float[Array, "rows outputs"]:
+    h = activation.value(hk.Linear(width, name=f"{name}_1")(x))
+    for layer in range(2, LAYERS):
+        h = h + activation.value(hk.Linear(width, name=f"{name}_{layer}")(h))
+    return hk.Linear(outputs, name=f"{name}_{LAYERS}")(h)

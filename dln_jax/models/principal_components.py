@@ -1,0 +1,43 @@
+"""Pictures by their principal components: fewer numbers, with the same distances as far as they keep the variance.
+
+c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.types import InputError
+
+
+class Components(NamedTuple):
+    """An orthonormal basis of pictures."""
+
+    mean: Float[np.ndarray, " n"]
+    basis: Float[np.ndarray, "C n"]
+    scale: float
+    """Root mean square of a coefficient."""
+    lost: float
+    """Share of the variance that the basis does not keep."""
+
+
+def principal_components(pictures: Float[np.ndarray, "*samples n"], count: int) -> Components:
+    """The components with the largest variance.
+
+    Raises:
+        InputError: a count outside 1..n.
+    """
+    n = pictures.shape[-1]
+    if not 1 <= count <= n:
+        raise InputError(f"components is {count}; expected 1 to {n}, the numbers of a picture")
+    flat = pictures.reshape(-1, n).astype(float)
+    mean = flat.mean(axis=0)
+    variances, vectors = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
+    kept = variances[-count:].sum()
+    return Components(mean, vectors[:, ::-1][:, :count].T, float(np.sqrt(kept / count)), 1 - kept / variances.sum())
+
+
+def compress(components: Components, pictures: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
+    """Coefficients of pictures, float32 where the pictures are."""
+    return ((pictures - components.mean) @ components.basis.T).astype(pictures.dtype)

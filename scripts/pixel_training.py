@@ -1,0 +1,74 @@
+"""What `train_hnn --task pixels` does: from a command line to a trained model of pictures in a run folder."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+
+from dln_jax.deploy.load_latent import save_latent
+from dln_jax.evaluation import figures
+from dln_jax.learning.runs import Checkpoint, Progress, fingerprint
+from dln_jax.types import InputError, require_positive
+from scripts import pixel_task
+from scripts.command_line import CONFIG, new_folder, stored_arguments, write_json
+from scripts.progress import progress
+
+if TYPE_CHECKING:
+    from scripts.train_hnn import Arguments
+
+KINDS = {"auto": "hnn", "black-box": "hnn", "baseline": "baseline"}
+TAKEN = ("model", "task", "trajectories", "steps", "seed", "out", "resume", "figures", "learning_rate")
+"""Options that the task reads."""
+
+
+def run_pixels(given: "Arguments") -> None:
+    """Trains, evaluates, and writes the run folder."""
+    console = Console(highlight=False, soft_wrap=True)
+    check(given)
+    kind = KINDS[given.model]
+    data = pixel_task.pixel_data(given.trajectories)
+    folder = given.out if given.resume and given.out else new_folder(given.out, "train_hnn")
+    write_json(folder / CONFIG, stored_arguments(given))
+    console.print(f"pixels: {len(data.train.q)} films to train on, {len(data.validation.q)} to select by; {kind}, f32")
+    steps = given.steps or pixel_task.RECIPE.steps
+    identity = {
+        "settings": {"model": kind, "seed": given.seed, "steps": steps},
+        "data": fingerprint([data.train.frames, data.validation.frames]),
+    }
+    with progress(steps) as show:
+        numbers, seen = pixel_task.measure_pixels(
+            kind,
+            seed=given.seed,
+            steps=steps,
+            trajectories=given.trajectories,
+            checkpoint=Checkpoint(folder, identity, given.resume),
+            report=lambda at: show(at.step, shown(at)),
+        )
+    save_latent(folder, kind, seen.components, seen.parameters)
+    write_json(folder / "metrics.json", {key: value for key, value in numbers.items() if np.isfinite(value)})
+    if given.figures:
+        pixel_task.draw_pixels({kind: seen}, data, folder)
+        history = seen.history
+        best = min(history, key=lambda at: at.validation).step
+        figures.training_curve(history, best_step=best, error="loss").savefig(folder / "training.png")
+    for name, value in numbers.items():
+        console.print(f"{name.replace('_', ' '):32s} {value:10.4g}")
+    console.print(f"run folder: {folder}")
+
+
+def check(given: "Arguments") -> None:
+    """Refuses what the task does not take, before anything is written."""
+    if given.model not in KINDS:
+        raise InputError(f"model is '{given.model}'; expected one of {', '.join(KINDS)} for pixels")
+    unset = type(given)()
+    for name, value in vars(given).items():
+        if name not in TAKEN and value != getattr(unset, name):
+            raise InputError(f"--{name.replace('_', '-')} is not for pixels, whose networks are settled; leave it out")
+    for name in ("steps", "trajectories"):
+        if getattr(given, name) is not None:
+            require_positive(**{name: getattr(given, name)})
+
+
+def shown(at: Progress) -> str:
+    """A line of progress."""
+    return f"loss {at.loss:.2e}  validation {at.validation:.2e}"
