@@ -5,7 +5,6 @@ one-pass way carries all d partial derivatives of both networks forward (`nn.dif
 gradients of the torque loss at batch 512, single calls are one state. `mechanics.natural` follows the outcome.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from dln_jax.evaluation.latency import medians_in_turns
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.mechanics import natural
 from dln_jax.models.delan import cholesky_factor
@@ -70,11 +70,12 @@ def ratio_rows(d: int, batch: int, width: int, repetitions: int) -> list[Row]:
             return jax.jit(lambda states: way(layers, *states[:3, 0]))
         return jax.jit(lambda states: jax.grad(loss)(layers, states))
 
-    medians = interleaved_medians([program(by_jvp_and_vjp), program(by_one_pass)], states, repetitions)
+    programs = {"jvp_vjp_us": program(by_jvp_and_vjp), "one_pass_us": program(by_one_pass)}
+    require_agreement(list(programs.values()), states)
+    medians = medians_in_turns(programs, (states,), repetitions=repetitions)
     case = f"d-{d}/{'single-call' if batch == 1 else f'training-step-batch-{batch}'}"
-    names = ("jvp_vjp_us", "one_pass_us")
-    times = [Row(case, name, value, "us") for name, value in zip(names, medians, strict=True)]
-    return [*times, Row(case, "one_pass_over_jvp_vjp", medians[1] / medians[0], "1")]
+    times = [Row(case, name, 1e6 * value, "us") for name, value in medians.items()]
+    return [*times, Row(case, "one_pass_over_jvp_vjp", medians["one_pass_us"] / medians["jvp_vjp_us"], "1")]
 
 
 def by_jvp_and_vjp(layers: tuple, q: Array, qd: Array, qdd: Array) -> Array:
@@ -108,18 +109,11 @@ def features(q: Array) -> Array:
     return jnp.concatenate([jnp.cos(q), jnp.sin(q)])
 
 
-def interleaved_medians(programs: list[Callable], states: Array, repetitions: int) -> list[float]:
-    """Median microseconds of each program; they take turns, so that a slow spell of the machine meets all."""
-    answers = [jax.block_until_ready(program(states)) for program in programs]
-    for one, other in zip(*map(jax.tree.leaves, answers), strict=True):
+def require_agreement(programs: list[Callable], states: Array) -> None:
+    """Both ways give one answer."""
+    answers = [jax.tree.leaves(program(states)) for program in programs]
+    for one, other in zip(*answers, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3 * float(jnp.max(jnp.abs(one))))
-    times = np.empty((repetitions, len(programs)))
-    for row in times:
-        for index, program in enumerate(programs):
-            start = time.perf_counter_ns()
-            jax.block_until_ready(program(states))
-            row[index] = (time.perf_counter_ns() - start) / 1e3
-    return np.median(times, axis=0).tolist()
 
 
 if __name__ == "__main__":

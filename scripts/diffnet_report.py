@@ -7,16 +7,15 @@ formulas of its activations already give faster derivatives. Repetitions of all 
 machine slows all alike; medians are compared. Prints a table and writes report.json.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
+from dln_jax.evaluation.latency import medians_in_turns
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
@@ -71,10 +70,10 @@ def main(given: Arguments) -> None:
 def rows_for(inputs: int, given: Arguments) -> list[Row]:
     """Times and their ratios for one number of inputs."""
     programs, arguments = programs_for(inputs, given)
-    seconds = medians(
+    seconds = medians_in_turns(
         {name: jax.jit(program).lower(*arguments).compile() for name, program in programs.items()},
         arguments,
-        given.repetitions,
+        repetitions=given.repetitions,
     )
     case = f"diffnet-pass/n-{inputs}"
     ours, bound = seconds["one_pass"], BOUNDS.get(inputs)
@@ -125,18 +124,6 @@ def programs_for(inputs: int, given: Arguments) -> tuple[dict[str, Callable], tu
         "value": value,
     }
     return {name: gradient_of_loss(network) for name, network in networks.items()}, (layers, x)
-
-
-def medians(programs: dict[str, Callable], arguments: tuple, repetitions: int) -> dict[str, float]:
-    """Median wall-clock seconds of each compiled program, called in turns, after two rounds to warm up."""
-    seconds = {name: np.empty(repetitions) for name in programs}
-    for repetition in range(-2, repetitions):
-        for name, program in programs.items():
-            start = time.perf_counter()
-            jax.block_until_ready(program(*arguments))
-            if repetition >= 0:
-                seconds[name][repetition] = time.perf_counter() - start
-    return {name: float(np.median(values)) for name, values in seconds.items()}
 
 
 if __name__ == "__main__":

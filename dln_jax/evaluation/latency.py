@@ -1,8 +1,8 @@
-"""How long one call takes, as a caller in a control loop would see it."""
+"""How long calls take: single ones, as a control loop would see them, and whole programs that take turns."""
 
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +14,8 @@ class Latency(NamedTuple):
     compile_seconds: float
     p50_us: float
     p99_us: float
+    p999_us: float
+    worst_us: float
     calls: int
 
 
@@ -21,7 +23,7 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, 
     """Times calls of a compiled function, one state at a time, going round the given states.
 
     Args:
-        function: a jitted function; called as `function(*state)`.
+        function: a jitted function, or one of NumPy arrays; called as `function(*state)`.
         states: argument tuples of one shape; varied, so that nothing is answered from a cache.
         calls: calls that are timed.
         warm_up: calls before them.
@@ -37,5 +39,22 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, 
         start = time.perf_counter_ns()
         jax.block_until_ready(function(*state))
         nanoseconds[index] = time.perf_counter_ns() - start
-    p50, p99 = np.percentile(nanoseconds / 1e3, [50, 99])
-    return Latency(compile_seconds, float(p50), float(p99), calls)
+    p50, p99, p999, worst = (float(time) for time in np.percentile(nanoseconds / 1e3, [50, 99, 99.9, 100]))
+    return Latency(compile_seconds, p50, p99, p999, worst, calls)
+
+
+def medians_in_turns(
+    programs: Mapping[str, Callable[..., Any]], arguments: tuple, *, repetitions: int, warm_up: int = 2
+) -> dict[str, float]:
+    """Median wall-clock seconds of each compiled program on the same arguments, results waited for.
+
+    They take turns, so that a slow spell of the machine meets all of them.
+    """
+    seconds = {name: np.empty(repetitions) for name in programs}
+    for repetition in range(-warm_up, repetitions):
+        for name, program in programs.items():
+            start = time.perf_counter()
+            jax.block_until_ready(program(*arguments))
+            if repetition >= 0:
+                seconds[name][repetition] = time.perf_counter() - start
+    return {name: float(np.median(values)) for name, values in seconds.items()}

@@ -67,6 +67,17 @@ def write_report(path: Path, rows: list[Row], facts: dict[str, Any]) -> None:
     path.write_text(json.dumps({"conditions": facts, "rows": listed}, indent=2) + "\n")
 
 
+def markdown(rows: list[Row]) -> str:
+    """A table with a line per case and a column per quantity, in the order in which they come."""
+    cases = list(dict.fromkeys(row.case for row in rows))
+    columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
+    values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
+    titles = [quantity.replace("_", " ") + (f", {unit}" if unit != "1" else "") for quantity, unit in columns]
+    lines = [["case", *titles], ["---"] * (len(columns) + 1)]
+    lines += [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
 def _module_name() -> str:
     specification = getattr(sys.modules.get("__main__"), "__spec__", None)
     return specification.name if specification else Path(sys.argv[0]).name

@@ -1,0 +1,78 @@
+"""Measure speed against error: one report, a table and a figure for each subject.
+
+Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
+states per second), scaling (cost against the number of joints), training (error against seconds), integrators (steps
+per second against energy drift and trajectory error), precision (float32 against float64), and all of them. Compilation
+is timed apart, results are waited for, inputs vary, programs that are compared take turns, and medians count.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from dln_jax.evaluation.report import Row, conditions, markdown, write_report
+from scripts import (
+    benchmark_integrators,
+    benchmark_one_step,
+    benchmark_precision,
+    benchmark_scaling,
+    benchmark_throughput,
+    benchmark_training,
+)
+from scripts.command_line import new_folder, run
+from scripts.report_table import print_report
+
+Measure = Callable[[bool], tuple[list[Row], Figure]]
+MEASURES: dict[str, Measure] = {
+    "one-step": benchmark_one_step.measure,
+    "throughput": benchmark_throughput.measure,
+    "scaling": benchmark_scaling.measure,
+    "training": benchmark_training.measure,
+    "integrators": benchmark_integrators.measure,
+    "precision": benchmark_precision.measure,
+}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to measure, and for how long."""
+
+    subject: tyro.conf.Positional[
+        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "all"]
+    ] = "all"
+    """What is measured."""
+    quick: bool = False
+    """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
+    out: Path | None = None
+    """Folder for report.json, a Markdown table and a figure of each subject (default: runs/benchmark-1, -2, ...)."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes; what is measured is kept even if a later subject is interrupted."""
+    console = Console(highlight=False, soft_wrap=True)
+    folder = new_folder(given.out, "benchmark")
+    subjects = MEASURES if given.subject == "all" else {given.subject: MEASURES[given.subject]}
+    facts = functools.partial(
+        conditions, dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=given.quick
+    )
+    every: list[Row] = []
+    for name, measure in subjects.items():
+        console.print(f"{name} ...")
+        rows, figure = measure(given.quick)
+        rows = [row._replace(case=f"{name}/{row.case}") for row in rows]
+        every += rows
+        figure.savefig(folder / f"{name}.png")
+        (folder / f"{name}.md").write_text(markdown(rows))
+        write_report(folder / "report.json", every, facts())
+        print_report([row for row in rows if row.bound is not None] or rows[:40], facts())
+    print(f"report: {folder / 'report.json'}; tables and figures of {', '.join(subjects)} beside it")
+
+
+if __name__ == "__main__":
+    run(main, Arguments)
