@@ -1,7 +1,10 @@
 """Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers."""
 
 from dln_jax.data.schema import Trajectories, load, save
-from dln_jax.deploy.load import load_run
+from dln_jax.deploy.c_source import export_c
+from dln_jax.deploy.load import load_phase_field, load_run
+from dln_jax.deploy.load_c import load_c
+from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.mechanics import lagrangian, natural
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics
 from dln_jax.mechanics.natural import NaturalSystem
@@ -17,9 +20,14 @@ __all__ = [
     "NaturalSystem",
     "Needs",
     "Trajectories",
+    "enable_low_latency",
+    "export_c",
     "lagrangian",
     "load",
+    "load_c",
+    "load_phase_field",
     "load_run",
+    "low_latency",
     "make_delan",
     "natural",
     "save",

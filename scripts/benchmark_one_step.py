@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
@@ -30,6 +31,8 @@ BOUNDS = {
 }
 LOOP_BOUNDS = {f"{WIDE}/c-loop": 200_000.0, f"{SMALL}/c-loop": 1_500_000.0}
 CALLS = 20_000
+PROCESSES = 3
+"""Of each way to dispatch, in turns; their medians count, and their spread shows the machine's noise."""
 
 
 def measure(quick: bool) -> tuple[list[Row], Figure]:
@@ -38,10 +41,12 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
     with tempfile.TemporaryDirectory() as place:
         folders = [train_into(Path(place), name, sets, quick=quick) for name in names(quick)]
         test_errors = {folder.name: torque_mse(folder, sets) for folder in folders}
-        times = {folder.name: {} for folder in folders}
-        for dispatch in ("default", "low-latency"):
-            for name, found in timed(folders, dispatch, calls=CALLS // 10 if quick else CALLS).items():
-                times[name] |= found
+        turns = [
+            timed(folders, dispatch, calls=CALLS // 10 if quick else CALLS)
+            for _ in range(1 if quick else PROCESSES)
+            for dispatch in ("default", "low-latency")
+        ]
+    times = {name: over_processes([turn[name] for turn in turns]) for name in test_errors}
     rows, places = [], {}
     for name, paths in times.items():
         rows.append(Row(name, "torque_mse", test_errors[name], "N^2 m^2"))
@@ -100,6 +105,20 @@ def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
+    """Medians of each quantity over the processes that have it, and the spread of the median call."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for path in dict.fromkeys(path for turn in turns for path in turn):
+        of_path = [turn[path] for turn in turns if path in turn]
+        found[path] = {}
+        for name in of_path[0]:
+            numbers = {key: [each[name][key] for each in of_path] for key in of_path[0][name]}
+            found[path][name] = {key: float(np.median(values)) for key, values in numbers.items()}
+            if "p50_us" in numbers:
+                found[path][name]["p50_spread_us"] = float(np.ptp(numbers["p50_us"]))
+    return found
+
+
 def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
     """Quantiles of each function."""
     rows = []
@@ -108,7 +127,9 @@ def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
             rate, bound = latency["calls_per_second"], LOOP_BOUNDS.get(case)
             rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", None, bound, at_least=True))
             continue
-        quantities = {f"{name}_{key}": latency[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us")}
+        quantities = {
+            f"{name}_{key}": latency[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
+        }
         rows += [Row(case, key, value, "us", None, BOUNDS.get((case, key))) for key, value in quantities.items()]
         ratio = f"{name}_p99_over_p50"
         rows.append(Row(case, ratio, latency["p99_us"] / latency["p50_us"], "1", None, BOUNDS.get((case, ratio))))

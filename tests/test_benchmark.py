@@ -109,9 +109,11 @@ def test_call_paths_are_timed(small_run, capsys, monkeypatch):
     assert set(first) == {"default-jit"}
     assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)
     assert second["c-loop"]["inverse"]["calls_per_second"] > 0
+    merged = benchmark_one_step.over_processes([first, second, second])
+    assert merged["c-from-python"]["inverse"]["p50_spread_us"] == 0 and set(merged) == {*first, *second}
     rows = [
         row
-        for path, functions in second.items()
+        for path, functions in merged.items()
         for row in benchmark_one_step.rows_of(f"structured-delan/{path}", functions)
     ]
     bounds = {row.case: row.bound for row in rows if row.bound is not None}

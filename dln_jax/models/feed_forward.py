@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 
 from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences
 from dln_jax.models.black_box import Scale, per_coordinate
-from dln_jax.models.features import joint_features
+from dln_jax.models.features import joint_features, unsaturated
 from dln_jax.models.model import Model, Parameters
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Needs, Vector, require_positive
@@ -55,7 +55,7 @@ def make_feed_forward(
     forces = per_coordinate(needs, "tau_scale", tau_scale)
 
     def network(name: str, sizes: tuple[float, ...], output: tuple[float, ...], q: Vector, qd: Vector, x: Vector):
-        scaled = [qd / jnp.asarray(rates, qd.dtype), x / jnp.asarray(sizes, x.dtype)]
+        scaled = [unsaturated(qd / jnp.asarray(rates, qd.dtype)), unsaturated(x / jnp.asarray(sizes, x.dtype))]
         layers = hk.nets.MLP([width] * depth + [len(output)], activation=activation.value, name=name)
         return jnp.asarray(output, qd.dtype) * layers(jnp.concatenate([joint_features(needs, q), *scaled]))
 

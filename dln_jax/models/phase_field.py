@@ -21,7 +21,7 @@ from jax.typing import DTypeLike
 from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.models.black_box import Scale, per_coordinate
-from dln_jax.models.features import joint_features
+from dln_jax.models.features import joint_features, unsaturated
 from dln_jax.models.model import Model, Parameters
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Dissipation, Hamiltonian, Needs, Scalar, Vector, require_positive
@@ -159,7 +159,7 @@ def make_phase_network(
     @hk.without_apply_rng
     @hk.transform
     def network(q: Vector, p: Vector):
-        inputs = jnp.concatenate([joint_features(needs, q), p / jnp.asarray(momenta, p.dtype)])
+        inputs = jnp.concatenate([joint_features(needs, q), unsaturated(p / jnp.asarray(momenta, p.dtype))])
         layers = hk.nets.MLP([width] * depth + [2 * d], activation=activation.value, name="rates")
         outputs = layers(inputs) * jnp.asarray(rates * 2, p.dtype)
         return outputs[:d], outputs[d:]

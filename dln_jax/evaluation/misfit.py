@@ -1,0 +1,81 @@
+"""Whether the torques that a model leaves over are those of a force that it lacks and that velocity drives.
+
+Without friction tau(q, qd, qdd) = M qdd + c + g is even in time, and friction odd. What a model without friction leaves
+over, r = tau - tau_hat, is then b qd (viscous) and does work on average:
+
+    P_j = qd_j r_j > 0,   b_j = sum(qd_j r_j) / sum(qd_j²),   share_j = b_j² sum(qd_j²) / sum(r_j²)
+
+Residuals that are noise do none: the mean of P over its standard error is then a standard normal variable.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.types import InputError
+
+
+class Misfit(NamedTuple):
+    """What residuals say of a force that is missing, for each joint [d]."""
+
+    residual_rms: Float[np.ndarray, " d"]
+    """In N m or N."""
+    coefficient: Float[np.ndarray, " d"]
+    """Viscous coefficient b that explains most of the residual; N m s or N s/m, negative for a driving force."""
+    explained_share: Float[np.ndarray, " d"]
+    """Of the residual's mean square, by b qd."""
+    power: Float[np.ndarray, " d"]
+    """Mean power qd r in W, what friction would dissipate."""
+    significance: Float[np.ndarray, " d"]
+    """Mean power in standard errors, over trajectories where there are ten or more, else over samples."""
+    missing: np.ndarray
+    """Whether a velocity-dependent force is missing: significant, and more than a trace of the residual."""
+
+
+def velocity_misfit(
+    qd: Float[np.ndarray, "N d"],
+    residual: Float[np.ndarray, "N d"],
+    trajectory: np.ndarray | None = None,
+    *,
+    least_significance: float = 5.0,
+    least_share: float = 0.01,
+) -> Misfit:
+    """Looks for friction that a model lacks in its torque residuals tau - tau_hat [N, d].
+
+    A potential that is missing does work too, along motions that do not return; it explains little of its residual
+    by velocity, which is what `least_share` is for.
+
+    Args:
+        qd: velocities [N, d].
+        residual: tau - tau_hat [N, d].
+        trajectory: index of each sample's trajectory, whose samples count as one; `None` for independent samples.
+        least_significance: standard errors from zero at which the mean power counts.
+        least_share: of the residual's mean square that velocity must explain.
+
+    Raises:
+        InputError: fewer than three samples, or shapes that differ.
+    """
+    qd, residual = np.asarray(qd, np.float64), np.asarray(residual, np.float64)
+    if qd.shape != residual.shape or qd.ndim != 2 or len(qd) < 3:
+        raise InputError(f"qd is {qd.shape} and residual {residual.shape}; expected the same [N, d] with N >= 3")
+    power = qd * residual
+    groups = np.arange(len(qd)) if trajectory is None else np.unique(trajectory, return_inverse=True)[1]
+    if groups.max() < 9:
+        groups = np.arange(len(qd))
+    counts = np.bincount(groups)[:, None]
+    means = np.stack([np.bincount(groups, column) for column in power.T], axis=1) / counts
+    error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    moving, left = np.sum(qd**2, axis=0), np.sum(residual**2, axis=0)
+    nothing = np.zeros(qd.shape[1])
+    coefficient = np.divide(power.sum(axis=0), moving, out=nothing.copy(), where=moving > 0)
+    share = np.divide(coefficient**2 * moving, left, out=nothing.copy(), where=left > 0)
+    significance = np.divide(means.mean(axis=0), error, out=nothing.copy(), where=error > 0)
+    return Misfit(
+        residual_rms=np.sqrt(left / len(qd)),
+        coefficient=coefficient,
+        explained_share=share,
+        power=power.mean(axis=0),
+        significance=significance,
+        missing=(abs(significance) >= least_significance) & (share >= least_share),
+    )

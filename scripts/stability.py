@@ -1,0 +1,83 @@
+"""Measure the hard cases: numerical stability, each number beside what theory lets one expect.
+
+Prints one table (case, expected, got, pass), writes report.json, and draws figures. All of it is float64 unless a case
+says otherwise.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.evaluation.hard_cases import NAMES, Case, measure
+from dln_jax.evaluation.hard_cases.figures import FIGURES
+from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.types import InputError, require_positive
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to measure."""
+
+    only: str = ",".join(NAMES)
+    """Hard cases, comma separated."""
+    steps: int = 100_000
+    """Of the long motions: the separatrix and the double pendulum."""
+    out: Path | None = None
+    """Folder for report.json and the figures (default: runs/stability-1, -2, ...)."""
+    figures: bool = True
+    """Draw the figures."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    require_positive(steps=given.steps)
+    names = [name.strip() for name in given.only.split(",") if name.strip()]
+    if unknown := [name for name in names if name not in NAMES]:
+        raise InputError(f"--only: '{unknown[0]}' is unknown; choose from {', '.join(NAMES)}")
+    if not names:
+        raise InputError(f"--only names no case; choose from {', '.join(NAMES)}")
+    folder = new_folder(given.out, "stability")
+    write_json(folder / CONFIG, stored_arguments(given))
+    console = Console(highlight=False, soft_wrap=True)
+    cases: list[Case] = []
+    for number, name in enumerate(names, start=1):
+        began = time.perf_counter()
+        found = measure(name, steps=given.steps)
+        cases += found.cases
+        if given.figures and name in FIGURES:
+            FIGURES[name](found.curves).savefig(folder / f"{name}.png")
+        passed = sum(case.passed for case in found.cases)
+        seconds = time.perf_counter() - began
+        console.print(f"{number}/{len(names)}  {name:20s} {passed}/{len(found.cases)} pass  {seconds:.1f} s")
+    facts = conditions(
+        dtype="float64, and float32 where a case says so",
+        seeds=[0],
+        steps=given.steps,
+        expected={f"{case.name} {case.quantity}": case.expected for case in cases},
+    )
+    write_report(folder / "report.json", [case.row for case in cases], facts)
+    # A file or a pipe has no width to keep to.
+    Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table(cases))
+    failing = [f"{case.name} {case.quantity}" for case in cases if not case.passed]
+    console.print(f"{len(cases) - len(failing)} of {len(cases)} pass" + "".join(f"\nfails: {name}" for name in failing))
+    console.print(f"report: {folder / 'report.json'}")
+
+
+def table(cases: list[Case]) -> Table:
+    """One line per case."""
+    shown = Table("case", "quantity", "expected", "got", "bound", "unit", "pass")
+    for case in cases:
+        sign = "≥" if case.at_least else "≤"
+        passed = "yes" if case.passed else "[bold red]no[/]"
+        numbers = (f"{case.got:.3g}", f"{sign} {case.bound:.3g}", case.unit)
+        shown.add_row(case.name, case.quantity, case.expected, *numbers, passed)
+    return shown
+
+
+if __name__ == "__main__":
+    run(main, Arguments)
