@@ -119,6 +119,9 @@ def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
     return found
 
 
+SHOWN = ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
+
+
 def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
     """Quantiles of each function."""
     rows = []

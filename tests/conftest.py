@@ -1,21 +1,22 @@
 """Shared set-up: float64 everywhere, and programs compiled quickly rather than to run fast, and each only once."""
 
-import atexit
 import os
-import shutil
-import tempfile
 
 # Tests run each program a few times: compiling costs them more than running. Read when the first device is used.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 
-# A run that is resumed, or built a second time, has the programs of the first. The test processes share them.
-CACHE = "DLN_JAX_TEST_PROGRAMS"
-if CACHE not in os.environ:
-    os.environ[CACHE] = tempfile.mkdtemp(prefix="dln_jax-tests-")
-    atexit.register(shutil.rmtree, os.environ[CACHE], ignore_errors=True)
+import atexit
+import shutil
+import tempfile
 
 import jax
 
+CACHE = "DLN_JAX_TEST_PROGRAMS"
+"""Variable with the folder of compiled programs, which the test processes share: a run that is resumed has those of the
+first."""
+if CACHE not in os.environ:
+    os.environ[CACHE] = tempfile.mkdtemp(prefix="dln_jax-tests-")
+    atexit.register(shutil.rmtree, os.environ[CACHE], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

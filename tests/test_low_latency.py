@@ -119,6 +119,6 @@ def test_an_artefact_needs_its_package_and_its_ending(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="no such file"):
         stablehlo.load_stablehlo(tmp_path / "void.stablehlo")
     monkeypatch.setattr(stablehlo.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="pip install flatbuffers"):
+    with pytest.raises(InputError, match="need the package flatbuffers"):
         stablehlo.export_stablehlo(jnp.sin, np.zeros(2), path=tmp_path / "sin.stablehlo")
     assert not list(tmp_path.iterdir())

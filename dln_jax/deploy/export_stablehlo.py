@@ -107,4 +107,4 @@ def note_of(path: Path) -> Path:
 
 def _require_flatbuffers() -> None:
     if importlib.util.find_spec("flatbuffers") is None:
-        raise InputError("jax.export artefacts need the package flatbuffers; install it with pip install "dln-jax[export]"")
+        raise InputError("jax.export artefacts need the package flatbuffers; install the extra [export]")
