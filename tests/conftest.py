@@ -20,3 +20,14 @@ if CACHE not in os.environ:
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+LONGEST = (
+    *("test_train_delan", "test_stability", "test_hnn_tasks", "test_pixels", "test_gauss_newton", "test_export_c"),
+    *("test_train_models", "test_arm_table", "test_train_diffnet", "test_delan", "test_mechanics", "test_n_body"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first, so that no process ends with one of them."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
