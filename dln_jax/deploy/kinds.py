@@ -3,8 +3,8 @@
 A description is plain JSON values: `kind`, `needs`, `precision` (f32 or f64), and the keywords of the kind's factory.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.learning.residuals import BOTH_WAYS, CANONICAL, TORQUE, Objective
@@ -17,6 +17,9 @@ from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError, Needs
+
+SomeKind = TypeVar("SomeKind")
+SomeModel = TypeVar("SomeModel")
 
 
 class Kind(NamedTuple):
@@ -66,16 +69,29 @@ def build(description: dict[str, Any]) -> Model:
     Raises:
         InputError: an unknown kind, needs, activation or precision, or a missing or unknown key.
     """
+    return build_by(description, KINDS, lambda kind, *given, **keywords: kind.make(*given, **keywords))
+
+
+WITHOUT_ACTIVATION = ("trigonometric", "polynomial-hamiltonian")
+"""Kinds that are no networks."""
+
+
+def build_by(description: dict[str, Any], kinds: Mapping[str, SomeKind], make: Callable[..., SomeModel]) -> SomeModel:
+    """What `make(kind, needs, dtype=..., **keywords)` gives for a description of one of these kinds.
+
+    Raises:
+        InputError: as `build`.
+    """
     keywords = dict(description)
     kind = keywords.pop("kind", None)
-    if kind not in KINDS:
-        raise InputError(f"model kind is {kind!r}; this release knows {', '.join(KINDS)}")
+    if kind not in kinds:
+        raise InputError(f"model kind is {kind!r}; this release knows {', '.join(kinds)}")
     try:
         needs, dtype = needs_from_json(keywords.pop("needs")), data_type(keywords.pop("precision"))
-        if kind != "trigonometric":
+        if kind not in WITHOUT_ACTIVATION:
             keywords["activation"] = activation(keywords.pop("activation"))
         # JSON knows no tuples, and a model's keywords are hashable.
         keywords = {key: tuple(value) if isinstance(value, list) else value for key, value in keywords.items()}
-        return KINDS[kind].make(needs, dtype=dtype, **keywords)
+        return make(kinds[kind], needs, dtype=dtype, **keywords)
     except (KeyError, TypeError) as error:
         raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error

@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data.schema import Trajectories, needs_from_json
-from dln_jax.learning.runs import data_type
+from dln_jax.data.schema import Trajectories
+from dln_jax.deploy.kinds import build_by
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.phase_field import PhaseModel, hamiltonian_phase_model, make_dissipative, make_phase_network
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.separable import make_separable_hamiltonian
-from dln_jax.nn.activations import activation
 from dln_jax.types import InputError, Needs
 
 
@@ -77,22 +76,14 @@ def build_phase(description: dict[str, Any]) -> PhaseModel:
     Raises:
         InputError: an unknown kind, needs, activation or precision, or a missing or unknown key.
     """
-    keywords = dict(description)
-    name = keywords.pop("kind", None)
-    if name not in PHASE_KINDS:
-        raise InputError(f"model kind is {name!r}; this release knows {', '.join(PHASE_KINDS)}")
-    kind = PHASE_KINDS[name]
-    try:
-        needs, dtype = needs_from_json(keywords.pop("needs")), data_type(keywords.pop("precision"))
-        friction_width = keywords.pop("friction_width", 0)
-        if "activation" in keywords:
-            keywords["activation"] = activation(keywords["activation"])
-        if kind.energy is None:
-            assert kind.field is not None
-            return kind.field(needs, dtype=dtype, **keywords)
-        if needs.friction and friction_width:
-            conservative = kind.energy(needs._replace(friction=False), dtype=dtype, **keywords)
-            return make_dissipative(conservative, needs, width=friction_width, dtype=dtype)
-        return hamiltonian_phase_model(kind.energy(needs, dtype=dtype, **keywords))
-    except (KeyError, TypeError) as error:
-        raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error
+    return build_by(description, PHASE_KINDS, _make)
+
+
+def _make(kind: PhaseKind, needs: Needs, *, dtype: Any, friction_width: int = 0, **keywords: Any) -> PhaseModel:
+    if kind.energy is None:
+        assert kind.field is not None
+        return kind.field(needs, dtype=dtype, **keywords)
+    if needs.friction and friction_width:
+        conservative = kind.energy(needs._replace(friction=False), dtype=dtype, **keywords)
+        return make_dissipative(conservative, needs, width=friction_width, dtype=dtype)
+    return hamiltonian_phase_model(kind.energy(needs, dtype=dtype, **keywords))

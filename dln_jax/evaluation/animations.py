@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dln_jax.evaluation.phase_figures import COLOURS, TRUTH
+from dln_jax.evaluation.phase_figures import COLOURS, TRUTH, plane_paths
 from dln_jax.evaluation.phase_metrics import Motions
 from dln_jax.types import InputError, require_positive
 
@@ -80,7 +80,7 @@ def write_motion_gif(
     require_positive(tail=tail, stride=stride, frames_per_second=frames_per_second)
     t = next(iter(motions.values())).t if motions else np.zeros(0)
     _require_common_length(t, {name: moved.q.shape[1] for name, moved in motions.items()})
-    curves = {name: _curves(moved, shown) for name, moved in motions.items()}
+    curves = {name: plane_paths(moved, shown) for name, moved in motions.items()}
     plane = next(iter(motions.values())).q.shape[2] == 1
     framed = curves.get(TRUTH) or [curve for of_one in curves.values() for curve in of_one]
     corners = [1.2 * max(float(np.nanmax(np.abs(curve[half]))) for curve in framed) for half in range(2)]
@@ -107,14 +107,6 @@ def write_motion_gif(
             body.set(data=(x[index : index + 1], y[index : index + 1]))
 
     _write(figure, path, t, show, frames_per_second, stride)
-
-
-def _curves(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(q, p), or (x, y) of each body, with gaps where a motion is not finite."""
-    q, p = (np.where(np.isfinite(state[shown]), state[shown], np.nan) for state in (motions.q, motions.p))
-    if q.shape[1] == 1:
-        return [(q[:, 0], p[:, 0])]
-    return [(q[:, body], q[:, body + 1]) for body in range(0, q.shape[1], 2)]
 
 
 def _write(figure: Figure, path: Path, t, show, frames_per_second: float, stride: int = 1) -> None:

@@ -44,14 +44,14 @@ def motion_figure(
     figure = Figure(figsize=(3.1 * len(motions) + 4.2, 3.4), layout="constrained", dpi=130)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(motions) + 1, width_ratios=[3.0] * len(motions) + [4.0])
-    truth = _paths(motions[TRUTH], shown)
+    truth = plane_paths(motions[TRUTH], shown)
     plane = motions[TRUTH].q.shape[2] == 1
     corner = 1.25 * max(float(np.abs(path).max()) for path in truth)
     for axis, (name, moved) in zip(axes, motions.items(), strict=False):
         for x, y in truth:
             axis.plot(x, y, color=COLOURS[TRUTH], linewidth=1.0)
         if name != TRUTH:
-            for x, y in _paths(moved, shown):
+            for x, y in plane_paths(moved, shown):
                 axis.plot(x, y, color=COLOURS.get(name, "C0"), linewidth=1.4)
         if plane and fields is not None and name in fields:
             _arrows(axis, fields[name], corner)
@@ -79,8 +79,8 @@ def _limits(truth: np.ndarray, curves: list[np.ndarray]) -> tuple[float, float]:
     return float(low - margin), float(high + margin)
 
 
-def _paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Curves to draw: (q, p), or (x, y) of each body."""
+def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Curves of one motion: (q, p), or (x, y) of each body; gaps where it is not finite."""
     q, p = motions.q[shown], motions.p[shown]
     q, p = (np.where(np.isfinite(each), each, np.nan) for each in (q, p))
     if q.shape[1] == 1:
