@@ -67,7 +67,9 @@ def training_curve(history: Sequence[Progress], *, best_step: int, error: str = 
     steps = [progress.step for progress in history]
     curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, f"validation {error}"))
     for field, colour, label in (*curves, ("monitor", TEST, f"test {error}")):
-        axis.semilogy(steps, [np.median(getattr(progress, field)) for progress in history], color=colour, label=label)
+        values = [np.median(getattr(progress, field)) for progress in history]
+        if not np.isnan(values).all():  # no test is monitored
+            axis.semilogy(steps, values, color=colour, label=label)
     axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
     axis.set_xlabel("optimiser step")
     axis.set_ylabel("loss, or MSE in (N m)²" if error == "torque MSE" else "loss")
