@@ -1,0 +1,148 @@
+"""A soft body and what acts on it: a mesh, the energy terms it needs, the vertices that are held, and their parameters.
+
+What a scene does not list is never traced. Everything in `Params` is differentiable and can be mapped over.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.softbody.mesh import Mesh, lumped_masses
+from dln_jax.softbody.term import Context, Term
+from dln_jax.solvers.element_energies import ElementEnergy
+from dln_jax.types import InputError
+
+
+class Params(NamedTuple):
+    """What a motion depends on besides its state and its controls."""
+
+    rest: Float[Array, "n dim"]
+    """Rest shape in m."""
+    masses: Float[Array, " n"]
+    """In kg."""
+    terms: dict[str, Any]
+    """Parameters of each term, by its name."""
+
+
+class SoftScene(NamedTuple):
+    """A soft body and what acts on it."""
+
+    mesh: Mesh
+    terms: tuple[Term, ...]
+    held: Int[np.ndarray, " k"]
+    """Vertices that are not solved for: they move with their own velocity in `State.v`."""
+    params: Params
+    """Defaults."""
+
+    @property
+    def free(self) -> Bool[np.ndarray, "n dim"]:
+        """Which coordinates are solved for."""
+        free = np.ones(self.mesh.vertices.shape, bool)
+        free[self.held] = False
+        return free
+
+
+class Previous(NamedTuple):
+    """The state before, for methods of two steps."""
+
+    x: Float[Array, "n dim"]
+    v: Float[Array, "n dim"]
+    known: Bool[Array, ""]
+    """False before the first step, which is then a step of backward Euler."""
+
+
+class State(NamedTuple):
+    """Positions and velocities."""
+
+    x: Float[Array, "n dim"]
+    """In m."""
+    v: Float[Array, "n dim"]
+    """In m/s; of held vertices, the velocity they are moved with."""
+    previous: Previous | None = None
+    """For "bdf2"."""
+
+
+def make_scene(
+    mesh: Mesh,
+    terms: Sequence[Term],
+    *,
+    density: float = 1000.0,
+    masses: Any = None,
+    held: Any = (),
+) -> SoftScene:
+    """A scene with its default parameters.
+
+    Args:
+        mesh: whose vertices are the rest shape.
+        terms: what acts on the body.
+        density: in kg/m³ (kg/m² in the plane), from which vertices get their masses.
+        masses: of the vertices in kg, one for all or [n], instead of a density.
+        held: indices of vertices that are not solved for.
+
+    Raises:
+        InputError: two terms of one name, an index or a mass out of range.
+    """
+    n = len(mesh.vertices)
+    terms = tuple(terms)
+    names = [term.name for term in terms]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"two terms are named '{twice[0]}'; give each its own name")
+    for term in terms:
+        wrong = np.argwhere((term.indices < 0) | (term.indices >= n))
+        if len(wrong):
+            raise InputError(
+                f"term '{term.name}', element {wrong[0][0]} names vertex {term.indices[tuple(wrong[0])]}; "
+                f"expected 0..{n - 1}"
+            )
+    held = np.asarray(held, int).reshape(-1)
+    if len(outside := held[(held < 0) | (held >= n)]):
+        raise InputError(f"held names vertex {outside[0]}; expected 0..{n - 1}")
+    masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
+    if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
+        raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
+    params = Params(
+        jnp.asarray(mesh.vertices), jnp.asarray(masses), {term.name: term.parameters for term in terms}
+    )
+    return SoftScene(mesh, terms, held, params)
+
+
+def initial_state(scene: SoftScene, *, x: Any = None, v: Any = None, two_steps: bool = False) -> State:
+    """The rest shape at rest, or the positions and velocities given ([n, dim], or one [dim] for all vertices).
+
+    Args:
+        scene: whose state this is.
+        x: positions in m.
+        v: velocities in m/s.
+        two_steps: make room for the state before, which "bdf2" needs.
+
+    Raises:
+        InputError: a value that is not finite.
+    """
+    shape = scene.mesh.vertices.shape
+    given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
+    for name, values in given.items():
+        if len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), shape)))):
+            raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
+    x, v = (jnp.broadcast_to(jnp.asarray(values, float), shape) for values in given.values())
+    return State(x, v, Previous(x, v, jnp.asarray(False)) if two_steps else None)
+
+
+def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
+    """The terms as the solver takes them."""
+    return tuple(ElementEnergy(term.energy, term.indices) for term in scene.terms)
+
+
+def prepare(scene: SoftScene, params: Params, context: Context) -> tuple[Any, ...]:
+    """Data of the elements of every term for one step."""
+    return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
+
+
+def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
+    """V(x) in J: what the scene stores, for energy plots; a term that dissipates counts as it would from rest at x."""
+    context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
+    data = prepare(scene, params, context)
+    return sum(jax.vmap(term.energy)(x[term.indices], of).sum() for term, of in zip(scene.terms, data, strict=True))

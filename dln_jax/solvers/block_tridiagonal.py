@@ -1,0 +1,51 @@
+"""Cholesky factorisation of symmetric block-tridiagonal matrices, as a scan over the blocks.
+
+    H = [[D_0, C_1ᵀ, ...], [C_1, D_1, C_2ᵀ, ...], ...],    H = L Lᵀ with diagonal blocks L_i and blocks W_i below them:
+    L_i L_iᵀ = D_i - W_i W_iᵀ,    W_i L_{i-1}ᵀ = C_i
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.lax.linalg import cholesky, triangular_solve
+from jaxtyping import Array, Float
+
+Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
+"""(L_i, W_i); W_0 is zero."""
+
+
+def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "count1 s s"]) -> Factor:
+    """L of a block-tridiagonal matrix; not finite if it is not positive definite.
+
+    Args:
+        diagonal: D_i; only their lower triangles are read.
+        below: C_1, C_2, ...: block i of the rows against block i - 1 of the columns.
+    """
+
+    def eliminate(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        d, c = blocks
+        w = triangular_solve(previous, c, lower=True, transpose_a=True)
+        factor = cholesky(d - w @ w.T, symmetrize_input=False)
+        return factor, (factor, w)
+
+    first = cholesky(diagonal[0], symmetrize_input=False)
+    _, (factors, w) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
+    return jnp.concatenate([first[None], factors]), jnp.concatenate([jnp.zeros_like(first)[None], w])
+
+
+def solve_blocks(factor: Factor, b: Float[Array, "count s"]) -> Float[Array, "count s"]:
+    """x with L Lᵀ x = b."""
+
+    def forwards(y: Array, blocks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        lower, w, right = blocks
+        y = triangular_solve(lower, (right - w @ y)[:, None], left_side=True, lower=True)[:, 0]
+        return y, y
+
+    def backwards(carry: Array, blocks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        lower, w, y = blocks
+        x = triangular_solve(lower, (y - carry)[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
+        return w.T @ x, x
+
+    zero = jnp.zeros_like(b[0])
+    _, y = jax.lax.scan(forwards, zero, (*factor, b))
+    _, x = jax.lax.scan(backwards, zero, (*factor, y), reverse=True)
+    return x

@@ -1,0 +1,181 @@
+"""Symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
+
+Three ways, chosen by size and structure before anything is traced:
+
+- dense Cholesky for small systems;
+- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most;
+- conjugate gradients with a block-Jacobi preconditioner on the element Hessians, without any matrix, for the largest.
+
+A matrix that is not positive definite gives a solution that is not finite: nothing is shifted or clamped here.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.lax.linalg import cholesky
+from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from dln_jax.solvers.block_tridiagonal import factorise_blocks, solve_blocks
+from dln_jax.solvers.conjugate_gradients import conjugate_gradients
+from dln_jax.solvers.element_energies import ElementEnergy, Pattern, assemble, entries
+from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+
+Blocks = Float[Array, "n b"]
+
+# Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
+_DENSE_UNKNOWNS = 160
+# Multiplications beyond which a factorisation takes longer than some hundred products with the matrix.
+_FACTORISATION_WORK = 4e9
+
+
+class LinearSolver(NamedTuple):
+    """How systems with the Hessian are solved."""
+
+    factorise: Callable[[Sequence[Array]], Any]
+    """Element Hessians -> what the solves need."""
+    solve: Callable[[Any, Blocks], Blocks]
+    """(factor, b) -> p, as accurate as rounding allows; p is zero where the pattern is not free."""
+    search: Callable[[Any, Blocks], Blocks]
+    """The same, as accurate as a search direction has to be."""
+
+
+LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
+
+
+def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """The way that is fastest for the size and the band of the pattern."""
+    if at.unknowns <= _DENSE_UNKNOWNS:
+        return dense(energies, at)
+    if at.unknowns * float(_band(at, _ordering(at)) * at.width) ** 2 <= _FACTORISATION_WORK:
+        return block_tridiagonal(energies, at)
+    return matrix_free(energies, at)
+
+
+def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Cholesky factorisation of the whole matrix."""
+    table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
+
+    def factorise(hessians: Sequence[Array]) -> Array:
+        return cholesky(_with_constants(entries(at, hessians))[table], symmetrize_input=False)
+
+    def solve(factor: Array, b: Blocks) -> Blocks:
+        right = jnp.where(at.free, b, 0).reshape(-1)
+        return solve_lower_transposed(factor, solve_lower(factor, right)).reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Cholesky factorisation block by block, the unknowns ordered so that only neighbouring blocks couple."""
+    order = _ordering(at)
+    size = _band(at, order)
+    count = -(-at.blocks // size)
+    # Unknowns in their new order; the last block is padded with unknowns that couple to nothing.
+    numbers = np.full(count * size * at.width, at.unknowns)
+    numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
+    numbers = numbers.reshape(count, size * at.width)
+    lookup = _lookup(at)
+    diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
+    block, row = np.nonzero(numbers == at.unknowns)
+    diagonal[block, row, row] = _one(at)
+    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in zip(numbers, numbers[1:], strict=False)])
+    back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
+
+    def factorise(hessians: Sequence[Array]) -> tuple[Array, Array]:
+        values = _with_constants(entries(at, hessians))
+        return factorise_blocks(values[diagonal], values[below])
+
+    def solve(factor: tuple[Array, Array], b: Blocks) -> Blocks:
+        right = jnp.append(jnp.where(at.free, b, 0).reshape(-1), 0)[numbers]
+        return solve_blocks(factor, right).reshape(-1)[back].reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def matrix_free(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    *,
+    tolerance: float = 1e-10,
+    search_tolerance: float = 1e-2,
+    iterations: int = 10_000,
+) -> LinearSolver:
+    """Conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
+
+    Args:
+        energies: whose indices say where the elements' products go.
+        at: the pattern.
+        tolerance: relative residual of `solve`; a solve that does not get there is not finite.
+        search_tolerance: relative residual of `search`.
+        iterations: products after which either gives up.
+    """
+    n, b = at.blocks, at.width
+    numbers = np.arange(n * b).reshape(n, b)
+    of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
+
+    def factorise(hessians: Sequence[Array]) -> tuple[tuple[Array, ...], Array]:
+        of_diagonal = _with_constants(entries(at, hessians))[of_blocks]
+        return tuple(hessians), jnp.linalg.inv(of_diagonal)
+
+    def run(factor: tuple[tuple[Array, ...], Array], right: Blocks, tolerance: float) -> Blocks:
+        hessians, inverse = factor
+
+        def product(x: Blocks) -> Blocks:
+            out = jnp.zeros_like(x)
+            for (_, indices), corners, of_elements in zip(energies, at.corners, hessians, strict=True):
+                local = x[indices].reshape(len(indices), -1)
+                products = (of_elements @ local[..., None]).reshape(*indices.shape, b)
+                out += assemble(corners, products)
+            return jnp.where(at.free, out, 0)
+
+        def precondition(x: Blocks) -> Blocks:
+            return (inverse @ x[..., None])[..., 0]
+
+        right = jnp.where(at.free, right, 0)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=iterations)
+
+    return LinearSolver(
+        factorise, lambda factor, right: run(factor, right, tolerance), lambda f, right: run(f, right, search_tolerance)
+    )
+
+
+def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """(rows, columns) -> index into the entries with the constants 0 and 1 behind them; one past the rows is all zero."""
+    size = at.unknowns + 1
+    key = at.rows * size + at.columns
+    order = np.argsort(key)
+    fixed = np.append(~at.free.ravel(), False)
+
+    def places(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        row, column = np.broadcast_arrays(row, column)
+        # The lower triangle stands for both.
+        wanted = np.maximum(row, column) * size + np.minimum(row, column)
+        nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
+        found = np.where(key[order][nearest] == wanted, order[nearest], len(key))
+        return np.where((row == column) & fixed[row], _one(at), found)
+
+    return places
+
+
+def _one(at: Pattern) -> int:
+    return len(at.rows) + 1
+
+
+def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+    return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
+
+
+def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
+    rows, columns = at.rows // at.width, at.columns // at.width
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
+    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+
+
+def _band(at: Pattern, order: np.ndarray) -> int:
+    """Largest distance in the ordering between two blocks that couple; at least 1."""
+    place = np.argsort(order)
+    return max(1, int(np.abs(place[at.rows // at.width] - place[at.columns // at.width]).max(initial=0)))

@@ -1,0 +1,265 @@
+"""Minima of sums of element energies by Newton's method, differentiable by the implicit function theorem.
+
+    x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
+    dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
+
+The Hessian is used as it is; only when its factorisation fails are the Hessians of the elements projected to positive
+semi-definite ones (projecting always costs several times the iterations on badly deformed bodies). The derivative is
+that of the minimum and not of the iterations: one factorisation and one solve, in forward and in reverse mode and to
+any order. A derivative at a point that is no minimum is NaN, never a plausible number.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.solvers.element_energies import (
+    Blocks,
+    ElementEnergy,
+    Pattern,
+    assemble,
+    element_hessians,
+    gradient,
+    pattern,
+    value,
+    value_and_gradient,
+)
+from dln_jax.solvers.linear_solvers import LinearSolver, LinearSolverFactory, by_size
+from dln_jax.solvers.projection import project
+from dln_jax.types import InputError, require_positive
+
+# Gradients and energies cannot be told from zero below so many units of rounding.
+_ROUNDING_UNITS = 16
+# Sufficient decrease of the line search (Armijo), and how often it halves the step.
+_DECREASE = 1e-4
+_HALVINGS = 40
+# Shifts of the projected Hessian's diagonal, relative to its largest element, tried in turn if that fails too.
+_SHIFTS = (0.0, 1e-8, 1e-4, 1.0)
+
+
+class Info(NamedTuple):
+    """How a minimisation ended."""
+
+    residual: Float[Array, ""]
+    """Largest |dE/dx| / scale at the point returned."""
+    iterations: Int[Array, ""]
+    """Newton steps taken."""
+    converged: Bool[Array, ""]
+    """Whether the residual is within the tolerance or at the level of rounding; false for values that are not finite."""
+    definite: Bool[Array, ""]
+    """Whether the Hessian at the point returned, as it is, is positive definite: a minimum and no saddle. Costs a
+    factorisation, which is left out of the program where this is not used."""
+
+
+class _State(NamedTuple):
+    x: Blocks
+    energy: Float[Array, ""]
+    gradient: Blocks
+    floor: Blocks
+    iterations: Int[Array, ""]
+    stuck: Bool[Array, ""]
+
+
+def minimise(
+    energies: Sequence[ElementEnergy] | Callable[[Blocks, Any], Array],
+    x0: Blocks,
+    data: Any = None,
+    *,
+    free: Any = None,
+    scale: Float[Array, " n"] | float = 1.0,
+    tolerance: float = 1e-8,
+    iterations: int = 100,
+    linear_solver: LinearSolverFactory = by_size,
+    at: Pattern | None = None,
+) -> tuple[Blocks, Info]:
+    """x [n, b] at which the sum of the energies is least, near x0, with how the search ended.
+
+    Derivatives are those of the minimum, with respect to `data` and to the entries of x0 that are not free. Arrays that
+    an energy closes over are constants.
+
+    Args:
+        energies: what is added up, or one function (x [n, b], data) -> scalar of all unknowns.
+        x0: start [n, b]; float32 or float64 decides the precision.
+        data: for each energy, the data of its elements (leading axis m); for one function, its second argument.
+        free: [n, b], which unknowns are solved for; the others keep their value in x0. All by default.
+        scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
+        tolerance: largest |dE/dx| / scale that counts as a minimum; rounding always does.
+        iterations: Newton steps after which the search gives up, which `Info.converged` reports.
+        linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.linear_solvers`.
+        at: the energies' pattern, if it is at hand; made here otherwise.
+
+    Raises:
+        InputError: indices, shapes or numbers that do not fit.
+    """
+    require_positive(tolerance=tolerance, iterations=iterations)
+    if x0.ndim != 2:
+        raise InputError(f"x0 has shape {x0.shape}; expected [n, b], blocks of unknowns")
+    if callable(energies):
+        energies = (ElementEnergy(energies, np.arange(x0.shape[0])[None]),)
+        data = (jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], data),)
+    energies = tuple(energies)
+    at = pattern(energies, *x0.shape, free) if at is None else at
+    solver = linear_solver(energies, at)
+    scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
+
+    @jax.custom_jvp
+    def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
+        x, info = _newton(energies, at, solver, x0, data, scale, tolerance, iterations)
+        definite = _is_definite(solver, solver.factorise(element_hessians(energies, x, data)), x)
+        return x, info._replace(definite=definite)
+
+    @minimum.defjvp
+    def derivative(primals: tuple[Blocks, Any, Array], tangents: tuple[Blocks, Any, Array]) -> tuple[Any, Any]:
+        x, info = minimum(*primals)
+        x_dot = _implicit_derivative(energies, at, solver, x, primals[1], *tangents[:2])
+        x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
+        return (x, info), (x_dot, jax.tree.map(_no_tangent, info))
+
+    return minimum(x0, tuple(data), scale)
+
+
+def _no_tangent(leaf: Array) -> Any:
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)
+
+
+def _implicit_derivative(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    solver: LinearSolver,
+    x: Blocks,
+    data: Any,
+    x0_dot: Blocks,
+    data_dot: Any,
+) -> Blocks:
+    fixed_dot = jnp.where(at.free, 0, x0_dot)
+    _, right = jax.jvp(lambda x, data: gradient(energies, at, x, data), (x, data), (fixed_dot, data_dot))
+    # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
+    constant_x, constant_data = jax.lax.stop_gradient((x, data))
+    factor = solver.factorise(element_hessians(energies, constant_x, constant_data))
+
+    def product(v: Blocks) -> Blocks:
+        masked = jnp.where(at.free, v, 0)
+        curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
+        return jnp.where(at.free, curved, v)
+
+    solution = jax.lax.custom_linear_solve(
+        product, -right, lambda _, b: solver.solve(factor, b), symmetric=True
+    )
+    return fixed_dot + solution
+
+
+def _is_definite(solver: LinearSolver, factor: Any, like: Blocks) -> Array:
+    # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
+    return jnp.isfinite(solver.solve(factor, jnp.ones_like(like))).all()
+
+
+def _newton(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    solver: LinearSolver,
+    x0: Blocks,
+    data: Any,
+    scale: Array,
+    tolerance: float,
+    iterations: int,
+) -> tuple[Blocks, Info]:
+    rounding = _ROUNDING_UNITS * jnp.finfo(x0.dtype).eps
+
+    def evaluate(x: Blocks) -> tuple[Array, Blocks]:
+        return value_and_gradient(energies, at, x, data)
+
+    def within(state: _State) -> Array:
+        return (jnp.abs(state.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
+
+    def running(state: _State) -> Array:
+        return ~within(state) & ~state.stuck & (state.iterations < iterations)
+
+    def iterate(state: _State) -> _State:
+        hessians = element_hessians(energies, state.x, data)
+        direction = _descent_direction(solver, hessians, state.gradient)
+        slope = jnp.vdot(direction, state.gradient)
+        floor = rounding * _products_of_magnitudes(energies, at, hessians, state.x)
+        x, energy, gradient, accepted = _line_search(evaluate, state, direction, slope, rounding, scale)
+        return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
+
+    energy, first = evaluate(x0)
+    start = _State(x0, energy, first, jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
+    last = jax.lax.while_loop(running, iterate, start)
+    residual = jnp.max(jnp.abs(last.gradient) / scale, initial=0)
+    return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy), jnp.asarray(False))
+
+
+def _descent_direction(solver: LinearSolver, hessians: Sequence[Array], gradient: Blocks) -> Blocks:
+    def towards(hessians: Sequence[Array]) -> tuple[Blocks, Array]:
+        direction = solver.search(solver.factorise(hessians), -gradient)
+        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+
+    # A loop that usually runs zero times: under vmap a branch would always be taken.
+    def failing(state: tuple[Blocks, Array, Array]) -> Array:
+        _, descends, attempts = state
+        return ~descends & (attempts < len(_SHIFTS))
+
+    def retry(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
+        # The barrier ties the projection to the loop: it would be computed ahead of it, and always, otherwise.
+        here, attempts = jax.lax.optimization_barrier((tuple(hessians), state[2]))
+        return *towards(project(here, jnp.asarray(_SHIFTS, gradient.dtype)[attempts])), attempts + 1
+
+    direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians), jnp.asarray(0)))
+    return jnp.where(descends, direction, -gradient)
+
+
+def _products_of_magnitudes(
+    energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Array], x: Blocks
+) -> Blocks:
+    """|H| |x|, the size of what cancels in the gradient, from the elements."""
+    size = jnp.max(jnp.abs(x), initial=0)
+    total = jnp.zeros_like(x)
+    for (_, indices), corners, hessian in zip(energies, at.corners, hessians, strict=True):
+        total += assemble(corners, jnp.abs(hessian).sum(-1).reshape(*indices.shape, -1))
+    return total * size
+
+
+def _line_search(
+    evaluate: Callable[[Blocks], tuple[Array, Blocks]],
+    state: _State,
+    direction: Blocks,
+    slope: Array,
+    rounding: Array,
+    scale: Array,
+) -> tuple[Blocks, Array, Blocks, Array]:
+    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell."""
+
+    class Trial(NamedTuple):
+        x: Blocks
+        energy: Array
+        gradient: Blocks
+        length: Array
+        accepted: Array
+
+    def size(gradient: Blocks) -> Array:
+        return jnp.max(jnp.abs(gradient) / scale, initial=0)
+
+    before = size(state.gradient)
+    unclear = rounding * jnp.abs(state.energy)
+
+    def attempt(trial: Trial) -> Trial:
+        x = state.x + trial.length * direction
+        energy, gradient = evaluate(x)
+        change = energy - state.energy
+        lower = change <= _DECREASE * trial.length * slope
+        flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
+        accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
+        return Trial(x, energy, gradient, trial.length / 2, accepted)
+
+    one = jnp.ones((), state.x.dtype)
+    start = Trial(state.x, state.energy, state.gradient, one, jnp.asarray(False))
+    smallest = 2.0**-_HALVINGS
+    last = jax.lax.while_loop(lambda trial: ~trial.accepted & (trial.length > smallest), attempt, start)
+    kept = [jnp.where(last.accepted, new, old) for new, old in zip(last[:3], state[:3], strict=True)]
+    return kept[0], kept[1], kept[2], last.accepted
