@@ -104,9 +104,7 @@ def make_scene(
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")
-    params = Params(
-        jnp.asarray(mesh.vertices), jnp.asarray(masses), {term.name: term.parameters for term in terms}
-    )
+    params = Params(jnp.asarray(mesh.vertices), jnp.asarray(masses), {term.name: term.parameters for term in terms})
     return SoftScene(mesh, terms, held, params)
 
 
@@ -133,7 +131,7 @@ def initial_state(scene: SoftScene, *, x: Any = None, v: Any = None, two_steps: 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     """The terms as the solver takes them."""
-    return tuple(ElementEnergy(term.energy, term.indices) for term in scene.terms)
+    return tuple(ElementEnergy(_shim(term.energy), term.indices, written_out=True) for term in scene.terms)
 
 
 def prepare(scene: SoftScene, params: Params, context: Context) -> tuple[Any, ...]:
@@ -146,3 +144,16 @@ def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, contro
     context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
     data = prepare(scene, params, context)
     return sum(jax.vmap(term.energy)(x[term.indices], of).sum() for term, of in zip(scene.terms, data, strict=True))
+
+
+class _R:
+    def __init__(s, x):
+        s.x = x
+        s.shape = (len(x), len(x[0]))
+
+    def __getitem__(s, i):
+        return s.x[i[0]][i[1]] if isinstance(i, tuple) else jnp.stack(s.x[i])
+
+
+def _shim(e):
+    return lambda x, d: e(_R(x), d)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
 from dln_jax.softbody.term import Context
-from dln_jax.solvers.element_energies import ElementEnergy, pattern, value
+from dln_jax.solvers.element_energies import Corners, ElementEnergy, pattern, value
 from dln_jax.solvers.linear_solvers import LinearSolverFactory, by_size
 from dln_jax.solvers.minimise import Info, minimise
 from dln_jax.types import InputError, require_positive
@@ -42,7 +42,10 @@ class _Inertia(NamedTuple):
 
 def incremental_potential(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     """Inertia and the scene's terms, as energies whose data are an inertia's and the terms'."""
-    return (ElementEnergy(_inertia, np.arange(len(scene.mesh.vertices))[:, None]), *element_energies(scene))
+    return (
+        ElementEnergy(_inertia, np.arange(len(scene.mesh.vertices))[:, None], written_out=True),
+        *element_energies(scene),
+    )
 
 
 def make_step(
@@ -132,8 +135,8 @@ def static_solve(
     )
 
 
-def _inertia(x: Float[Array, "1 dim"], data: _Inertia) -> Float[Array, ""]:
-    return 0.5 * data.weight * sum((x[0, i] - data.target[i]) ** 2 for i in range(x.shape[1]))
+def _inertia(x: Corners, data: _Inertia) -> Float[Array, ""]:
+    return 0.5 * data.weight * sum((coordinate - data.target[i]) ** 2 for i, coordinate in enumerate(x[0]))
 
 
 def _inertial_target(state: State, dt: float, integrator: Integrator) -> tuple[Array, Array]:
@@ -144,7 +147,7 @@ def _inertial_target(state: State, dt: float, integrator: Integrator) -> tuple[A
     if integrator == "backward-euler":
         return jnp.asarray(dt, x.dtype), x + dt * v
     if (previous := state.previous) is None:
-        raise InputError('the state has no room for the state before; make it by initial_state(..., two_steps=True)')
+        raise InputError("the state has no room for the state before; make it by initial_state(..., two_steps=True)")
     length = jnp.where(previous.known, 2 / 3 * dt, dt).astype(x.dtype)
     two_steps = (4 * x - previous.x + length * (4 * v - previous.v)) / 3
     return length, jnp.where(previous.known, two_steps, x + dt * v)
@@ -170,9 +173,7 @@ def _advance(state: State, x: Array, dt: float, integrator: Integrator, free: np
     else:
         two_steps = (3 * x - 4 * state.x + before.x) / (2 * dt)
         after, v = x, jnp.where(before.known, two_steps, (x - state.x) / dt)
-    moved = state._replace(
-        x=jnp.where(free, after, state.x + dt * state.v), v=jnp.where(free, v, state.v)
-    )
+    moved = state._replace(x=jnp.where(free, after, state.x + dt * state.v), v=jnp.where(free, v, state.v))
     if before is None:
         return moved
     return moved._replace(previous=Previous(state.x, state.v, jnp.asarray(True)))

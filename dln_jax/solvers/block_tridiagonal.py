@@ -1,7 +1,7 @@
 """Cholesky factorisation of symmetric block-tridiagonal matrices, as a scan over the blocks.
 
-    H = [[D_0, C_1ᵀ, ...], [C_1, D_1, C_2ᵀ, ...], ...],    H = L Lᵀ with diagonal blocks L_i and blocks W_i below them:
-    L_i L_iᵀ = D_i - W_i W_iᵀ,    W_i L_{i-1}ᵀ = C_i
+H = [[D_0, C_1ᵀ, ...], [C_1, D_1, C_2ᵀ, ...], ...],    H = L Lᵀ with diagonal blocks L_i and blocks W_i below them:
+L_i L_iᵀ = D_i - W_i W_iᵀ,    W_i L_{i-1}ᵀ = C_i
 """
 
 import jax

@@ -15,25 +15,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.solvers.linear_map import linear_map
 from dln_jax.types import InputError
 
 Blocks = Float[Array, "n b"]
+Corners = Sequence[Sequence[Array]]
+"""x[i][j]: unknown j of corner i, a scalar; `jnp.stack` makes vectors of it. An array [k, b] reads the same."""
 
 
 class ElementEnergy(NamedTuple):
     """A sum of one scalar function over elements."""
 
-    energy: Callable[[Float[Array, "k b"], Any], Float[Array, ""]]
-    """(unknowns of one element, its data) -> energy."""
+    energy: Callable[[Any, Any], Float[Array, ""]]
+    """(unknowns x[i][j] of one element, its data) -> energy."""
     indices: Int[np.ndarray, "m k"]
     """Blocks of unknowns of each element; an element may name a block once."""
+    written_out: bool = False
+    """Whether the energy takes `Corners`, scalars in place of an array [k, b]: arithmetic of scalars fuses over all
+    elements, so that its derivatives are several times faster; for elements of up to a dozen unknowns."""
 
 
 class Pattern(NamedTuple):
-    """Where the entries of the lower triangle of the Hessian come from. Static arrays.
+    """Where the gradient and the lower triangle of the Hessian come from. Static arrays.
 
-    Unknown number `r` is x.ravel()[r]. `sources` index the concatenated, raveled element Hessians of all energies;
-    one past their end is a zero.
+    Unknown number `r` is x.ravel()[r]. Sources index what the elements have, component by component (all elements'
+    first, then all elements' second, ...); one past the end stands for zero.
     """
 
     blocks: int
@@ -44,11 +50,13 @@ class Pattern(NamedTuple):
     """Unknowns that are solved for."""
     rows: Int[np.ndarray, " entries"]
     columns: Int[np.ndarray, " entries"]
-    """Of each entry; columns <= rows."""
+    """Of each entry of the Hessian; columns <= rows."""
     sources: tuple[Int[np.ndarray, "some terms"], ...]
     """Element entries that add up to each entry, for entries 0, 1, ... in turn, grouped by how many there are."""
-    corners: tuple[Int[np.ndarray, "n valence"], ...]
-    """For each energy, the corners (element * k + corner) at each block; padded with m * k."""
+    diagonal: Int[np.ndarray, " unknowns"]
+    """Place of each unknown's diagonal entry among the entries; one past the end where it is not free."""
+    corners: tuple[Int[np.ndarray, "n b valence"], ...]
+    """For each energy, the element components that add up to each unknown's."""
 
     @property
     def unknowns(self) -> int:
@@ -71,27 +79,31 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
     free = np.ones((blocks, width), bool) if free is None else np.asarray(free, bool)
     if free.shape != (blocks, width):
         raise InputError(f"free has shape {free.shape}; expected one value per unknown, {(blocks, width)}")
-    keys, offset = [], 0
-    places = []
-    for number, (_, indices) in enumerate(energies):
+    size = blocks * width
+    rows_of, columns_of, corners, offset = [], [], [], 0
+    for number, (_, indices, _) in enumerate(energies):
         _require_indices(indices, blocks, number)
-        unknowns = (indices[:, :, None] * width + np.arange(width)).reshape(len(indices), -1)
-        m, size = unknowns.shape
-        keys.append((unknowns[:, :, None] * blocks * width + unknowns[:, None, :]).ravel())
-        places.append(offset + np.arange(m * size * size))
-        offset += m * size * size
-    key, place = np.concatenate(keys), np.concatenate(places)
-    row, column = np.divmod(key, blocks * width)
-    kept = (column <= row) & free.ravel()[row] & free.ravel()[column]
-    entries, sources = _group(key[kept], place[kept], padding=offset)
-    rows, columns = np.divmod(entries, blocks * width)
-    corners = tuple(_corners(indices, blocks) for _, indices in energies)
-    return Pattern(blocks, width, free, rows, columns, sources, corners)
+        unknowns = (indices[:, :, None] * width + np.arange(width)).reshape(len(indices), -1).T
+        row, column = np.tril_indices(len(unknowns))
+        rows_of.append(unknowns[row].ravel())
+        columns_of.append(unknowns[column].ravel())
+        corners.append(_group(unknowns.ravel(), np.arange(unknowns.size), size, unknowns.size))
+    row, column = np.concatenate(rows_of), np.concatenate(columns_of)
+    row, column = np.maximum(row, column), np.minimum(row, column)
+    place = np.arange(len(row))
+    kept = free.ravel()[row] & free.ravel()[column]
+    entries, sources = _group_by_count(row[kept] * size + column[kept], place[kept], len(row))
+    rows, columns = np.divmod(entries, size)
+    diagonal = np.full(size, len(rows))
+    on_diagonal = np.flatnonzero(rows == columns)
+    diagonal[rows[on_diagonal]] = on_diagonal
+    corner_tables = tuple(table.reshape(blocks, width, -1) for table in corners)
+    return Pattern(blocks, width, free, rows, columns, sources, diagonal, corner_tables)
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
     """E(x)."""
-    terms = [jax.vmap(e.energy)(x[e.indices], d).sum() for e, d in zip(energies, data, strict=True) if len(e.indices)]
+    terms = [jax.vmap(e.energy)(local(e, x), d).sum() for e, d in zip(energies, data, strict=True)]
     return sum(terms, jnp.zeros((), x.dtype))
 
 
@@ -100,11 +112,10 @@ def value_and_gradient(
 ) -> tuple[Float[Array, ""], Blocks]:
     """E(x), and dE/dx with zeros where x is not free."""
     total, gradient = jnp.zeros((), x.dtype), jnp.zeros_like(x)
-    for (energy, indices), corners, of_elements in zip(energies, at.corners, data, strict=True):
-        if len(indices):
-            values, gradients = jax.vmap(jax.value_and_grad(energy))(x[indices], of_elements)
-            total += values.sum()
-            gradient += assemble(corners, gradients)
+    for element, corners, of_elements in zip(energies, at.corners, data, strict=True):
+        values, gradients = jax.vmap(jax.value_and_grad(element.energy))(local(element, x), of_elements)
+        total += values.sum()
+        gradient += assemble(corners, _components(gradients))
     return total, gradient if at.free.all() else jnp.where(at.free, gradient, 0)
 
 
@@ -113,69 +124,123 @@ def gradient(energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Se
     return value_and_gradient(energies, at, x, data)[1]
 
 
-def assemble(corners: Int[np.ndarray, "n valence"], of_corners: Float[Array, "m k b"]) -> Blocks:
+def local(element: ElementEnergy, x: Blocks) -> Any:
+    """The unknowns of all elements, as the energy takes them: [m, k, b], or scalars [m] in nested tuples."""
+    if not element.written_out:
+        return x[element.indices]
+    corners = (_take(x, corner) for corner in element.indices.T)
+    return tuple(tuple(corner[:, j] for j in range(x.shape[1])) for corner in corners)
+
+
+def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
     """Adds what the elements have at their corners to the blocks there."""
-    flat = of_corners.reshape(-1, of_corners.shape[-1])
-    # Summed slice by slice: a reduction over a short axis is slower than additions.
-    return sum(
-        (jnp.take(flat, column, axis=0, mode="fill", fill_value=0) for column in corners.T[1:]),
-        jnp.take(flat, corners[:, 0], axis=0, mode="fill", fill_value=0),
-    )
+    if corners.shape[2] == 1 and (corners[:, :, 0].T.ravel() == np.arange(components.size)).all():
+        return components.T.reshape(corners.shape[:2])
+    padding = components.size
+    # Where each component goes; the transposed map reads there, where differentiation would scatter.
+    unknown, slot = np.divmod(np.flatnonzero(corners.reshape(-1) < padding), corners.shape[2])
+    to = np.empty(padding, int)
+    to[corners.reshape(-1, corners.shape[2])[unknown, slot]] = unknown
+
+    def add(flat: Array) -> Array:
+        return jnp.append(flat, 0)[corners].sum(-1).reshape(-1)
+
+    def read(unknowns: Array) -> Array:
+        return unknowns[to]
+
+    return linear_map(add, read, components.reshape(-1), corners[..., 0].size).reshape(corners.shape[:2])
 
 
 def element_hessians(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> tuple[Array, ...]:
-    """The Hessian of each element, [m, k b, k b], for each energy."""
-    hessians = []
-    for (energy, indices), of_elements in zip(energies, data, strict=True):
-        size = indices.shape[1] * x.shape[1]
-        second = jax.vmap(jax.hessian(energy))(x[indices], of_elements)
-        hessians.append(second.reshape(len(indices), size, size))
-    return tuple(hessians)
+    """Lower triangles of the Hessian of each element, row by row: [s (s + 1)/2, m] for each energy, s = k b."""
+    return tuple(
+        _written_out_hessians(e, x, of) if e.written_out else _array_hessians(e, x, of)
+        for e, of in zip(energies, data, strict=True)
+    )
 
 
 def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:
     """Values of the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
-    dtype = hessians[0].dtype
-    flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, dtype)])
-    return jnp.concatenate([sum((flat[s] for s in of_group.T[1:]), flat[of_group[:, 0]]) for of_group in at.sources])
+    flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, hessians[0].dtype)])
+    return jnp.concatenate([flat[of_group].sum(-1) for of_group in at.sources])
 
 
-def _group(
+def square(lower: Float[Array, "entries m"]) -> Float[Array, "m s s"]:
+    """Whole element Hessians from their lower triangles."""
+    s = round((np.sqrt(8 * lower.shape[0] + 1) - 1) / 2)
+    row, column = np.indices((s, s))
+    larger, smaller = np.maximum(row, column), np.minimum(row, column)
+    return lower.T[:, larger * (larger + 1) // 2 + smaller]
+
+
+def lower_triangles(whole: Float[Array, "m s s"]) -> Float[Array, "entries m"]:
+    """The inverse of `square`."""
+    return whole[:, *np.tril_indices(whole.shape[-1])].T
+
+
+def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+    s = element.indices.shape[1] * x.shape[1]
+    whole = jax.vmap(jax.hessian(element.energy))(local(element, x), data)
+    return lower_triangles(whole.reshape(-1, s, s))
+
+
+def _written_out_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+    def of_one(corners: Corners, data: Any) -> list[Array]:
+        scalars, structure = jax.tree.flatten(corners)
+
+        def gradient(*scalars: Array) -> list[Array]:
+            return jax.tree.leaves(jax.grad(element.energy)(structure.unflatten(scalars), data))
+
+        _, product = jax.linearize(gradient, *scalars)
+        one, zero = jnp.ones_like(scalars[0]), jnp.zeros_like(scalars[0])
+        columns = [product(*(one if i == j else zero for i in range(len(scalars)))) for j in range(len(scalars))]
+        return [columns[j][i] for i in range(len(scalars)) for j in range(i + 1)]
+
+    return jnp.stack(jax.vmap(of_one)(local(element, x), data))
+
+
+def _components(of_corners: Any) -> Float[Array, "s m"]:
+    """What `local` gives, component by component."""
+    if isinstance(of_corners, tuple):
+        return jnp.stack(jax.tree.leaves(of_corners))
+    return of_corners.reshape(len(of_corners), -1).T
+
+
+def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
+    return x if np.array_equal(blocks, np.arange(len(x))) else x[blocks]
+
+
+def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys most"]:
+    """The places of each key 0 .. keys - 1, in a padded table."""
+    counts = np.bincount(key, minlength=keys)
+    table = np.full((keys, max(1, counts.max(initial=0))), padding)
+    slots = np.arange(table.shape[1])
+    filled = slots < counts[:, None]
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    order = np.argsort(key, kind="stable")
+    table[filled] = place[order][(first[:, None] + slots)[filled]]
+    return table
+
+
+def _group_by_count(
     key: np.ndarray, place: np.ndarray, padding: int
 ) -> tuple[np.ndarray, tuple[Int[np.ndarray, "some terms"], ...]]:
-    """Distinct keys, and the places of each, in two padded tables: keys with few places, then the rest."""
-    order = np.argsort(key, kind="stable")
-    distinct, first, counts = np.unique(key[order], return_index=True, return_counts=True)
+    """Distinct keys and the places of each, in two tables: keys with few places, then the rest."""
+    distinct, number, counts = np.unique(key, return_inverse=True, return_counts=True)
+    table = _group(number, place, len(distinct), padding)
     few = counts <= np.median(counts)
-    tables, sorted_keys = [], []
-    for chosen in (few, ~few):
-        if chosen.any():
-            table = np.full((chosen.sum(), counts[chosen].max()), padding)
-            slots = np.arange(table.shape[1])
-            filled = slots < counts[chosen][:, None]
-            table[filled] = place[order][(first[chosen][:, None] + slots)[filled]]
-            tables.append(table)
-            sorted_keys.append(distinct[chosen])
-    return np.concatenate(sorted_keys), tuple(tables)
-
-
-def _corners(indices: np.ndarray, blocks: int) -> Int[np.ndarray, "n valence"]:
-    flat = indices.ravel()
-    valence = np.bincount(flat, minlength=blocks)
-    table = np.full((blocks, max(1, valence.max(initial=0))), len(flat))
-    order = np.argsort(flat, kind="stable")
-    slots = np.arange(table.shape[1])
-    first = np.concatenate([[0], np.cumsum(valence)[:-1]])
-    filled = slots < valence[:, None]
-    table[filled] = order[(first[:, None] + slots)[filled]]
-    return table
+    chosen = [choice for choice in (few, ~few) if choice.any()]
+    tables = tuple(table[choice][:, : counts[choice].max()] for choice in chosen)
+    return np.concatenate([distinct[choice] for choice in chosen]), tables
 
 
 def _require_indices(indices: np.ndarray, blocks: int, number: int) -> None:
     wrong = np.argwhere((indices < 0) | (indices >= blocks))
     if len(wrong):
         element = wrong[0][0]
-        raise InputError(f"element {element} of energy {number} has indices {indices[element]}; expected 0..{blocks - 1}")
+        raise InputError(
+            f"element {element} of energy {number} has indices {indices[element]}; expected 0..{blocks - 1}"
+        )
     ordered = np.sort(indices, axis=1)
     twice = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(twice):

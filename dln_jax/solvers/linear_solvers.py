@@ -14,15 +14,14 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax.linalg import cholesky
+from jax.lax.linalg import cholesky, triangular_solve
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dln_jax.solvers.block_tridiagonal import factorise_blocks, solve_blocks
 from dln_jax.solvers.conjugate_gradients import conjugate_gradients
-from dln_jax.solvers.element_energies import ElementEnergy, Pattern, assemble, entries
-from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+from dln_jax.solvers.element_energies import ElementEnergy, Pattern, assemble, square
 
 Blocks = Float[Array, "n b"]
 
@@ -35,8 +34,8 @@ _FACTORISATION_WORK = 4e9
 class LinearSolver(NamedTuple):
     """How systems with the Hessian are solved."""
 
-    factorise: Callable[[Sequence[Array]], Any]
-    """Element Hessians -> what the solves need."""
+    factorise: Callable[[Sequence[Array], Float[Array, " entries"]], Any]
+    """(element Hessians, entries of their sum) -> what the solves need."""
     solve: Callable[[Any, Blocks], Blocks]
     """(factor, b) -> p, as accurate as rounding allows; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]
@@ -59,12 +58,13 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Cholesky factorisation of the whole matrix."""
     table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
-    def factorise(hessians: Sequence[Array]) -> Array:
-        return cholesky(_with_constants(entries(at, hessians))[table], symmetrize_input=False)
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
+        return cholesky(_with_constants(values)[table], symmetrize_input=False)
 
     def solve(factor: Array, b: Blocks) -> Blocks:
-        right = jnp.where(at.free, b, 0).reshape(-1)
-        return solve_lower_transposed(factor, solve_lower(factor, right)).reshape(b.shape)
+        right = jnp.where(at.free, b, 0).reshape(-1, 1)
+        y = triangular_solve(factor, right, left_side=True, lower=True)
+        return triangular_solve(factor, y, left_side=True, lower=True, transpose_a=True).reshape(b.shape)
 
     return LinearSolver(factorise, solve, solve)
 
@@ -82,11 +82,13 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
     block, row = np.nonzero(numbers == at.unknowns)
     diagonal[block, row, row] = _one(at)
-    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in zip(numbers, numbers[1:], strict=False)])
+    below = np.stack(
+        [lookup(lower[:, None], upper[None, :]) for upper, lower in zip(numbers, numbers[1:], strict=False)]
+    )
     back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
 
-    def factorise(hessians: Sequence[Array]) -> tuple[Array, Array]:
-        values = _with_constants(entries(at, hessians))
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:
+        values = _with_constants(values)
         return factorise_blocks(values[diagonal], values[below])
 
     def solve(factor: tuple[Array, Array], b: Blocks) -> Blocks:
@@ -117,19 +119,17 @@ def matrix_free(
     numbers = np.arange(n * b).reshape(n, b)
     of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
 
-    def factorise(hessians: Sequence[Array]) -> tuple[tuple[Array, ...], Array]:
-        of_diagonal = _with_constants(entries(at, hessians))[of_blocks]
-        return tuple(hessians), jnp.linalg.inv(of_diagonal)
+    def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
+        return tuple(map(square, hessians)), jnp.linalg.inv(_with_constants(values)[of_blocks])
 
     def run(factor: tuple[tuple[Array, ...], Array], right: Blocks, tolerance: float) -> Blocks:
         hessians, inverse = factor
 
         def product(x: Blocks) -> Blocks:
             out = jnp.zeros_like(x)
-            for (_, indices), corners, of_elements in zip(energies, at.corners, hessians, strict=True):
-                local = x[indices].reshape(len(indices), -1)
-                products = (of_elements @ local[..., None]).reshape(*indices.shape, b)
-                out += assemble(corners, products)
+            for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
+                at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
+                out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
             return jnp.where(at.free, out, 0)
 
         def precondition(x: Blocks) -> Blocks:

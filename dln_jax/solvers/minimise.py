@@ -21,8 +21,8 @@ from dln_jax.solvers.element_energies import (
     Blocks,
     ElementEnergy,
     Pattern,
-    assemble,
     element_hessians,
+    entries,
     gradient,
     pattern,
     value,
@@ -109,8 +109,9 @@ def minimise(
     @jax.custom_jvp
     def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
         x, info = _newton(energies, at, solver, x0, data, scale, tolerance, iterations)
-        definite = _is_definite(solver, solver.factorise(element_hessians(energies, x, data)), x)
-        return x, info._replace(definite=definite)
+        # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
+        solved = solver.solve(_factor(energies, at, solver, x, data), jnp.ones_like(x))
+        return x, info._replace(definite=jnp.isfinite(solved).all())
 
     @minimum.defjvp
     def derivative(primals: tuple[Blocks, Any, Array], tangents: tuple[Blocks, Any, Array]) -> tuple[Any, Any]:
@@ -137,26 +138,28 @@ def _implicit_derivative(
     x0_dot: Blocks,
     data_dot: Any,
 ) -> Blocks:
-    fixed_dot = jnp.where(at.free, 0, x0_dot)
-    _, right = jax.jvp(lambda x, data: gradient(energies, at, x, data), (x, data), (fixed_dot, data_dot))
+    if at.free.all():
+        fixed_dot = jnp.zeros_like(x)
+        _, right = jax.jvp(lambda data: gradient(energies, at, x, data), (data,), (data_dot,))
+    else:
+        fixed_dot = jnp.where(at.free, 0, x0_dot)
+        _, right = jax.jvp(lambda x, data: gradient(energies, at, x, data), (x, data), (fixed_dot, data_dot))
     # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
     constant_x, constant_data = jax.lax.stop_gradient((x, data))
-    factor = solver.factorise(element_hessians(energies, constant_x, constant_data))
+    factor = _factor(energies, at, solver, constant_x, constant_data)
 
     def product(v: Blocks) -> Blocks:
         masked = jnp.where(at.free, v, 0)
         curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
         return jnp.where(at.free, curved, v)
 
-    solution = jax.lax.custom_linear_solve(
-        product, -right, lambda _, b: solver.solve(factor, b), symmetric=True
-    )
+    solution = jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
     return fixed_dot + solution
 
 
-def _is_definite(solver: LinearSolver, factor: Any, like: Blocks) -> Array:
-    # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
-    return jnp.isfinite(solver.solve(factor, jnp.ones_like(like))).all()
+def _factor(energies: Sequence[ElementEnergy], at: Pattern, solver: LinearSolver, x: Blocks, data: Any) -> Any:
+    hessians = element_hessians(energies, x, data)
+    return solver.factorise(hessians, entries(at, hessians))
 
 
 def _newton(
@@ -182,9 +185,12 @@ def _newton(
 
     def iterate(state: _State) -> _State:
         hessians = element_hessians(energies, state.x, data)
-        direction = _descent_direction(solver, hessians, state.gradient)
+        values = entries(at, hessians)
+        direction = _descent_direction(at, solver, hessians, values, state.gradient)
         slope = jnp.vdot(direction, state.gradient)
-        floor = rounding * _products_of_magnitudes(energies, at, hessians, state.x)
+        # What cancels in a row of the gradient is of the size of |H| |x|.
+        diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(state.x.shape)
+        floor = rounding * diagonal * jnp.max(jnp.abs(state.x), initial=0)
         x, energy, gradient, accepted = _line_search(evaluate, state, direction, slope, rounding, scale)
         return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
 
@@ -195,9 +201,11 @@ def _newton(
     return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy), jnp.asarray(False))
 
 
-def _descent_direction(solver: LinearSolver, hessians: Sequence[Array], gradient: Blocks) -> Blocks:
-    def towards(hessians: Sequence[Array]) -> tuple[Blocks, Array]:
-        direction = solver.search(solver.factorise(hessians), -gradient)
+def _descent_direction(
+    at: Pattern, solver: LinearSolver, hessians: Sequence[Array], values: Array, gradient: Blocks
+) -> Blocks:
+    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
+        direction = solver.search(solver.factorise(hessians, values), -gradient)
         return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
 
     # A loop that usually runs zero times: under vmap a branch would always be taken.
@@ -208,21 +216,11 @@ def _descent_direction(solver: LinearSolver, hessians: Sequence[Array], gradient
     def retry(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
         # The barrier ties the projection to the loop: it would be computed ahead of it, and always, otherwise.
         here, attempts = jax.lax.optimization_barrier((tuple(hessians), state[2]))
-        return *towards(project(here, jnp.asarray(_SHIFTS, gradient.dtype)[attempts])), attempts + 1
+        projected = project(here, jnp.asarray(_SHIFTS, gradient.dtype)[attempts])
+        return *towards(projected, entries(at, projected)), attempts + 1
 
-    direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians), jnp.asarray(0)))
+    direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians, values), jnp.asarray(0)))
     return jnp.where(descends, direction, -gradient)
-
-
-def _products_of_magnitudes(
-    energies: Sequence[ElementEnergy], at: Pattern, hessians: Sequence[Array], x: Blocks
-) -> Blocks:
-    """|H| |x|, the size of what cancels in the gradient, from the elements."""
-    size = jnp.max(jnp.abs(x), initial=0)
-    total = jnp.zeros_like(x)
-    for (_, indices), corners, hessian in zip(energies, at.corners, hessians, strict=True):
-        total += assemble(corners, jnp.abs(hessian).sum(-1).reshape(*indices.shape, -1))
-    return total * size
 
 
 def _line_search(

@@ -5,25 +5,29 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dln_jax.solvers.element_energies import lower_triangles, square
 
-def project(hessians: Sequence[Float[Array, "m s s"]], shift: Float[Array, ""]) -> tuple[Array, ...]:
+
+def project(hessians: Sequence[Float[Array, "_ m"]], shift: Float[Array, ""]) -> tuple[Array, ...]:
     """The nearest positive semi-definite matrix of each element (negative eigenvalues become zero), plus a multiple of 1.
 
     Args:
-        hessians: of the elements of each energy, of any sizes.
+        hessians: lower triangles of the elements of each energy, of any sizes.
         shift: what is added to the diagonals, relative to the largest eigenvalue of all.
     """
-    largest = max(h.shape[-1] for h in hessians)
+    wholes = [square(lower) for lower in hessians]
+    largest = max(h.shape[-1] for h in wholes)
     # One call for all: several batched LAPACK calls in one program can wait for each other for ever.
-    padded = [jnp.pad(h, ((0, 0), (0, largest - h.shape[-1]), (0, largest - h.shape[-1]))) for h in hessians]
+    padded = [jnp.pad(h, ((0, 0), (0, largest - h.shape[-1]), (0, largest - h.shape[-1]))) for h in wholes]
     stacked = jnp.concatenate(padded)
     finite = jnp.where(jnp.isfinite(stacked), stacked, 0)
     values, vectors = jnp.linalg.eigh(finite)
     values = jnp.maximum(values, 0) + shift * jnp.max(values, initial=0)
     projected = (vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2)
     ends = [0]
-    for h in hessians:
+    for h in wholes:
         ends.append(ends[-1] + len(h))
     return tuple(
-        projected[a:b, : h.shape[-1], : h.shape[-1]] for a, b, h in zip(ends, ends[1:], hessians, strict=False)
+        lower_triangles(projected[a:b, : h.shape[-1], : h.shape[-1]])
+        for a, b, h in zip(ends, ends[1:], wholes, strict=False)
     )
