@@ -6,14 +6,13 @@ What a scene does not list is never traced. Everything in `Params` is differenti
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.softbody.mesh import Mesh, lumped_masses
 from dln_jax.softbody.term import Context, Term
-from dln_jax.solvers.element_energies import ElementEnergy
+from dln_jax.solvers.element_energies import ElementEnergy, value
 from dln_jax.types import InputError
 
 
@@ -131,7 +130,7 @@ def initial_state(scene: SoftScene, *, x: Any = None, v: Any = None, two_steps: 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     """The terms as the solver takes them."""
-    return tuple(ElementEnergy(_shim(term.energy), term.indices, written_out=True) for term in scene.terms)
+    return tuple(ElementEnergy(term.energy, term.indices, written_out=True) for term in scene.terms)
 
 
 def prepare(scene: SoftScene, params: Params, context: Context) -> tuple[Any, ...]:
@@ -142,18 +141,4 @@ def prepare(scene: SoftScene, params: Params, context: Context) -> tuple[Any, ..
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
     """V(x) in J: what the scene stores, for energy plots; a term that dissipates counts as it would from rest at x."""
     context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
-    data = prepare(scene, params, context)
-    return sum(jax.vmap(term.energy)(x[term.indices], of).sum() for term, of in zip(scene.terms, data, strict=True))
-
-
-class _R:
-    def __init__(s, x):
-        s.x = x
-        s.shape = (len(x), len(x[0]))
-
-    def __getitem__(s, i):
-        return s.x[i[0]][i[1]] if isinstance(i, tuple) else jnp.stack(s.x[i])
-
-
-def _shim(e):
-    return lambda x, d: e(_R(x), d)
+    return value(element_energies(scene), x, prepare(scene, params, context))

@@ -76,7 +76,7 @@ def make_step(
         raise InputError(f"integrator '{integrator}' is unknown; choose from {', '.join(get_args(Integrator))}")
     energies = incremental_potential(scene)
     free = scene.free
-    at = pattern(energies, *free.shape, free)
+    at = pattern(energies, free.shape[0], free.shape[1], free)
 
     def step(state: State, params: Params, control: Any = None) -> tuple[State, Info]:
         length, target = _inertial_target(state, dt, integrator)

@@ -2,7 +2,7 @@
 
     V(x) = sum over terms, sum over elements e:  energy(x[indices[e]], data[e])
 
-An element is whatever the energy couples: the corners of a triangle, the two ends of a spring, a single vertex above the
+An element is whatever the energy couples: the corners of a triangle, the two ends of a spring, a single vertex above
 ground. `prepare` turns a term's parameters into the data of its elements once per time step, so that everything an
 element needs (rest shape, material, actuation, lagged contact forces) is differentiable.
 """
@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from dln_jax.solvers.element_energies import Corners
 
 
 class Context(NamedTuple):
@@ -38,8 +40,9 @@ class Term(NamedTuple):
     """Under which its parameters are found in `Params.terms`; unique in a scene."""
     indices: Int[np.ndarray, "m k"]
     """Vertices of each element."""
-    energy: Callable[[Float[Array, "k dim"], Any], Float[Array, ""]]
-    """(positions of one element's vertices, its data) -> J."""
+    energy: Callable[[Corners, Any], Float[Array, ""]]
+    """(positions x[k][i] of one element's vertices, its data) -> J. The positions are `Corners`, scalars: arithmetic of
+    scalars fuses over all elements, where slices and stacks of arrays do not."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]

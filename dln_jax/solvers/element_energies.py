@@ -19,7 +19,7 @@ from dln_jax.solvers.linear_map import linear_map
 from dln_jax.types import InputError
 
 Blocks = Float[Array, "n b"]
-Corners = Sequence[Sequence[Array]]
+Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
 """x[i][j]: unknown j of corner i, a scalar; `jnp.stack` makes vectors of it. An array [k, b] reads the same."""
 
 
@@ -80,7 +80,7 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
     if free.shape != (blocks, width):
         raise InputError(f"free has shape {free.shape}; expected one value per unknown, {(blocks, width)}")
     size = blocks * width
-    rows_of, columns_of, corners, offset = [], [], [], 0
+    rows_of, columns_of, corners = [], [], []
     for number, (_, indices, _) in enumerate(energies):
         _require_indices(indices, blocks, number)
         unknowns = (indices[:, :, None] * width + np.arange(width)).reshape(len(indices), -1).T

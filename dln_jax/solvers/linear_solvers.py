@@ -9,6 +9,7 @@ Three ways, chosen by size and structure before anything is traced:
 A matrix that is not positive definite gives a solution that is not finite: nothing is shifted or clamped here.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -82,9 +83,7 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
     block, row = np.nonzero(numbers == at.unknowns)
     diagonal[block, row, row] = _one(at)
-    below = np.stack(
-        [lookup(lower[:, None], upper[None, :]) for upper, lower in zip(numbers, numbers[1:], strict=False)]
-    )
+    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
     back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:
@@ -144,7 +143,7 @@ def matrix_free(
 
 
 def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """(rows, columns) -> index into the entries with the constants 0 and 1 behind them; one past the rows is all zero."""
+    """(rows, columns) -> index into the entries with the constants 0 and 1 behind them; beyond the rows all is zero."""
     size = at.unknowns + 1
     key = at.rows * size + at.columns
     order = np.argsort(key)

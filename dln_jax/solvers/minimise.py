@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.element_energies import (
@@ -25,7 +26,6 @@ from dln_jax.solvers.element_energies import (
     entries,
     gradient,
     pattern,
-    value,
     value_and_gradient,
 )
 from dln_jax.solvers.linear_solvers import LinearSolver, LinearSolverFactory, by_size
@@ -49,7 +49,7 @@ class Info(NamedTuple):
     iterations: Int[Array, ""]
     """Newton steps taken."""
     converged: Bool[Array, ""]
-    """Whether the residual is within the tolerance or at the level of rounding; false for values that are not finite."""
+    """Whether the residual is within the tolerance or at the level of rounding; false where values are not finite."""
     definite: Bool[Array, ""]
     """Whether the Hessian at the point returned, as it is, is positive definite: a minimum and no saddle. Costs a
     factorisation, which is left out of the program where this is not used."""
@@ -102,7 +102,7 @@ def minimise(
         energies = (ElementEnergy(energies, np.arange(x0.shape[0])[None]),)
         data = (jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], data),)
     energies = tuple(energies)
-    at = pattern(energies, *x0.shape, free) if at is None else at
+    at = pattern(energies, x0.shape[0], x0.shape[1], free) if at is None else at
     solver = linear_solver(energies, at)
     scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
 
@@ -113,14 +113,18 @@ def minimise(
         solved = solver.solve(_factor(energies, at, solver, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
-    @minimum.defjvp
     def derivative(primals: tuple[Blocks, Any, Array], tangents: tuple[Blocks, Any, Array]) -> tuple[Any, Any]:
         x, info = minimum(*primals)
         x_dot = _implicit_derivative(energies, at, solver, x, primals[1], *tangents[:2])
         x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
         return (x, info), (x_dot, jax.tree.map(_no_tangent, info))
 
+    minimum.defjvp(derivative, symbolic_zeros=True)
     return minimum(x0, tuple(data), scale)
+
+
+def _is_constant(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero) or getattr(tangent, "dtype", None) == jax.dtypes.float0
 
 
 def _no_tangent(leaf: Array) -> Any:
@@ -138,12 +142,22 @@ def _implicit_derivative(
     x0_dot: Blocks,
     data_dot: Any,
 ) -> Blocks:
-    if at.free.all():
+    # What does not vary is left out: its derivatives would be computed only to be multiplied by zero.
+    leaves, structure = jax.tree.flatten(data)
+    dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
+    varying = [i for i, dot in enumerate(dots) if not _is_constant(dot)]
+
+    def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
+        replaced = dict(zip(varying, given, strict=True))
+        return gradient(energies, at, x, structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(leaves)]))
+
+    given, given_dots = [leaves[i] for i in varying], [dots[i] for i in varying]
+    if at.free.all() or _is_constant(x0_dot):
         fixed_dot = jnp.zeros_like(x)
-        _, right = jax.jvp(lambda data: gradient(energies, at, x, data), (data,), (data_dot,))
+        _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
     else:
         fixed_dot = jnp.where(at.free, 0, x0_dot)
-        _, right = jax.jvp(lambda x, data: gradient(energies, at, x, data), (x, data), (fixed_dot, data_dot))
+        _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
     # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
     constant_x, constant_data = jax.lax.stop_gradient((x, data))
     factor = _factor(energies, at, solver, constant_x, constant_data)
@@ -190,8 +204,10 @@ def _newton(
         slope = jnp.vdot(direction, state.gradient)
         # What cancels in a row of the gradient is of the size of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(state.x.shape)
-        floor = rounding * diagonal * jnp.max(jnp.abs(state.x), initial=0)
-        x, energy, gradient, accepted = _line_search(evaluate, state, direction, slope, rounding, scale)
+        extent = jnp.max(jnp.abs(state.x), initial=0)
+        floor = rounding * diagonal * extent
+        unclear = rounding * jnp.abs(state.energy) + floor.sum() * extent
+        x, energy, gradient, accepted = _line_search(evaluate, state, direction, slope, unclear, scale)
         return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
 
     energy, first = evaluate(x0)
@@ -228,10 +244,14 @@ def _line_search(
     state: _State,
     direction: Blocks,
     slope: Array,
-    rounding: Array,
+    unclear: Array,
     scale: Array,
 ) -> tuple[Blocks, Array, Blocks, Array]:
-    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell."""
+    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell.
+
+    Changes of the energy below `unclear` tell nothing: terms that cancel at rest are that large. A stiff body's
+    gradient is balanced to many digits after its energy has become blind.
+    """
 
     class Trial(NamedTuple):
         x: Blocks
@@ -244,7 +264,6 @@ def _line_search(
         return jnp.max(jnp.abs(gradient) / scale, initial=0)
 
     before = size(state.gradient)
-    unclear = rounding * jnp.abs(state.energy)
 
     def attempt(trial: Trial) -> Trial:
         x = state.x + trial.length * direction

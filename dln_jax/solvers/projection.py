@@ -9,7 +9,7 @@ from dln_jax.solvers.element_energies import lower_triangles, square
 
 
 def project(hessians: Sequence[Float[Array, "_ m"]], shift: Float[Array, ""]) -> tuple[Array, ...]:
-    """The nearest positive semi-definite matrix of each element (negative eigenvalues become zero), plus a multiple of 1.
+    """Element Hessians with their negative eigenvalues set to zero, plus a multiple of the unit matrix.
 
     Args:
         hessians: lower triangles of the elements of each energy, of any sizes.

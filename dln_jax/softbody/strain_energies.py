@@ -1,0 +1,150 @@
+"""Energy densities of isotropic elastic materials, in J per m² or m³ of the rest shape, as functions of F = dx/dX.
+
+With I1 = |F|² and J = det F, each has W = 0 and no stress at rest, and for small strains e = sym(F - I) the energy
+mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is given by its rows, so that all is
+arithmetic of scalars, which fuses under `vmap`.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.types import Scalar
+
+DeformationGradient = Float[Array, "dim dim"] | Sequence[Sequence[Array]]
+"""Rows of F."""
+StrainEnergy = Callable[[DeformationGradient, Scalar, Scalar], Scalar]
+"""(F, mu, lambda) -> W in J/m^dim; the Lamé parameters are in Pa."""
+
+_LAGUERRE_STEPS = 20
+"""Enough for double roots, where convergence is linear; elsewhere 1 to 4 are taken."""
+
+
+def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
+    """W = mu/2 (I1 - dim) - mu ln J + lambda/2 (ln J)² (Bonet and Wood 2008, eq. 6.28).
+
+    An inverted or collapsed element (J <= 0) has infinite energy, which every line search refuses, and derivatives of
+    zero, which add nothing wrong to the others.
+    """
+    J = determinant(F)
+    valid = J > 0
+    log_J = jnp.log(jnp.where(valid, J, 1.0))
+    density = 0.5 * mu * (squared_norm(F) - len(F)) - mu * log_J + 0.5 * lam * log_J**2
+    return jnp.where(valid, density, jnp.inf)
+
+
+def stable_neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
+    """W = mu/2 (I1 - dim) - mu (J - 1) + (lambda + mu)/2 (J - 1)² (Smith, de Goes and Kim 2018).
+
+    A polynomial: finite and smooth for every F, inverted or collapsed. The paper's lambda is lambda + mu of linear
+    elasticity, because -mu (J - 1) alone contributes -mu/2 tr(e)² to second order. Without the paper's further term
+    -mu/2 ln(I1 + 1) the point F = 0 is stationary; at rest nothing changes.
+    """
+    change = determinant(F) - 1.0
+    return 0.5 * mu * (squared_norm(F) - len(F)) - mu * change + 0.5 * (lam + mu) * change**2
+
+
+def st_venant_kirchhoff(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
+    """W = mu |E|² + lambda/2 tr(E)² with the Green strain E = (FᵀF - I)/2.
+
+    Smooth everywhere, but softens under compression: uniaxial stress vanishes again as the element collapses.
+    """
+    axes = range(len(F))
+    strain = [
+        [0.5 * (sum(F[k][i] * F[k][j] for k in axes) - (1.0 if i == j else 0.0)) for j in axes if j <= i] for i in axes
+    ]
+    trace = sum(strain[i][i] for i in axes)
+    squared = sum((1.0 if i == j else 2.0) * strain[i][j] ** 2 for i in axes for j in range(i + 1))
+    return mu * squared + 0.5 * lam * trace**2
+
+
+def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
+    """W = mu |F - R|² + lambda/2 tr(RᵀF - I)² with the rotation R closest to F (McAdams et al. 2011).
+
+    By invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
+    the smallest with the sign of J. R is not unique, and W has a crease, where the two smallest cancel: mirror images
+    in 2-D, and in 3-D elements collapsed to a line or mirrored in the plane of equal stretches. See `rotation_trace`.
+    """
+    s, dimension = rotation_trace(F), len(F)
+    return mu * (squared_norm(F) - 2.0 * s + dimension) + 0.5 * lam * (s - dimension) ** 2
+
+
+def squared_norm(F: DeformationGradient) -> Scalar:
+    """I1 = |F|²."""
+    return jnp.asarray(sum(entry * entry for row in F for entry in row))
+
+
+def determinant(F: DeformationGradient) -> Scalar:
+    """J = det F."""
+    if len(F) == 2:
+        return F[0][0] * F[1][1] - F[0][1] * F[1][0]
+    cofactor = cofactors(F)
+    return F[0][0] * cofactor[0][0] + F[0][1] * cofactor[0][1] + F[0][2] * cofactor[0][2]
+
+
+def cofactors(F: DeformationGradient) -> list[list[Array]]:
+    """Rows of cof F = J F⁻ᵀ."""
+    if len(F) == 2:
+        return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
+    # Taking the indices cyclically gives the signs.
+    return [
+        [
+            F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
+            - F[(i + 1) % 3][(j + 2) % 3] * F[(i + 2) % 3][(j + 1) % 3]
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
+
+
+def rotation_trace(F: DeformationGradient) -> Scalar:
+    """s = max over rotations R of tr(RᵀF), with right first and second derivatives and no singular values.
+
+    In 2-D s² = (F11 + F22)² + (F21 - F12)². In 3-D s is the largest root of (s² - I1)² - 8 J s - 4 |cof F|² (the
+    characteristic polynomial of Davenport's 4x4 matrix, whose roots are all real). On the crease this root is double or
+    triple, so s is exact to 1e-8 or 1e-6 (in float64); the derivative there is one that is right for a change of size,
+    F s/|F|², and zero at F = 0 and on the crease in 2-D, where s = 0.
+    """
+    if len(F) == 2:
+        squared = (F[0][0] + F[1][1]) ** 2 + (F[1][0] - F[0][1]) ** 2
+        smooth = squared > 0
+        return jnp.where(smooth, jnp.sqrt(jnp.where(smooth, squared, 1.0)), 0.0)
+    return _largest_root(squared_norm(F), determinant(F), squared_norm(cofactors(F)))
+
+
+def _largest_root(I1: Scalar, J: Scalar, minors: Scalar) -> Scalar:
+    def polynomial(s: Scalar, I1: Scalar, J: Scalar, minors: Scalar) -> Scalar:
+        return (s * s - I1) ** 2 - 8.0 * J * s - 4.0 * minors
+
+    def slope(s: Scalar, I1: Scalar, J: Scalar) -> Scalar:
+        return 4.0 * s * (s * s - I1) - 8.0 * J
+
+    constants = jax.lax.stop_gradient((I1, J, minors))
+
+    # Laguerre's method from an upper bound falls on the largest root, cubically where that is simple.
+    def improve(carry):
+        s, _, count = carry
+        value, rate = polynomial(s, *constants), slope(s, *constants[:2])
+        curvature = 12.0 * s * s - 4.0 * constants[0]
+        divisor = rate + jnp.sqrt(jnp.maximum(9.0 * rate * rate - 12.0 * value * curvature, 0.0))
+        change = jnp.where(divisor > 0, 4.0 * value / jnp.where(divisor > 0, divisor, 1.0), 0.0)
+        return s - change, change, count + 1
+
+    def unfinished(carry):
+        s, change, count = carry
+        return (jnp.abs(change) > 8.0 * precision * s) & (count < _LAGUERRE_STEPS)
+
+    start = jnp.sqrt(3.0 * constants[0])
+    precision = jnp.finfo(start.dtype).eps
+    s, _, _ = jax.lax.while_loop(unfinished, improve, (start, start, jnp.asarray(0)))
+
+    # Each Newton step from the constant root doubles the order to which derivatives are right: 1, then 3.
+    simple = slope(s, *constants[:2]) > 32.0 * jnp.sqrt(precision) * s**3
+    root = s
+    for _ in range(2):
+        root -= polynomial(root, I1, J, minors) / jnp.where(simple, slope(root, I1, J), 1.0)
+    extended = constants[0] > 0
+    norm = jnp.sqrt(jnp.where(extended, I1, 1.0))
+    return jnp.where(simple, root, jnp.where(extended, s * norm / jax.lax.stop_gradient(norm), 0.0))
