@@ -37,8 +37,9 @@ _ROUNDING_UNITS = 16
 # Sufficient decrease of the line search (Armijo), and how often it halves the step.
 _DECREASE = 1e-4
 _HALVINGS = 40
-# Shifts of the projected Hessian's diagonal, relative to its largest element, tried in turn if that fails too.
-_SHIFTS = (0.0, 1e-8, 1e-4, 1.0)
+# Shifts of the projected Hessian's diagonal, relative to the largest eigenvalue of an element, tried in turn: projected
+# elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
+_SHIFTS = (1e-6, 1e-3, 1.0)
 
 
 class Info(NamedTuple):
@@ -66,7 +67,7 @@ class _State(NamedTuple):
 
 def minimise(
     energies: Sequence[ElementEnergy] | Callable[[Blocks, Any], Array],
-    x0: Blocks,
+    x0: Array,
     data: Any = None,
     *,
     free: Any = None,
@@ -113,7 +114,7 @@ def minimise(
         solved = solver.solve(_factor(energies, at, solver, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
-    def derivative(primals: tuple[Blocks, Any, Array], tangents: tuple[Blocks, Any, Array]) -> tuple[Any, Any]:
+    def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         x, info = minimum(*primals)
         x_dot = _implicit_derivative(energies, at, solver, x, primals[1], *tangents[:2])
         x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
@@ -139,7 +140,7 @@ def _implicit_derivative(
     solver: LinearSolver,
     x: Blocks,
     data: Any,
-    x0_dot: Blocks,
+    x0_dot: Any,
     data_dot: Any,
 ) -> Blocks:
     # What does not vary is left out: its derivatives would be computed only to be multiplied by zero.

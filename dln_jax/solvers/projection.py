@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from dln_jax.solvers.element_energies import lower_triangles, square
 
 
-def project(hessians: Sequence[Float[Array, "_ m"]], shift: Float[Array, ""]) -> tuple[Array, ...]:
+def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
     """Element Hessians with their negative eigenvalues set to zero, plus a multiple of the unit matrix.
 
     Args:
