@@ -27,7 +27,7 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
     data = sets.train
     states = tuple(array[:BATCH] for array in (data.q, data.qd, data.qdd, data.tau))
     rows, shown = [], {}
-    for kind in ("structured-delan", "trigonometric") if quick else MEASURED:
+    for kind in ("structured-delan",) if quick else MEASURED:
         answers, seconds = {}, {}
         keywords = {"degree": 1} if kind == "trigonometric" else {"width": 64, "depth": 2, "activation": "tanh"}
         needs = two_link_arm().needs

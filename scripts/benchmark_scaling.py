@@ -15,7 +15,7 @@ from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
 
 SIZES = (1, 2, 3, 4, 6, 8, 10, 12, 30)
-QUICK = (1, 2, 4)
+QUICK = (2, 4)
 FITTED = (2, 12)
 """Joints between which exponents of growth are fitted."""
 BATCH = 512

@@ -3,9 +3,17 @@
 import os
 
 # Tests run each program a few times: compiling costs them more than running. Read when the first device is used.
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
+os.environ["XLA_FLAGS"] = " ".join(
+    (
+        os.environ.get("XLA_FLAGS", ""),
+        "--xla_backend_optimization_level=0",
+        "--xla_llvm_disable_expensive_passes=true",
+        "--xla_cpu_use_fusion_emitters=false",
+    )
+)
 
 import atexit
+import gc
 import shutil
 import tempfile
 
@@ -20,6 +28,9 @@ if CACHE not in os.environ:
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+# Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
+gc.set_threshold(200_000, 20, 100)
 
 LONGEST = (
     *("test_train_delan", "test_stability", "test_hnn_tasks", "test_pixels", "test_gauss_newton", "test_export_c"),
