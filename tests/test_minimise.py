@@ -145,7 +145,7 @@ def test_a_function_of_all_unknowns_is_minimised_from_where_its_hessian_is_indef
 
 def test_a_saddle_is_not_definite():
     # x² - y² has no minimum; its only stationary point is where the search starts.
-    x, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0)
+    _, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0)
     assert info.converged and not info.definite
 
 

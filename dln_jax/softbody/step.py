@@ -51,7 +51,7 @@ def incremental_potential(scene: SoftScene) -> tuple[ElementEnergy, ...]:
 def make_step(
     scene: SoftScene,
     dt: float,
-    integrator: Integrator = "backward-euler",
+    integrator: Integrator | str = "backward-euler",
     *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,
@@ -139,7 +139,7 @@ def _inertia(x: Corners, data: _Inertia) -> Float[Array, ""]:
     return 0.5 * data.weight * sum((coordinate - data.target[i]) ** 2 for i, coordinate in enumerate(x[0]))
 
 
-def _inertial_target(state: State, dt: float, integrator: Integrator) -> tuple[Array, Array]:
+def _inertial_target(state: State, dt: float, integrator: str) -> tuple[Array, Array]:
     """(h, y) of the minimisation."""
     x, v = state.x, state.v
     if integrator == "midpoint":
@@ -153,7 +153,7 @@ def _inertial_target(state: State, dt: float, integrator: Integrator) -> tuple[A
     return length, jnp.where(previous.known, two_steps, x + dt * v)
 
 
-def _span(dt: float, integrator: Integrator, state: State) -> Array:
+def _span(dt: float, integrator: str, state: State) -> Array:
     """Time in s from the state to the minimum."""
     return jnp.asarray(dt / 2 if integrator == "midpoint" else dt, state.x.dtype)
 
@@ -164,7 +164,7 @@ def _better(energies: tuple[ElementEnergy, ...], data: tuple[Any, ...], stay: Ar
     return jnp.where(lower, coast, stay)
 
 
-def _advance(state: State, x: Array, dt: float, integrator: Integrator, free: np.ndarray) -> State:
+def _advance(state: State, x: Array, dt: float, integrator: str, free: np.ndarray) -> State:
     before = state.previous
     if integrator == "midpoint":
         after, v = 2 * x - state.x, 4 / dt * (x - state.x) - state.v
