@@ -15,6 +15,7 @@ order and does not damp, so that it is for smooth motions.
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -50,7 +51,7 @@ def incremental_potential(scene: SoftScene) -> tuple[ElementEnergy, ...]:
 
 def make_step(
     scene: SoftScene,
-    dt: float,
+    dt: Any,
     integrator: Integrator | str = "backward-euler",
     *,
     tolerance: float = TOLERANCE,
@@ -61,7 +62,7 @@ def make_step(
 
     Args:
         scene: the body; its terms are compiled, no others.
-        dt: in s.
+        dt: in s; a traced value, whose sign is not checked, serves several steps by one program.
         integrator: "backward-euler", "bdf2" or "midpoint".
         tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
         iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
@@ -71,7 +72,8 @@ def make_step(
         InputError: an unknown integrator or a number that is not positive; a step of "bdf2" also for a state without
             room for the state before.
     """
-    require_positive(dt=dt)
+    if not isinstance(dt, jax.core.Tracer):
+        require_positive(dt=dt)
     if integrator not in get_args(Integrator):
         raise InputError(f"integrator '{integrator}' is unknown; choose from {', '.join(get_args(Integrator))}")
     energies = incremental_potential(scene)
@@ -139,7 +141,7 @@ def _inertia(x: Corners, data: _Inertia) -> Float[Array, ""]:
     return 0.5 * data.weight * sum((coordinate - data.target[i]) ** 2 for i, coordinate in enumerate(x[0]))
 
 
-def _inertial_target(state: State, dt: float, integrator: str) -> tuple[Array, Array]:
+def _inertial_target(state: State, dt: Any, integrator: str) -> tuple[Array, Array]:
     """(h, y) of the minimisation."""
     x, v = state.x, state.v
     if integrator == "midpoint":
@@ -153,7 +155,7 @@ def _inertial_target(state: State, dt: float, integrator: str) -> tuple[Array, A
     return length, jnp.where(previous.known, two_steps, x + dt * v)
 
 
-def _span(dt: float, integrator: str, state: State) -> Array:
+def _span(dt: Any, integrator: str, state: State) -> Array:
     """Time in s from the state to the minimum."""
     return jnp.asarray(dt / 2 if integrator == "midpoint" else dt, state.x.dtype)
 
@@ -164,7 +166,7 @@ def _better(energies: tuple[ElementEnergy, ...], data: tuple[Any, ...], stay: Ar
     return jnp.where(lower, coast, stay)
 
 
-def _advance(state: State, x: Array, dt: float, integrator: str, free: np.ndarray) -> State:
+def _advance(state: State, x: Array, dt: Any, integrator: str, free: np.ndarray) -> State:
     before = state.previous
     if integrator == "midpoint":
         after, v = 2 * x - state.x, 4 / dt * (x - state.x) - state.v

@@ -134,7 +134,7 @@ def local(element: ElementEnergy, x: Blocks) -> Any:
 
 def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
     """Adds what the elements have at their corners to the blocks there."""
-    if corners.shape[2] == 1 and (corners[:, :, 0].T.ravel() == np.arange(components.size)).all():
+    if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):
         return components.T.reshape(corners.shape[:2])
     padding = components.size
     # Where each component goes; the transposed map reads there, where differentiation would scatter.

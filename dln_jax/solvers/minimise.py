@@ -9,6 +9,7 @@ that of the minimum and not of the iterations: one factorisation and one solve, 
 any order. A derivative at a point that is no minimum is NaN, never a plausible number.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -147,29 +148,35 @@ def _implicit_derivative(
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
     varying = [i for i, dot in enumerate(dots) if not _is_constant(dot)]
+    moving = not (at.free.all() or _is_constant(x0_dot))
 
-    def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
-        replaced = dict(zip(varying, given, strict=True))
-        return gradient(energies, at, x, structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(leaves)]))
+    # Reverse mode keeps the arguments and nothing else: reading back what could be kept takes longer than the work.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def response(x: Blocks, leaves: list[Array], given_dots: list[Array], fixed_dot: Any) -> Blocks:
+        data = structure.unflatten(leaves)
 
-    given, given_dots = [leaves[i] for i in varying], [dots[i] for i in varying]
-    if at.free.all() or _is_constant(x0_dot):
-        fixed_dot = jnp.zeros_like(x)
-        _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
-    else:
-        fixed_dot = jnp.where(at.free, 0, x0_dot)
-        _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
-    # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
-    constant_x, constant_data = jax.lax.stop_gradient((x, data))
-    factor = _factor(energies, at, solver, constant_x, constant_data)
+        def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
+            replaced = dict(zip(varying, given, strict=True))
+            all_leaves = [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
+            return gradient(energies, at, x, structure.unflatten(all_leaves))
 
-    def product(v: Blocks) -> Blocks:
-        masked = jnp.where(at.free, v, 0)
-        curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
-        return jnp.where(at.free, curved, v)
+        def product(v: Blocks) -> Blocks:
+            masked = jnp.where(at.free, v, 0)
+            curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
+            return jnp.where(at.free, curved, v)
 
-    solution = jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
-    return fixed_dot + solution
+        given = [leaves[i] for i in varying]
+        if moving:
+            _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
+        else:
+            _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
+        # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
+        factor = _factor(energies, at, solver, *jax.lax.stop_gradient((x, data)))
+        return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
+
+    fixed_dot = jnp.where(at.free, 0, x0_dot) if moving else None
+    solution = response(x, leaves, [dots[i] for i in varying], fixed_dot)
+    return solution if fixed_dot is None else solution + fixed_dot
 
 
 def _factor(energies: Sequence[ElementEnergy], at: Pattern, solver: LinearSolver, x: Blocks, data: Any) -> Any:

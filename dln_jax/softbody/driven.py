@@ -1,0 +1,81 @@
+"""Motions that are driven from outside: actuation of muscles, and held vertices that are led along a path.
+
+A path is followed exactly: in each step a held vertex has the velocity (p(t + dt) - p(t)) / dt, and not that of the path
+at t, with which a rotation would spiral outwards.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.scene import Params, Previous, SoftScene, State
+from dln_jax.softbody.step import Integrator, Step, make_step
+from dln_jax.solvers.minimise import Info
+
+Path = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k dim"]]
+Signal = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k"]]
+
+
+class Example(NamedTuple):
+    """A scene, how it begins, and what drives it."""
+
+    scene: SoftScene
+    state: State
+    dt: float
+    """Time step that suits it, in s."""
+    seconds: float
+    """Length of a motion that shows it, in s."""
+    ground: float | None = None
+    """Rise of the ground over its run; it passes through the origin. `None` where there is none."""
+    control: Signal | None = None
+    """Actuation at the times given, in s."""
+    held_path: Path | None = None
+    """Where held vertices are at the times given, in s; without it they stay."""
+    muscles: np.ndarray | None = None
+    """Pairs of vertices [k, 2], for pictures."""
+    moments: tuple[float, ...] = (0.0,)
+    """Times in s worth a picture."""
+
+
+class Drive(NamedTuple):
+    """What drives one step; leading axis for several."""
+
+    t: Float[Array, "*steps"]
+    """At the end of the step, in s."""
+    control: Float[Array, "*steps k"] | None
+    """Actuation there."""
+    held_velocity: Float[Array, "*steps k dim"] | None
+    """In m/s."""
+
+
+def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
+    """What drives so many steps of dt in s, from step number `first` on.
+
+    Held vertices get the velocities that take them from each point of their path to the next: they stay on it exactly.
+    """
+    t = dt * np.arange(first, first + steps + 1)
+    dtype = example.state.x.dtype
+    control = None if example.control is None else jnp.asarray(example.control(t[1:]), dtype)
+    velocity = None if example.held_path is None else jnp.asarray(np.diff(example.held_path(t), axis=0) / dt, dtype)
+    return Drive(jnp.asarray(t[1:], dtype), control, velocity)
+
+
+def driven_step(example: Example, dt: float, integrator: Integrator = "backward-euler") -> Step:
+    """step(state, params, Drive) -> (state, Info)."""
+    step = make_step(example.scene, dt, integrator)
+
+    def advance(state: State, params: Params, driven: Drive) -> tuple[State, Info]:
+        if driven.held_velocity is not None:
+            state = state._replace(v=state.v.at[example.scene.held].set(driven.held_velocity))
+        return step(state, params, driven.control)
+
+    return advance
+
+
+def beginning(example: Example, integrator: Integrator = "backward-euler") -> State:
+    """The state at the start, with room for the state before where the integrator needs it."""
+    x, v, _ = example.state
+    return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator == "bdf2" else None)

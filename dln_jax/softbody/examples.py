@@ -1,0 +1,233 @@
+"""Examples: bodies and what is done to them, ready to be stepped.
+
+| scene | body | what happens |
+|---|---|---|
+| beam | cantilever of 4 m, in the plane or in space | falls under its weight and swings |
+| twist | bar of 8 m in space | its ends are turned against each other, twice or more |
+| slope | block in the plane | slides down a plane of tan 0.5, or sticks, by Coulomb friction |
+| drop | disc, or box in space | falls on the ground and bounces |
+| creature | crawler with muscles | crawls, by a wave that runs from its head to its tail |
+
+The last axis points up. Materials are elastic (E in Pa, Poisson's ratio, a density of `strain_energies`); densities are
+1000 kg/m³. The creature is the published preset of `creature_terms`.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from dln_jax.softbody.contact import plane_contact
+from dln_jax.softbody.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.creatures import body_length, crawler
+from dln_jax.softbody.driven import Example
+from dln_jax.softbody.elasticity import elastic
+from dln_jax.softbody.gravity import gravity
+from dln_jax.softbody.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh_builders import beam as beam_mesh
+from dln_jax.softbody.mesh_builders import box, disc
+from dln_jax.softbody.scene import initial_state, make_scene
+from dln_jax.softbody.strain_energies import StrainEnergy, stable_neo_hookean
+from dln_jax.softbody.term import Term
+from dln_jax.types import InputError
+
+GRAVITY = 9.81
+"""In m/s²."""
+DENSITY = 1000.0
+"""In kg/m³."""
+SLOPE = 0.5
+"""Rise of the slope over its run."""
+DROP_SPEED = 2.0
+"""Of the falling body, to the right, in m/s."""
+TURNING = 4.0
+"""Seconds in which the bar's ends are turned."""
+WAVE_PERIOD = 0.33
+"""Of the creature's muscles, in s."""
+WAVE_LENGTH = 2.0
+"""In body lengths."""
+WAVE_DELAY = math.pi / 4
+"""Of the back behind the rest of the skin, in rad."""
+SHORTEST, LONGEST = 0.3, 1.0
+"""Actuation of the creature's muscles."""
+
+
+def beam(
+    *,
+    mesh: Mesh | None = None,
+    held: ArrayLike | None = None,
+    dimension: int = 2,
+    cells: int = 4,
+    youngs_modulus: float = 2e6,
+    poisson_ratio: float = 0.3,
+    strain_energy: StrainEnergy = stable_neo_hookean,
+) -> Example:
+    """A beam of 4 m x 1 m (x 1 m) with so many cells across, or a mesh of one's own, held on the left.
+
+    Held are the vertices given, or those of least x.
+    """
+    if mesh is None:
+        _require_dimension(dimension)
+        mesh = (
+            beam_mesh(4.0, 1.0, 4 * cells, cells) if dimension == 2 else box((4.0, 1.0, 1.0), (4 * cells, cells, cells))
+        )
+    if held is None:
+        left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
+        held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh))]
+    scene = make_scene(mesh, terms, density=DENSITY, held=held)
+    return Example(scene, initial_state(scene), dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
+
+
+def twist(
+    *,
+    cells: int = 3,
+    turns: float = 2.0,
+    youngs_modulus: float = 1e6,
+    poisson_ratio: float = 0.4,
+    strain_energy: StrainEnergy = stable_neo_hookean,
+) -> Example:
+    """A bar of 1 m x 8 m x 1 m whose ends are turned against each other about its axis, half of the turns each.
+
+    The turns take 4 s, then the ends are held for 1 s. There is no gravity, and no contact of the
+    bar with itself: beyond two turns it buckles, and can pass through itself.
+    """
+    mesh = box((1.0, 8.0, 1.0), (cells, 8 * cells, cells))
+    held = vertices_where(mesh, lambda x: (x[:, 1] == 0.0) | (x[:, 1] == 8.0))
+    scene = make_scene(mesh, [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio)], density=DENSITY, held=held)
+    x, y, z = (mesh.vertices[held] - [0.5, 0.0, 0.5]).T
+
+    def path(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k dim"]:
+        angle = 2 * np.pi * turns * np.minimum(t / TURNING, 1.0)[:, None] * np.where(y > 0, 0.5, -0.5)
+        across, up = np.cos(angle) * x + np.sin(angle) * z, np.cos(angle) * z - np.sin(angle) * x
+        return np.stack([0.5 + across, np.broadcast_to(y, angle.shape), 0.5 + up], axis=-1)
+
+    moments = (0.0, TURNING / 2, TURNING)
+    return Example(scene, initial_state(scene), dt=1 / 60, seconds=TURNING + 1.0, held_path=path, moments=moments)
+
+
+def slope(
+    *,
+    cells: int = 4,
+    friction: float = 0.3,
+    youngs_modulus: float = 1e6,
+    poisson_ratio: float = 0.3,
+    strain_energy: StrainEnergy = stable_neo_hookean,
+) -> Example:
+    """A block of 1 m x 0.5 m that lies on a plane of tan 0.5 which rises to the right: it slides if friction < 0.5."""
+    mesh = beam_mesh(1.0, 0.5, 2 * cells, cells)
+    along = np.array([1.0, SLOPE]) / math.hypot(1.0, SLOPE)
+    normal = np.array([-along[1], along[0]])
+    mesh = Mesh(mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal, mesh.elements)
+    ground = _ground(mesh, friction, height=0.5, normal=normal)
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh)), ground]
+    scene = make_scene(mesh, terms, density=DENSITY)
+    return Example(
+        scene, initial_state(scene), dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0)
+    )
+
+
+def drop(
+    *,
+    mesh: Mesh | None = None,
+    dimension: int = 2,
+    cells: int = 5,
+    friction: float = 0.5,
+    youngs_modulus: float = 3e5,
+    poisson_ratio: float = 0.3,
+    strain_energy: StrainEnergy = stable_neo_hookean,
+    seed: int = 0,
+) -> Example:
+    """A body that falls from its own height with 2 m/s to the right, turning by a rate the seed decides (±1 rad/s).
+
+    A disc of radius 0.5 m with so many rings, a box of 1 m in space, which the seed also tilts, or one's own mesh,
+    lifted or lowered to that height as it is.
+    """
+    random = np.random.default_rng(seed)
+    if mesh is None:
+        _require_dimension(dimension)
+        mesh = disc(0.5, cells) if dimension == 2 else _tilted(box((1.0, 1.0, 1.0), (cells, cells, cells)), random)
+    height = float(np.ptp(mesh.vertices[:, -1]))
+    lift = np.zeros(mesh.dimension)
+    lift[-1] = height - mesh.vertices[:, -1].min()
+    mesh = Mesh(mesh.vertices + lift, mesh.elements)
+    ground = _ground(mesh, friction, height=height, normal=-np.array(_down(mesh)) / GRAVITY)
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh)), ground]
+    scene = make_scene(mesh, terms, density=DENSITY)
+    arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
+    v = np.zeros_like(arms)
+    v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
+    v *= random.uniform(-1.0, 1.0)
+    v[:, 0] += DROP_SPEED
+    return Example(
+        scene, initial_state(scene, v=v), dt=1 / 200, seconds=2.5, ground=0.0, moments=(0.0, 0.3, 0.52, 0.9, 1.25)
+    )
+
+
+def creature() -> Example:
+    """The crawler, whose muscles shorten in a wave from its head to its tail, which pushes it forwards."""
+    body = crawler()
+    scene = make_scene(body.mesh, creature_terms(body.mesh, body.muscles), masses=MASS)
+    x, y = body.mesh.vertices[body.muscles].mean(axis=1).T
+    phase = 2 * np.pi * x / (WAVE_LENGTH * body_length(body)) - WAVE_DELAY * (y > 0.75 * body.mesh.vertices[:, 1].max())
+    mean, amplitude = (LONGEST + SHORTEST) / 2, (LONGEST - SHORTEST) / 2
+
+    def control(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k"]:
+        return mean + amplitude * np.sin(2 * np.pi * t[:, None] / WAVE_PERIOD + phase)
+
+    return Example(
+        scene,
+        initial_state(scene),
+        dt=TIME_STEP,
+        seconds=6.0,
+        ground=0.0,
+        control=control,
+        muscles=body.muscles,
+        moments=(0.0, 3.0, 6.0),
+    )
+
+
+EXAMPLES: dict[str, Callable[..., Example]] = {
+    "beam": beam,
+    "twist": twist,
+    "slope": slope,
+    "drop": drop,
+    "creature": creature,
+}
+"""By name; their keyword arguments are what can be chosen."""
+
+
+def _solid(mesh: Mesh, density: StrainEnergy, youngs_modulus: float, poisson_ratio: float) -> Term:
+    return elastic(mesh, density, youngs_modulus=youngs_modulus, poisson_ratio=poisson_ratio)
+
+
+def _down(mesh: Mesh) -> tuple[float, ...]:
+    return (*(0.0,) * (mesh.dimension - 1), -GRAVITY)
+
+
+def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:
+    """A plane so stiff that a single vertex that carries the whole body sinks a thousandth of its height."""
+    weight = GRAVITY * float(lumped_masses(mesh, DENSITY).sum())
+    return plane_contact(
+        np.arange(len(mesh.vertices)),
+        normal=normal,
+        stiffness=1e3 * weight / height,
+        width=1e-3 * height,
+        friction=friction,
+        name="ground",
+    )
+
+
+def _tilted(mesh: Mesh, random: np.random.Generator) -> Mesh:
+    """Turned by a random rotation of at most about half a radian."""
+    axis = 0.25 * random.normal(size=3)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    # Cayley's transform of a skew matrix is a rotation.
+    rotation = np.linalg.solve(np.eye(3) - skew / 2, np.eye(3) + skew / 2)
+    return Mesh(mesh.vertices @ rotation.T, mesh.elements)
+
+
+def _require_dimension(dimension: int) -> None:
+    if dimension not in (2, 3):
+        raise InputError(f"dimension is {dimension}; expected 2 or 3")
