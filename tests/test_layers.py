@@ -18,6 +18,7 @@ FLOORS = {
     "learning": 4,
     "evaluation": 5,
     "deploy": 5,
+    "locomotion": 5,
     "__init__": 6,  # the public names, gathered from every floor
 }
 MODULES = sorted((ROOT / "dln_jax").rglob("*.py"))

@@ -1,0 +1,49 @@
+"""The task as a `gymnasium.Env`, for other libraries' learners: NumPy in float32, actions in [-1, 1]."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.locomotion.task import FALLEN, Task, actuation_of, advance, beginning, observe
+
+
+class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One creature: an action in [-1, 1] per muscle is an actuation in [0.25, 1], the reward is that of the task.
+
+    An episode is truncated after the task's number of steps. It is terminated by a fall, and by a step of the simulator
+    that does not converge, which `info["converged"]` tells apart.
+    """
+
+    def __init__(self, task: Task):
+        self.task = task
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
+        self._start = beginning(task)
+        self._place = self._start
+        self._advance = jax.jit(lambda place, action: advance(task, place, actuation_of(action)))
+        self._observe = jax.jit(lambda place: observe(task, place))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
+        """The observation of the rest shape at rest; nothing is random."""
+        super().reset(seed=seed, options=options)
+        self._place = self._start
+        return self._observation(), {}
+
+    def step(
+        self, action: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
+        """Observation, reward, terminated, truncated, and `info` with "x" [n, 2] in m and "converged"."""
+        self._place, seen = self._advance(self._place, np.asarray(action, self._place.state.x.dtype))
+        converged = bool(seen.converged)
+        terminated = not converged or abs(float(seen.tilt)) > FALLEN
+        truncated = int(self._place.steps) >= self.task.episode
+        info = {"x": np.asarray(seen.x), "converged": converged}
+        return self._observation(), float(seen.reward), terminated, truncated, info
+
+    def _observation(self) -> Float[np.ndarray, " o"]:
+        return np.asarray(self._observe(self._place), np.float32)

@@ -1,0 +1,99 @@
+"""Evolution strategy with antithetic sampling and ranks (Salimans et al. 2017; Wierstra et al. 2014).
+
+    g = 1 / (2 n sigma) sum_i (u_i+ - u_i-) eps_i,    eps_i ~ N(0, I)
+
+u± are the fitnesses of theta ± sigma eps_i, or their centred ranks in [-1/2, 1/2], which no outlier can sway. With
+fitnesses and many pairs g is the gradient of E[f(theta + sigma eps)], and of f where f is quadratic.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from dln_jax.locomotion.learning import Learner
+from dln_jax.locomotion.policy import Policy
+from dln_jax.locomotion.task import Task, run_episode
+from dln_jax.types import require_positive
+
+
+class EvolutionSettings(NamedTuple):
+    """How the strategy searches; the same for all creatures and seeds."""
+
+    pairs: int = 16
+    """n; a generation is 2 n episodes."""
+    deviation: float = 0.2
+    """sigma."""
+    learning_rate: float = 0.2
+    """Of Adam."""
+    generations: int = 1
+    """Between two evaluations."""
+
+
+class EvolutionState(NamedTuple):
+    """Where the search is."""
+
+    parameters: Any
+    """Of the policy, as a vector [p]."""
+    optimiser: Any
+    seed: Int[Array, ""]
+    generation: Int[Array, ""]
+    skipped: Int[Array, ""]
+
+
+def estimate(
+    plus: Float[Array, " n"], minus: Float[Array, " n"], noise: Float[Array, "n p"], deviation: float
+) -> Float[Array, " p"]:
+    """g of the fitnesses, or ranks, of theta + sigma eps and theta - sigma eps."""
+    return (plus - minus) @ noise / (2.0 * deviation * len(noise))
+
+
+def centred_ranks(fitness: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Places in ascending order, from -1/2 to 1/2; what is not a number comes first."""
+    order = jnp.argsort(jnp.argsort(jnp.where(jnp.isnan(fitness), -jnp.inf, fitness)))
+    return order / (len(fitness) - 1) - 0.5
+
+
+def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettings = EvolutionSettings()) -> Learner:  # noqa: B008
+    """The learner; episodes with a step that does not converge rank last and count as skipped."""
+    require_positive(**settings._asdict())
+    like, unravel = _flat(policy, 0)
+    optimiser = optax.adam(settings.learning_rate)
+
+    def start(seed: int) -> EvolutionState:
+        parameters, _ = _flat(policy, seed)
+        zero = jnp.asarray(0)
+        return EvolutionState(parameters, optimiser.init(parameters), jnp.asarray(seed), zero, zero)
+
+    def fitness(parameters: Float[Array, " p"]) -> Float[Array, ""]:
+        return run_episode(task, lambda seen: policy.apply(unravel(parameters), seen)).total_reward
+
+    def generation(state: EvolutionState, _: None) -> tuple[EvolutionState, None]:
+        key = jax.random.fold_in(jax.random.key(state.seed), state.generation)
+        noise = jax.random.normal(key, (settings.pairs, *like.shape), like.dtype)
+        moves = settings.deviation * jnp.concatenate([noise, -noise])
+        found = jax.vmap(fitness)(state.parameters + moves)
+        plus, minus = jnp.split(centred_ranks(found), 2)
+        gradient = estimate(plus, minus, noise, settings.deviation)
+        change, moments = optimiser.update(-gradient, state.optimiser, state.parameters)
+        skipped = state.skipped + jnp.isnan(found).sum()
+        return EvolutionState(
+            optax.apply_updates(state.parameters, change), moments, state.seed, state.generation + 1, skipped
+        ), None
+
+    return Learner(
+        policy=policy,
+        start=start,
+        improve=lambda state: jax.lax.scan(generation, state, length=settings.generations)[0],
+        parameters=lambda state: unravel(state.parameters),
+        skipped=lambda state: state.skipped,
+        steps=settings.generations * 2 * settings.pairs * task.episode,
+    )
+
+
+def _flat(policy: Policy, seed: int) -> tuple[Any, Any]:
+    """First parameters as a vector, and the way back."""
+    return ravel_pytree(policy.init(jax.random.key(seed)))

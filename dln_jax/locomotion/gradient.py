@@ -1,0 +1,111 @@
+"""Short-horizon gradients through the simulator, of a smoothed objective.
+
+    J(theta) = E[ reward of a window of H steps under theta + sigma eps ],    eps ~ N(0, I)
+
+Each lane walks H steps from where its last window ended, with parameters of its own; gradients go back to the beginning
+of the window and no further, so that they neither explode nor vanish over the length of an episode (Xu et al. 2022,
+"Accelerated policy learning with parallel differentiable simulation"). Windows are longer than the clock's period, so
+that what a step does for the next stride is seen and no value function is needed. Lanes come in pairs, +eps and -eps.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Int
+
+from dln_jax.locomotion.learning import Learner, chosen, finite
+from dln_jax.locomotion.policy import Parameters, Policy
+from dln_jax.locomotion.task import FALLEN, Place, Task, beginning, walk
+from dln_jax.types import InputError, require_positive
+
+
+class GradientSettings(NamedTuple):
+    """How gradients are taken and followed."""
+
+    window: int = 40
+    """Steps that gradients go back; divides the episode."""
+    pairs: int = 1
+    """Half of the number of lanes."""
+    deviation: float = 0.01
+    """sigma; 0 takes the plain objective."""
+    learning_rate: float = 0.02
+    """Of Adam, after clipping the gradient's norm at 1 body length per episode."""
+    updates: int = 5
+    """Between two evaluations."""
+
+
+class GradientState(NamedTuple):
+    """Where learning is."""
+
+    parameters: Parameters
+    optimiser: Any
+    lanes: Place
+    """Of each lane."""
+    seed: Int[Array, ""]
+    updates: Int[Array, ""]
+    skipped: Int[Array, ""]
+
+
+def make_gradient_learner(task: Task, policy: Policy, settings: GradientSettings = GradientSettings()) -> Learner:  # noqa: B008
+    """The learner.
+
+    Raises:
+        InputError: a window that does not divide the episode, or a number that is not positive.
+    """
+    lanes, window = 2 * settings.pairs, settings.window
+    require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
+    if task.episode % window:
+        raise InputError(f"a window has {window} steps; expected a divisor of the episode's {task.episode}")
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
+
+    def start(seed: int) -> GradientState:
+        parameters = policy.init(jax.random.key(seed))
+        # Lanes are in different parts of the episode, so that every update sees several.
+        counts = jnp.arange(lanes) * window % task.episode
+        places = jax.vmap(lambda steps: beginning(task)._replace(steps=steps))(counts)
+        zero = jnp.asarray(0)
+        return GradientState(parameters, optimiser.init(parameters), places, jnp.asarray(seed), zero, zero)
+
+    def loss(parameters: Parameters, noise: Parameters, places: Place) -> tuple[Array, Any]:
+        def lane(sign: Array, noise: Parameters, place: Place) -> tuple[Array, Any]:
+            own = jax.tree.map(lambda p, eps: p + sign * settings.deviation * eps, parameters, noise)
+            end, seen = walk(task, lambda observation: policy.apply(own, observation), place, window)
+            usable = seen.converged.all() & (jnp.abs(seen.tilt[-1]) < FALLEN)
+            return seen.reward.sum() * task.episode / window, (end, usable)
+
+        signs = jnp.tile(jnp.asarray([1.0, -1.0]), settings.pairs)
+        rewards, after = jax.vmap(lane)(signs, noise, places)
+        return -rewards.mean(), after
+
+    def update(state: GradientState, _: None) -> tuple[GradientState, None]:
+        key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
+        noise = _pairs_of_noise(key, state.parameters, settings.pairs)
+        gradient, (ends, usable_ends) = jax.grad(loss, has_aux=True)(state.parameters, noise, state.lanes)
+        # A step that does not converge has NaN for a gradient.
+        usable = finite(gradient)
+        change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
+        moved = optax.apply_updates(state.parameters, change)
+        parameters, moments = chosen(usable, (moved, moments), (state.parameters, state.optimiser))
+        over = (ends.steps >= task.episode) | ~usable_ends
+        lanes = jax.vmap(lambda over, end: chosen(over, beginning(task), end))(over, ends)
+        skipped = state.skipped + (~usable).astype(state.skipped.dtype)
+        return GradientState(parameters, moments, lanes, state.seed, state.updates + 1, skipped), None
+
+    return Learner(
+        policy=policy,
+        start=start,
+        improve=lambda state: jax.lax.scan(update, state, length=settings.updates)[0],
+        parameters=lambda state: state.parameters,
+        skipped=lambda state: state.skipped,
+        steps=settings.updates * lanes * window,
+    )
+
+
+def _pairs_of_noise(key: Array, like: Parameters, pairs: int) -> Parameters:
+    """The same normal numbers for the two lanes of each pair."""
+    leaves, structure = jax.tree.flatten(like)
+    keys = jax.random.split(key, len(leaves))
+    drawn = [jax.random.normal(k, (pairs, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]
+    return structure.unflatten([jnp.repeat(noise, 2, axis=0) for noise in drawn])

@@ -1,0 +1,184 @@
+"""What the ways of learning share: learn, evaluate, record, until a distance or a number of environment steps.
+
+An environment step is one step of the simulator for one creature. Those of evaluations are counted apart; every way of
+learning is evaluated alike, by one episode from rest, after each call of `improve` or each update of PPO.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dln_jax.learning import checkpoints
+from dln_jax.learning.runs import has_checkpoint
+from dln_jax.locomotion.policy import Parameters, Policy
+from dln_jax.locomotion.task import Task, run_episode
+from dln_jax.types import InputError
+
+CHECKPOINT = "checkpoint"
+"""Beginning of the names of the files from which a seed can continue."""
+
+# Compiles in half the time what then runs for a few seconds, and no slower.
+_QUICKLY: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
+
+
+class Record(NamedTuple):
+    """One evaluation."""
+
+    steps: int
+    """Environment steps of learning so far."""
+    seconds: float
+    """Wall time so far: compilation, learning and evaluation, interruptions apart."""
+    distance: float
+    """Body lengths in one episode from rest."""
+    skipped: int
+    """Updates so far that were left out because a step of the simulator did not converge."""
+
+
+class Learner(NamedTuple):
+    """A way of learning."""
+
+    policy: Policy
+    start: Callable[[int], Any]
+    """Seed -> state, a tree of arrays."""
+    improve: Callable[[Any], Any]
+    """State -> state after some updates, traceable."""
+    parameters: Callable[[Any], Parameters]
+    """Of the policy in a state."""
+    skipped: Callable[[Any], Any]
+    """Updates that a state has left out."""
+    steps: int
+    """Environment steps that `improve` takes."""
+
+
+class Compiled(NamedTuple):
+    """A learner with its programs, for any number of seeds."""
+
+    learner: Learner
+    improve: Callable[[Any], Any]
+    evaluate: Callable[[Parameters], Any]
+    episode: int
+    seconds: float
+    """That compiling took."""
+
+
+class Learned(NamedTuple):
+    """What learning gives."""
+
+    parameters: Parameters
+    """Those that went farthest in an evaluation."""
+    records: list[Record]
+    compile_seconds: float
+    evaluation_steps: int
+    """Environment steps of evaluations."""
+
+    @property
+    def distance(self) -> float:
+        """The farthest, in body lengths."""
+        return max((r.distance for r in self.records if math.isfinite(r.distance)), default=math.nan)
+
+
+class Goal(NamedTuple):
+    """When learning ends."""
+
+    steps: int
+    """Environment steps; the last update may exceed it."""
+    distance: float = math.inf
+    """Body lengths."""
+
+
+Report = Callable[[Record], None]
+
+
+def compile_learner(task: Task, learner: Learner) -> Compiled:
+    """Compiles what a learner runs."""
+    began = time.perf_counter()
+    state = jax.eval_shape(lambda: learner.start(0))
+    improve = jax.jit(learner.improve).lower(state).compile(_QUICKLY)
+    evaluate = compile_evaluation(task, learner.policy, jax.eval_shape(learner.parameters, state))
+    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)
+
+
+def compile_evaluation(task: Task, policy: Policy, parameters: Parameters) -> Callable[[Parameters], Any]:
+    """Parameters -> body lengths in one episode from rest."""
+    judge = jax.jit(lambda parameters: run_episode(task, lambda seen: policy.apply(parameters, seen)).distance)
+    return judge.lower(parameters).compile(_QUICKLY)
+
+
+def learn(
+    compiled: Compiled,
+    *,
+    seed: int,
+    goal: Goal,
+    directory: Path | None = None,
+    settings: dict[str, Any] | None = None,
+    resume: bool = False,
+    report: Report = lambda record: None,
+) -> Learned:
+    """Learns until the goal; with a directory, stores every evaluation's state there and can continue bit for bit.
+
+    Args:
+        compiled: by `compile_learner`.
+        seed: decides everything random.
+        goal: when to end.
+        directory: an existing folder for checkpoints.
+        settings: JSON values that decide the result; a stored run of others is not continued.
+        resume: continue the run in the directory, if it has come to a first checkpoint.
+        report: called after every evaluation.
+
+    Raises:
+        InputError: the stored run had other settings, or its files are damaged.
+    """
+    learner, name = compiled.learner, f"{CHECKPOINT}-{seed}"
+    identity = {"settings": {**(settings or {}), "seed": seed}}
+    state = learner.start(seed)
+    best, records = learner.parameters(state), []
+    if resume and directory is not None and has_checkpoint(directory, name):
+        (state, best), records = _restored(directory, name, identity, (state, best))
+    farthest = max((record.distance for record in records), default=-math.inf)
+    before = records[-1].seconds if records else compiled.seconds
+    began = time.perf_counter()
+    while not reached(records, goal):
+        state = compiled.improve(state)
+        distance = float(compiled.evaluate(learner.parameters(state)))
+        if distance > farthest:
+            farthest, best = distance, learner.parameters(state)
+        steps = (records[-1].steps if records else 0) + learner.steps
+        seconds = before + time.perf_counter() - began
+        records.append(Record(steps, seconds, distance, int(learner.skipped(state))))
+        if directory is not None:
+            stored = {**identity, "records": [_json(record) for record in records]}
+            checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
+        report(records[-1])
+    return Learned(best, records, compiled.seconds, len(records) * compiled.episode)
+
+
+def finite(tree: Any) -> Any:
+    """Whether every number of a tree is."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+
+
+def chosen(condition: Any, new: Any, old: Any) -> Any:
+    """One of two trees."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+
+
+def reached(records: list[Record], goal: Goal) -> bool:
+    """Whether the last evaluation is the last of all."""
+    return bool(records) and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)
+
+
+def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -> tuple[Any, list[Record]]:
+    manifest = checkpoints.load_manifest(directory, name)
+    if manifest.get("settings") != identity["settings"]:
+        raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
+    records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in manifest["records"]]
+    return checkpoints.load_tree(directory, name, like), records
+
+
+def _json(record: Record) -> list[Any]:
+    return [value if math.isfinite(value) else None for value in record]

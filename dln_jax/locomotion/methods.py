@@ -1,0 +1,117 @@
+"""The ways of learning by name, and several seeds of one of them."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
+from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
+from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn
+from dln_jax.locomotion.policy import WIDTH, Parameters, Policy, make_policy
+from dln_jax.locomotion.ppo import PPOSettings, learn_ppo, make_actor
+from dln_jax.locomotion.task import Task, Walk, beginning, walk
+from dln_jax.types import InputError
+
+Method = Literal["gradient", "evolution", "ppo"]
+METHODS: tuple[Method, ...] = get_args(Method)
+SETTINGS: dict[str, Any] = {"gradient": GradientSettings(), "evolution": EvolutionSettings(), "ppo": PPOSettings()}
+WINDOWS = {"crawler": 40, "biped": 80, "quadruped": 40}
+"""Steps that gradients go back, by creature: balance on two legs takes the whole episode."""
+STEPS = {"gradient": 40_000, "evolution": 500_000, "ppo": 300_000}
+"""Environment steps by default."""
+
+Report = Callable[[int, Record], None]
+
+
+class Trained(NamedTuple):
+    """Several seeds of one way of learning."""
+
+    policy: Policy
+    learned: list[Learned]
+
+    @property
+    def best(self) -> Learned:
+        """The seed that went farthest."""
+        return max(self.learned, key=lambda of: of.distance if np.isfinite(of.distance) else -np.inf)
+
+
+def train(
+    task: Task,
+    method: Method,
+    *,
+    seeds: Sequence[int],
+    goal: Goal,
+    width: int = WIDTH,
+    window: int | None = None,
+    directory: Path | None = None,
+    resume: bool = False,
+    report: Report = lambda seed, record: None,
+) -> Trained:
+    """Learns with each seed; settings are the same for all seeds and, but for the window, for all creatures.
+
+    Args:
+        task: what is learned.
+        method: "gradient", "evolution" or "ppo".
+        seeds: one after the other; programs are compiled once.
+        goal: when each ends.
+        width: of the hidden layer of a policy that is learned by gradients or evolution.
+        window: steps that gradients go back (default: those of `WINDOWS`).
+        directory: where gradients and evolution store their states.
+        resume: continue what is stored there.
+        report: called with seed and record after every evaluation.
+
+    Raises:
+        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings.
+    """
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
+    if method == "ppo":
+        if resume:
+            raise InputError("runs of ppo are not stored on their way; train again without --resume")
+        actor = make_actor(task)
+        return Trained(actor, [learn_ppo(task, seed=s, goal=goal, report=_of(report, s)) for s in seeds])
+    policy = make_policy(task, width=width)
+    if method == "gradient":
+        chosen = settings_of(method, task.creature.name, window)
+        learner = make_gradient_learner(task, policy, chosen)
+    else:
+        chosen = settings_of(method, task.creature.name)
+        learner = make_evolution_learner(task, policy, chosen)
+    compiled = compile_learner(task, learner)
+    settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
+    settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
+    settings |= chosen._asdict()
+    runs = [
+        learn(
+            compiled,
+            seed=seed,
+            goal=goal,
+            directory=directory,
+            settings=settings,
+            resume=resume,
+            report=_of(report, seed),
+        )
+        for seed in seeds
+    ]
+    return Trained(policy, runs)
+
+
+def settings_of(method: Method, creature: str, window: int | None = None) -> Any:
+    """Settings of a method for a creature; only the window of gradients depends on it."""
+    if method != "gradient":
+        return SETTINGS[method]
+    return SETTINGS[method]._replace(window=window or WINDOWS.get(creature, GradientSettings().window))
+
+
+def shown_walk(task: Task, policy: Policy, parameters: Parameters, steps: int) -> Walk:
+    """What a policy does from rest, as NumPy arrays."""
+    program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), beginning(task), steps)[1])
+    return jax.tree.map(np.asarray, program(jax.tree.map(jnp.asarray, parameters)))
+
+
+def _of(report: Report, seed: int) -> Callable[[Record], None]:
+    return lambda record: report(seed, record)

@@ -1,0 +1,127 @@
+"""Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3, with its actor as a policy of this package.
+
+The actor is a network of two tanh layers; its mean in [-1, 1] is an actuation in [0.25, 1].
+"""
+
+import importlib.util
+import math
+import time
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.locomotion.learning import Goal, Learned, Record, Report, compile_evaluation, reached
+from dln_jax.locomotion.policy import Parameters, Policy
+from dln_jax.locomotion.task import Task, actuation_of
+from dln_jax.softbody.creature_terms import TIME_STEP
+from dln_jax.types import InputError
+
+_ACTOR = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")
+
+
+class PPOSettings(NamedTuple):
+    """Hyperparameters; the same for all creatures and seeds."""
+
+    lanes: int = 16
+    steps: int = 80
+    """Of each lane between two updates."""
+    batch: int = 256
+    epochs: int = 10
+    learning_rate: float = 1e-3
+    discount: float = 0.98
+    trace: float = 0.95
+    """lambda of generalised advantage estimation."""
+    clip: float = 0.2
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    deviation: float = 0.6
+    """Of the actions at first."""
+    width: int = 64
+    """Of the two hidden layers, of actor and critic."""
+
+
+def require_stable_baselines3() -> None:
+    """Raises `InputError` where stable-baselines3 is not installed."""
+    if importlib.util.find_spec("stable_baselines3") is None:
+        raise InputError("--method ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
+
+
+def make_actor(task: Task) -> Policy:
+    """The actor's mean as a policy; parameters are "w" and "b" of each layer, without an initialisation."""
+    sizes = (task.observation_size, task.muscle_count)
+
+    def apply(parameters: Parameters, observation: Float[Array, " o"]) -> Float[Array, " k"]:
+        h = observation.astype(parameters[0]["w"].dtype)
+        for layer in parameters[:-1]:
+            h = jnp.tanh(layer["w"] @ h + layer["b"])
+        mean = parameters[-1]["w"] @ h + parameters[-1]["b"]
+        return actuation_of(mean).astype(observation.dtype)
+
+    def init(key: Array) -> Parameters:
+        raise InputError(f"an actor of {sizes} is trained by stable-baselines3, which initialises it")
+
+    return Policy(init, apply)
+
+
+def actor_parameters(model: Any) -> Parameters:
+    """Of `make_actor`, from a stable-baselines3 model."""
+    stored = model.policy.state_dict()
+    return tuple(
+        {"w": jnp.asarray(stored[f"{name}.weight"].numpy()), "b": jnp.asarray(stored[f"{name}.bias"].numpy())}
+        for name in _ACTOR
+    )
+
+
+def learn_ppo(
+    task: Task,
+    *,
+    seed: int,
+    goal: Goal,
+    settings: PPOSettings = PPOSettings(),  # noqa: B008
+    report: Report = lambda record: None,
+) -> Learned:
+    """Learns until the goal, and is evaluated after every update by an episode of the actor's mean from rest.
+
+    Raises:
+        InputError: stable-baselines3 is not installed.
+    """
+    require_stable_baselines3()
+    import torch
+    from stable_baselines3 import PPO
+
+    from dln_jax.locomotion.vector_environment import VectorEnvironment
+
+    began = time.perf_counter()
+    # Networks this small are slower on several threads.
+    torch.set_num_threads(1)
+    # Body lengths per second: rewards of a size that suits the critic.
+    lanes = VectorEnvironment(task, settings.lanes, reward_scale=1.0 / TIME_STEP)
+    model = PPO(
+        "MlpPolicy",
+        lanes,
+        n_steps=settings.steps,
+        batch_size=settings.batch,
+        n_epochs=settings.epochs,
+        learning_rate=settings.learning_rate,
+        gamma=settings.discount,
+        gae_lambda=settings.trace,
+        clip_range=settings.clip,
+        ent_coef=settings.entropy,
+        policy_kwargs={"net_arch": [settings.width] * 2, "log_std_init": math.log(settings.deviation)},
+        seed=seed,
+        device="cpu",
+    )
+    evaluate = compile_evaluation(task, make_actor(task), actor_parameters(model))
+    compile_seconds = time.perf_counter() - began
+    best, records = actor_parameters(model), []
+    farthest = -math.inf
+    while not reached(records, goal):
+        model.learn(settings.steps * settings.lanes, reset_num_timesteps=not records)
+        parameters = actor_parameters(model)
+        distance = float(evaluate(parameters))
+        if distance > farthest:
+            farthest, best = distance, parameters
+        records.append(Record(int(model.num_timesteps), time.perf_counter() - began, distance, 0))
+        report(records[-1])
+    return Learned(best, records, compile_seconds, len(records) * task.episode)

@@ -1,0 +1,188 @@
+"""The task: a creature at rest on the ground goes as far along x as it can within an episode, and does not fall.
+
+    observation = [(x - x_rest) / (0.1 L) relative to the mean x, v / (L / 1 s), sin 2 pi t / P, cos 2 pi t / P]
+    reward of a step = change of mean x / L - w posture / T
+    posture = 1 - cos tilt + (max(0, 0.8 - h / h_rest) / 0.2)²
+
+L is the creature's body length, t the time since the episode of T steps began, and P the period of the clock. Heights
+are those above the ground; along the ground only positions relative to the mean x are seen, so that places are alike.
+h is the mean height, and the tilt that of the rotation which takes the rest shape nearest to the body (Procrustes). A
+body that has tilted by more than 1 rad has fallen, and what it travels from then on does not count: tall bodies would
+go far by rolling.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.softbody.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.creatures import Creature, biped, body_length, crawler, quadruped
+from dln_jax.softbody.scene import SoftScene, State, initial_state, make_scene
+from dln_jax.softbody.step import Step, make_step
+from dln_jax.types import InputError, require_positive
+
+CREATURES: dict[str, Callable[[], Creature]] = {"crawler": crawler, "biped": biped, "quadruped": quadruped}
+EPISODE = 80
+"""Steps of an episode."""
+CLOCK_PERIOD = 16.0
+"""Steps of one turn of the clock."""
+SHORTEST = 0.25
+"""Least actuation: length of a muscle relative to its rest length; the greatest is 1."""
+POSITION_UNIT = 0.1
+"""In body lengths."""
+UPRIGHT = 4.0
+"""w, in body lengths per episode."""
+CROUCHED = 0.8
+"""Mean height, relative to that at rest, below which crouching costs."""
+FALLEN = 1.0
+"""Tilt in rad."""
+
+Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
+"""Observation -> actuation."""
+
+
+class Task(NamedTuple):
+    """A creature and how it is stepped."""
+
+    creature: Creature
+    scene: SoftScene
+    step: Step
+    length: float
+    """Body length in m."""
+    episode: int
+    """Steps."""
+    clock_period: float
+    """Steps."""
+    upright: float
+    """w of the reward, in body lengths per episode."""
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in an observation."""
+        return 2 * self.creature.mesh.vertices.size + 2
+
+    @property
+    def muscle_count(self) -> int:
+        """Numbers in an actuation."""
+        return len(self.creature.muscles)
+
+
+class Place(NamedTuple):
+    """Where an episode is."""
+
+    state: State
+    steps: Int[Array, ""]
+    """Since its beginning."""
+
+
+class Walk(NamedTuple):
+    """What is seen of each of T steps."""
+
+    x: Float[Array, "T n 2"]
+    """Positions after it, in m."""
+    actuation: Float[Array, "T k"]
+    converged: Bool[Array, " T"]
+    reward: Float[Array, " T"]
+    """In body lengths."""
+    tilt: Float[Array, " T"]
+    """In rad."""
+
+
+def make_task(
+    creature: Creature, *, episode: int = EPISODE, clock_period: float = CLOCK_PERIOD, upright: float = UPRIGHT
+) -> Task:
+    """The task of a creature of the "creature" preset, stepped at its published time step."""
+    require_positive(episode=episode, clock_period=clock_period)
+    scene = make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles), masses=MASS)
+    step = make_step(scene, TIME_STEP)
+    return Task(creature, scene, step, body_length(creature), episode, clock_period, upright)
+
+
+def creature_named(name: str) -> Creature:
+    """The creature of a name; `InputError` lists the names."""
+    if name not in CREATURES:
+        raise InputError(f"creature '{name}' is unknown; choose from {', '.join(CREATURES)}")
+    return CREATURES[name]()
+
+
+def beginning(task: Task) -> Place:
+    """The creature's rest shape at rest."""
+    return Place(initial_state(task.scene), jnp.asarray(0))
+
+
+def observe(task: Task, place: Place) -> Float[Array, " o"]:
+    """The observation of the module's heading."""
+    rest = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype)
+    moved = place.state.x - rest
+    moved = moved.at[:, 0].add(-moved[:, 0].mean()) / (POSITION_UNIT * task.length)
+    angle = 2.0 * jnp.pi / task.clock_period * place.steps.astype(moved.dtype)
+    clock = jnp.stack([jnp.sin(angle), jnp.cos(angle)])
+    return jnp.concatenate([moved.ravel(), place.state.v.ravel() / task.length, clock])
+
+
+def advance(task: Task, place: Place, actuation: Float[Array, " k"]) -> tuple[Place, Walk]:
+    """The place after one step, and what is seen of the step."""
+    state, info = task.step(place.state, task.scene.params, actuation)
+    after = Place(state, place.steps + 1)
+    cost, angle = _posture(task, state.x)
+    reward = travelled(task, place, after) - task.upright * cost / task.episode
+    return after, Walk(state.x, actuation, info.converged, reward, angle)
+
+
+def walk(task: Task, act: Act, start: Place, steps: int) -> tuple[Place, Walk]:
+    """Steps of a policy from a place."""
+
+    def one(place: Place, _: None) -> tuple[Place, Walk]:
+        return advance(task, place, act(observe(task, place)))
+
+    return jax.lax.scan(one, start, length=steps)
+
+
+def travelled(task: Task, start: Place, end: Place) -> Float[Array, ""]:
+    """Change of the mean x, in body lengths."""
+    return (end.state.x[:, 0].mean() - start.state.x[:, 0].mean()) / task.length
+
+
+class Episode(NamedTuple):
+    """What an episode from rest comes to; NaN where a step did not converge."""
+
+    distance: Float[Array, ""]
+    """Body lengths before the fall, if there is one: what policies are judged by."""
+    total_reward: Float[Array, ""]
+    """Before the fall."""
+
+
+def run_episode(task: Task, act: Act) -> Episode:
+    """One episode from rest."""
+    start = beginning(task)
+    _, seen = walk(task, act, start, task.episode)
+    return judged(task, start, seen)
+
+
+def judged(task: Task, start: Place, seen: Walk) -> Episode:
+    """What the steps of an episode come to."""
+    before_fall = jnp.cumsum(jnp.abs(seen.tilt) > FALLEN) == 0
+    means = jnp.concatenate([start.state.x[None, :, 0], seen.x[:, :, 0]]).mean(axis=1)
+    distance = (before_fall * jnp.diff(means)).sum() / task.length
+    usable = jnp.where(seen.converged.all(), 1.0, jnp.nan)
+    return Episode(usable * distance, usable * (before_fall * seen.reward).sum())
+
+
+def actuation_of(command: Float[Array, "*k"] | Float[np.ndarray, "*k"]) -> Float[Array, "*k"]:
+    """Actuation in [0.25, 1] of commands in [-1, 1]; what lies outside counts as the nearest."""
+    return SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + jnp.clip(command, -1.0, 1.0))
+
+
+def _posture(task: Task, x: Float[Array, "n 2"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Posture of the reward, and tilt in rad, positive to the left."""
+    rest = jnp.asarray(task.creature.mesh.vertices, x.dtype)
+    lowered = jnp.maximum(0.0, CROUCHED - x[:, 1].mean() / rest[:, 1].mean()) / (1.0 - CROUCHED)
+    rest, x = rest - rest.mean(axis=0), x - x.mean(axis=0)
+    along, across = jnp.sum(rest * x), jnp.sum(rest[:, 0] * x[:, 1] - rest[:, 1] * x[:, 0])
+    # The norm is zero only for a body that has shrunk to a point.
+    cosine = along / jnp.sqrt(along**2 + across**2)
+    return 1.0 - cosine + lowered**2, jnp.arctan2(across, along)

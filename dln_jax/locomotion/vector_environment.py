@@ -1,0 +1,79 @@
+"""Many creatures at once for stable-baselines3: one compiled, vmapped step for all lanes, which restarts them too."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from dln_jax.locomotion.learning import chosen
+from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
+
+
+class VectorEnvironment(VecEnv):
+    """Lanes of `CreatureEnvironment`, with rewards times a constant."""
+
+    def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0):
+        infinite = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+        self.render_mode = None
+        super().__init__(lanes, infinite, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32))
+        self._scale = reward_scale
+        self._start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), beginning(task))
+        self._places, self._actions = self._start, np.zeros((lanes, task.muscle_count), np.float32)
+
+        def one(place: Place, action: Any) -> tuple[Place, Any]:
+            after, seen = advance(task, place, actuation_of(action))
+            terminated = (jnp.abs(seen.tilt) > FALLEN) | ~seen.converged
+            truncated = (after.steps >= task.episode) & ~terminated
+            kept = chosen(terminated | truncated, beginning(task), after)
+            last, first = observe(task, after).astype(jnp.float32), observe(task, kept).astype(jnp.float32)
+            return kept, (first, seen.reward.astype(jnp.float32), terminated, truncated, last)
+
+        actions = jnp.zeros(self._actions.shape, self._places.state.x.dtype)
+        self._advance = jax.jit(jax.vmap(one)).lower(self._places, actions).compile()
+        self._first = np.asarray(jax.jit(jax.vmap(lambda place: observe(task, place)))(self._start), np.float32)
+
+    def reset(self) -> np.ndarray:
+        """All lanes at the beginning of an episode."""
+        self._places = self._start
+        return self._first.copy()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """One step of all lanes; those that ended are restarted, their last observation is in their info."""
+        actions = np.asarray(self._actions, self._places.state.x.dtype)
+        self._places, seen = self._advance(self._places, actions)
+        observed, rewards, terminated, truncated, last = (np.asarray(values) for values in seen)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for lane in np.flatnonzero(terminated | truncated):
+            infos[lane] = {"terminal_observation": last[lane], "TimeLimit.truncated": bool(truncated[lane])}
+        return observed.copy(), self._scale * rewards, terminated | truncated, infos
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute, for each lane."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Sets it for all lanes."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **keywords: Any) -> list[Any]:
+        """There is one method for all lanes."""
+        return [getattr(self, method_name)(*arguments, **keywords) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No lane is."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """None are drawn."""
+        return [None] * self.num_envs
