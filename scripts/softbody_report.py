@@ -1,0 +1,75 @@
+"""Measure soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect.
+
+Prints one table (case, quantity, expected, got, bound, unit, pass), writes report.json, and draws figures. All of it is
+float64 unless a case says otherwise.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from dln_jax.evaluation.hard_cases.case import Case
+from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.evaluation.soft_cases import SUBJECTS, measure
+from dln_jax.evaluation.soft_cases.figures import FIGURES
+from dln_jax.types import InputError
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+from scripts.stability import table
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to measure."""
+
+    only: str = ",".join(SUBJECTS)
+    """Subjects, comma separated."""
+    quick: bool = False
+    """Smaller meshes, fewer and shorter motions: 90 s instead of minutes."""
+    out: Path | None = None
+    """Folder for report.json and the figures (default: runs/softbody-1, -2, ...)."""
+    figures: bool = True
+    """Draw the figures."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    subjects = [name.strip() for name in given.only.split(",") if name.strip()]
+    if unknown := [name for name in subjects if name not in SUBJECTS]:
+        raise InputError(f"--only: '{unknown[0]}' is unknown; choose from {', '.join(SUBJECTS)}")
+    if not subjects:
+        raise InputError(f"--only names no subject; choose from {', '.join(SUBJECTS)}")
+    folder = new_folder(given.out, "softbody")
+    write_json(folder / CONFIG, stored_arguments(given))
+    console = Console(highlight=False, soft_wrap=True)
+    wanted = [(subject, name) for subject in subjects for name in SUBJECTS[subject]]
+    cases: list[Case] = []
+    for number, (subject, name) in enumerate(wanted, start=1):
+        began = time.perf_counter()
+        found = measure(subject, name, quick=given.quick)
+        cases += found.cases
+        if given.figures and name in FIGURES:
+            FIGURES[name](found.curves).savefig(folder / f"{name}.png")
+        passed = sum(case.passed for case in found.cases)
+        seconds = time.perf_counter() - began
+        console.print(
+            f"{number:2d}/{len(wanted)}  {subject:10s} {name:20s} {passed}/{len(found.cases)} pass  {seconds:.1f} s"
+        )
+    facts = conditions(
+        dtype="float64, and float32 where a case says so",
+        seeds=[0],
+        quick=given.quick,
+        expected={f"{case.name} {case.quantity}": case.expected for case in cases},
+    )
+    write_report(folder / "report.json", [case.row for case in cases], facts)
+    # A file or a pipe has no width to keep to.
+    Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table(cases))
+    failing = [f"{case.name} {case.quantity}" for case in cases if not case.passed]
+    console.print(f"{len(cases) - len(failing)} of {len(cases)} pass" + "".join(f"\nfails: {name}" for name in failing))
+    console.print(f"report: {folder / 'report.json'}")
+
+
+if __name__ == "__main__":
+    run(main, Arguments)
