@@ -1,0 +1,124 @@
+"""Material, friction, actuation or shape of a soft body from what is observed of it, by Levenberg-Marquardt.
+
+    minimise over theta:  mean over motions of |x(t; theta) - x_observed(t)|² / noise²        (identification)
+    minimise over theta:  |x*(theta) - x_wanted|² / noise²,   x* an equilibrium               (inverse design)
+
+Residuals are differentiated through the implicit steps, or through the equilibrium. theta is any tree of
+float64 arrays; `params_of(theta)` says which `Params` it stands for, such as `exp` of it where a parameter must stay positive.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Float
+
+from dln_jax.learning.levenberg_marquardt import QUICK_COMPILATION
+from dln_jax.softbody.rollout import rollout
+from dln_jax.softbody.scene import Params, SoftScene, State
+from dln_jax.softbody.step import Step, static_solve
+from dln_jax.types import require_positive
+
+
+class ObservedMotions(NamedTuple):
+    """Motions of one body, K of them, T steps each."""
+
+    x0: Float[Array, "K n dim"]
+    """Positions at the start, in m."""
+    v0: Float[Array, "K n dim"]
+    """Velocities at the start, in m/s."""
+    controls: Float[Array, "K T controls"]
+    """Actuation of each step; [K, T, 0] for a body without."""
+    x: Float[Array, "K T n dim"]
+    """Positions after each step, in m; not finite where a vertex was not seen."""
+
+
+class Fitted(NamedTuple):
+    """What was found."""
+
+    parameters: Any
+    """theta."""
+    misfit: float
+    """Root mean square of the residuals there, in units of the noise; NaN if a step did not converge."""
+    iterations: int
+    """Of Levenberg-Marquardt."""
+
+
+def identify(
+    step: Step,
+    params_of: Callable[[Any], Params],
+    guess: Any,
+    motions: ObservedMotions,
+    *,
+    noise: float = 1e-3,
+    iterations: int = 30,
+) -> Fitted:
+    """theta at which the simulated motions are nearest to the observed ones.
+
+    Args:
+        step: of `make_step`, of a method of one step.
+        params_of: theta -> the scene's parameters.
+        guess: theta to start from, float64 arrays.
+        motions: what was observed.
+        noise: of the positions, in m: the unit of the residuals.
+        iterations: of Levenberg-Marquardt at most.
+
+    Raises:
+        InputError: numbers that are not positive.
+    """
+    require_positive(noise=noise, iterations=iterations)
+
+    def residual(theta: Any, x0: Array, v0: Array, controls: Array, observed: Array) -> Array:
+        given = {"controls": controls} if controls.shape[1] else {"steps": observed.shape[0]}
+        _, (x, _) = rollout(step, State(x0, v0), params_of(theta), **given)
+        seen = jnp.isfinite(observed)
+        return jnp.where(seen, x - jnp.where(seen, observed, 0), 0) / noise
+
+    return _fitted(lambda theta: jax.vmap(functools.partial(residual, theta))(*motions), guess, iterations)
+
+
+def design(
+    scene: SoftScene,
+    params_of: Callable[[Any], Params],
+    guess: Any,
+    wanted: Float[Array, "n dim"],
+    *,
+    noise: float = 1e-3,
+    iterations: int = 30,
+) -> Fitted:
+    """theta (a rest shape, say) for which the body's equilibrium is nearest to what is wanted.
+
+    Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
+    count. The other arguments are those of `identify`.
+
+    Raises:
+        InputError: as `identify`.
+    """
+    require_positive(noise=noise, iterations=iterations)
+
+    seen = jnp.isfinite(wanted)
+
+    def residual(theta: Any) -> Array:
+        x, _ = static_solve(scene, params_of(theta), x=scene.params.rest)
+        return jnp.where(seen, x - jnp.where(seen, wanted, 0), 0) / noise
+
+    return _fitted(residual, guess, iterations)
+
+
+def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int) -> Fitted:
+    # Forward mode: a handful of parameters against thousands of residuals.
+    solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+
+    @functools.partial(jax.jit, compiler_options=QUICK_COMPILATION)
+    def solve(guess: Any) -> tuple[Any, Array, Array]:
+        found = optimistix.least_squares(
+            lambda theta, _: residual(theta), solver, guess, options={"jac": "fwd"}, max_steps=iterations, throw=False
+        )
+        misfit = jnp.sqrt(jnp.mean(residual(found.value) ** 2))
+        return found.value, misfit, found.stats["num_steps"]
+
+    theta, misfit, count = solve(guess)
+    return Fitted(theta, float(misfit), int(count))
