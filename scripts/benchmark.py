@@ -2,8 +2,9 @@
 
 Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
 states per second), scaling (cost against the number of joints), training (error against seconds), integrators (steps
-per second against energy drift and trajectory error), precision (float32 against float64), and all of them. Compilation
-is timed apart, results are waited for, inputs vary, programs that are compared take turns, and medians count.
+per second against energy drift and trajectory error), precision (float32 against float64), softbody (steps per second
+of soft bodies, their gradients and time steps), and all of them. Compilation is timed apart, results are waited for,
+inputs vary, programs that are compared take turns, and medians count.
 """
 
 import functools
@@ -22,6 +23,7 @@ from scripts import (
     benchmark_one_step,
     benchmark_precision,
     benchmark_scaling,
+    benchmark_softbody,
     benchmark_throughput,
     benchmark_training,
 )
@@ -36,6 +38,7 @@ MEASURES: dict[str, Measure] = {
     "training": benchmark_training.measure,
     "integrators": benchmark_integrators.measure,
     "precision": benchmark_precision.measure,
+    "softbody": benchmark_softbody.measure,
 }
 
 
@@ -44,7 +47,7 @@ class Arguments:
     """What to measure, and for how long."""
 
     subject: tyro.conf.Positional[
-        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "all"]
+        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "softbody", "all"]
     ] = "all"
     """What is measured."""
     quick: bool = False

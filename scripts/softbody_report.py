@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from dln_jax.evaluation.hard_cases.case import Case
+from dln_jax.evaluation.case import Case
 from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.evaluation.soft_cases.figures import FIGURES

@@ -4,7 +4,8 @@
     minimise over theta:  |x*(theta) - x_wanted|² / noise²,   x* an equilibrium               (inverse design)
 
 Residuals are differentiated through the implicit steps, or through the equilibrium. theta is any tree of
-float64 arrays; `params_of(theta)` says which `Params` it stands for, such as `exp` of it where a parameter must stay positive.
+float64 arrays; `params_of(theta)` says which `Params` it stands for, such as `exp` of it where a parameter must stay
+positive.
 """
 
 import functools
@@ -72,8 +73,8 @@ def identify(
     require_positive(noise=noise, iterations=iterations)
 
     def residual(theta: Any, x0: Array, v0: Array, controls: Array, observed: Array) -> Array:
-        given = {"controls": controls} if controls.shape[1] else {"steps": observed.shape[0]}
-        _, (x, _) = rollout(step, State(x0, v0), params_of(theta), **given)
+        given = controls if controls.shape[1] else None
+        _, (x, _) = rollout(step, State(x0, v0), params_of(theta), given, steps=observed.shape[0])
         seen = jnp.isfinite(observed)
         return jnp.where(seen, x - jnp.where(seen, observed, 0), 0) / noise
 

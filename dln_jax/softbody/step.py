@@ -15,9 +15,9 @@ order and does not damp, so that it is for smooth motions.
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
@@ -72,7 +72,7 @@ def make_step(
         InputError: an unknown integrator or a number that is not positive; a step of "bdf2" also for a state without
             room for the state before.
     """
-    if not isinstance(dt, jax.core.Tracer):
+    if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     if integrator not in get_args(Integrator):
         raise InputError(f"integrator '{integrator}' is unknown; choose from {', '.join(get_args(Integrator))}")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from dln_jax.data.generators import in_float64
-from dln_jax.evaluation.hard_cases.case import Case, Findings
+from dln_jax.evaluation.case import Case, Findings
 from dln_jax.evaluation.hard_cases.close_encounters import close_encounters
 from dln_jax.evaluation.hard_cases.conditioning import mass_conditions, sizes
 from dln_jax.evaluation.hard_cases.data_faults import batches, not_finite, torque_channels

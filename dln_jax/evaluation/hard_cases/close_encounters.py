@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.mechanics.integrators import adaptive_rollout, implicit_midpoint, second_order
 
 TOLERANCE = 1e-12

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.evaluation.definiteness import definiteness
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest, random_parameters
+from dln_jax.evaluation.hard_cases.random_models import random_parameters
 from dln_jax.mechanics import lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.natural import NaturalSystem

@@ -8,7 +8,8 @@ import numpy as np
 
 from dln_jax.data import generators, schema
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest, random_parameters
+from dln_jax.evaluation.case import Case, Findings, largest
+from dln_jax.evaluation.hard_cases.random_models import random_parameters
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.residuals import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units

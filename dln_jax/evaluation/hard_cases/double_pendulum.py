@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.mechanics import hamiltonian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_order

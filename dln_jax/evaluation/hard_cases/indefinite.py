@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.evaluation.case import Case, Findings
 from dln_jax.evaluation.definiteness import definiteness
-from dln_jax.evaluation.hard_cases.case import Case, Findings, random_parameters
+from dln_jax.evaluation.hard_cases.random_models import random_parameters
 from dln_jax.mechanics import lagrangian
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.types import Needs

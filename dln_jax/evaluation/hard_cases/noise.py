@@ -12,7 +12,7 @@ import numpy as np
 
 from dln_jax.data import generators
 from dln_jax.data.schema import Trajectories
-from dln_jax.evaluation.hard_cases.case import Case, Findings
+from dln_jax.evaluation.case import Case, Findings
 from dln_jax.evaluation.metrics import mean_square
 from dln_jax.evaluation.misfit import velocity_misfit
 from dln_jax.learning.linear_fit import LinearFit, fit_linear

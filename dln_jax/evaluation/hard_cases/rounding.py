@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest, random_parameters
+from dln_jax.evaluation.case import Case, Findings, largest
+from dln_jax.evaluation.hard_cases.random_models import random_parameters
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import make_delan

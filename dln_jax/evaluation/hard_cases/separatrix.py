@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.mechanics.integrators import (
     explicit_euler,
     gauss_legendre4,

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from dln_jax.data.generators import in_float64
-from dln_jax.evaluation.hard_cases.case import Findings
+from dln_jax.evaluation.case import Findings
 from dln_jax.evaluation.soft_cases import gradients, motions, robustness, sliding, speed, statics
 from dln_jax.types import InputError
 

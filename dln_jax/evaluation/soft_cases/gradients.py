@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings
+from dln_jax.evaluation.case import Case, Findings
 from dln_jax.evaluation.soft_cases.common import GRAVITY
 from dln_jax.softbody.contact import plane_contact
 from dln_jax.softbody.creature_terms import MASS, TIME_STEP, creature_terms

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.evaluation.soft_cases.common import GRAVITY, motion
 from dln_jax.softbody.elasticity import elastic
 from dln_jax.softbody.gravity import Gravity, gravity

@@ -8,7 +8,7 @@ friction is smooth, and slides with g (sin - mu cos) for less.
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.evaluation.soft_cases.common import GRAVITY, motion
 from dln_jax.softbody.contact import plane_contact
 from dln_jax.softbody.gravity import gravity

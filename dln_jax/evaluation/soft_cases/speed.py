@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.evaluation.soft_cases.gradients import crawling, crawling_scene, gait
 from dln_jax.evaluation.soft_cases.robustness import cantilever_scene
 from dln_jax.softbody.creature_terms import TIME_STEP

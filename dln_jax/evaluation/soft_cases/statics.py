@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import eigsh, spsolve
 
-from dln_jax.evaluation.hard_cases.case import Case, Findings, largest
+from dln_jax.evaluation.case import Case, Findings, largest
 from dln_jax.evaluation.soft_cases.common import GRAVITY
 from dln_jax.softbody.elasticity import elastic
 from dln_jax.softbody.gravity import gravity

@@ -1,13 +1,10 @@
-"""What a hard case is: a number that was measured, and what theory lets one expect of it."""
+"""Cases of a report: a number that was measured, and what theory lets one expect of it."""
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.evaluation.report import Row
-from dln_jax.models.model import Model, Parameters
 
 
 class Case(NamedTuple):
@@ -44,20 +41,9 @@ class Findings(NamedTuple):
 
     cases: list[Case]
     curves: dict[str, Any] = {}  # noqa: RUF012  never written to
-    """Name -> array, or arrays by name; see `hard_cases.figures`."""
+    """Name -> array, or arrays by name; see the `figures` of the cases' package."""
 
 
 def largest(values: Any) -> float:
     """The largest of some numbers; NaN if one is NaN, so that it meets no bound."""
     return float(np.max(np.asarray(values, np.float64)))
-
-
-def random_parameters(model: Model) -> Parameters:
-    """Parameters of a network that nothing has trained, of unit gain: drawn without compiling its initialisation."""
-    random = np.random.default_rng(0)
-
-    def draw(like: jax.ShapeDtypeStruct):
-        gain = like.shape[0] ** -0.5 if len(like.shape) > 1 else 0.1
-        return jnp.asarray(gain * random.normal(size=like.shape), like.dtype)
-
-    return jax.tree.map(draw, jax.eval_shape(model.init, jax.random.key(0)))
