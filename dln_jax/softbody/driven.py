@@ -1,7 +1,7 @@
 """Motions that are driven from outside: actuation of muscles, and held vertices that are led along a path.
 
-A path is followed exactly: in each step a held vertex has the velocity (p(t + dt) - p(t)) / dt, and not that of the path
-at t, with which a rotation would spiral outwards.
+A path is followed exactly: in each step a held vertex has the velocity (p(t + dt) - p(t)) / dt. With the one of p at t,
+a rotation would spiral outwards.
 """
 
 from collections.abc import Callable

@@ -82,13 +82,15 @@ def make_step(
 
     def step(state: State, params: Params, control: Any = None) -> tuple[State, Info]:
         length, target = _inertial_target(state, dt, integrator)
-        context = Context(params.rest, params.masses, state.x, state.v, _span(dt, integrator, state), control)
+        span = _span(dt, integrator, state)
+        context = Context(params.rest, params.masses, state.x, state.v, span, control)
         inertia = _Inertia(params.masses / length**2, target)
         data = (inertia, *prepare(scene, params, context))
-        moved = jnp.where(free, state.x, target)
+        carried = state.x + span * state.v
+        start = _better(energies, data, jnp.where(free, state.x, carried), jnp.where(free, target, carried))
         x, info = minimise(
             energies,
-            _better(energies, data, moved, target),
+            start,
             data,
             free=free,
             scale=params.masses,

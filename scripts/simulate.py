@@ -1,0 +1,259 @@
+"""Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
+
+Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
+time: what the implicit step damps is seen), moments.png, metrics.json, report.json and config.json. Bodies have 1000
+kg/m³; in the plane they are 1 m thick.
+
+Your own mesh: --mesh FILE.npz for the scenes beam and drop, with `vertices` [n, 2 or 3] in m, the last axis up,
+`elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam, optionally `held` [k] (vertices;
+by default those of least x).
+"""
+
+import dataclasses
+import inspect
+import math
+import time
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
+from dln_jax.softbody.driven import Example, beginning, drive, driven_step
+from dln_jax.softbody.examples import EXAMPLES
+from dln_jax.softbody.mesh import Mesh, make_mesh
+from dln_jax.softbody.rollout import rollout
+from dln_jax.softbody.scene import Params, State
+from dln_jax.softbody.step import Integrator, Step
+from dln_jax.softbody.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
+from dln_jax.solvers.minimise import Info
+from dln_jax.types import InputError, require_positive
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+from scripts.progress import progress
+from scripts.simulate_outputs import Motion, draw, results, results_table, warn
+
+MATERIALS = {
+    "stable-neo-hookean": stable_neo_hookean,
+    "neo-hookean": neo_hookean,
+    "st-venant-kirchhoff": st_venant_kirchhoff,
+    "corotated": corotated,
+}
+PRECISIONS = {"float32": jnp.float32, "float64": jnp.float64}
+CHUNKS = 20
+"""Programs called for a motion, after each of which progress is shown."""
+ALL = "all"
+GALLERY = (0, 3, 2, 1, 4)
+"""Order of the scenes in the picture of all."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
+
+    scene: str = "beam"
+    """beam, twist, slope, drop or creature; or all, each in a folder of its own, with one picture of them."""
+    integrator: str = "backward-euler"
+    """backward-euler (damps), bdf2 (second order, damps little) or midpoint (second order, does not damp)."""
+    dt: float | None = None
+    """Time step in s."""
+    seconds: float | None = None
+    """Length of the motion in s."""
+    cells: int | None = None
+    """Cells across the body (drop: rings of the disc); not for the creature."""
+    dimension: int | None = None
+    """2 or 3, for beam and drop."""
+    youngs_modulus: float | None = None
+    """E in Pa; not for the creature."""
+    poisson_ratio: float | None = None
+    """Between -1 and 0.5; not for the creature."""
+    friction: float | None = None
+    """Coulomb's coefficient, for slope and drop."""
+    turns: float | None = None
+    """Turns of one end against the other, for twist."""
+    material: str | None = None
+    """stable-neo-hookean, neo-hookean, st-venant-kirchhoff or corotated; not for the creature."""
+    mesh: Path | None = None
+    """Your own mesh, for beam and drop: see above."""
+    precision: str = "float64"
+    """float32 or float64."""
+    seed: int = 0
+    """Of the turning rate in drop, and of its box's tilt; nothing else is random."""
+    out: Path | None = None
+    """Run folder (default: runs/simulate-1, -2, ...)."""
+    gif: bool = True
+    """Write the GIF."""
+
+
+class Prepared(NamedTuple):
+    """A scene that is ready to be simulated."""
+
+    given: Arguments
+    example: Example
+    step: Step
+    dt: float
+    """In s."""
+    steps: int
+
+
+def main(given: Arguments) -> None:
+    """Simulates, prints and writes."""
+    names = list(EXAMPLES) if given.scene == ALL else [given.scene]
+    prepared = [prepare(dataclasses.replace(given, scene=name)) for name in names]
+    folder = new_folder(given.out, "simulate")
+    console = Console(highlight=False, soft_wrap=True)
+    pictures = []
+    for each in prepared:
+        own = folder if len(names) == 1 else folder / each.given.scene
+        own.mkdir(exist_ok=True)
+        pictures.append(simulate(each, own, console))
+    if len(names) > 1:
+        gallery = moments_figure([pictures[i] for i in GALLERY], columns=3, width=11.5)
+        gallery.savefig(folder / "soft-bodies.png", dpi=86)
+    console.print(f"run folder: {folder}")
+
+
+def prepare(given: Arguments) -> Prepared:
+    """What is to be simulated; every mistake of the command line is found here, before anything is written."""
+    example = example_of(given)
+    dt = example.dt if given.dt is None else given.dt
+    seconds = example.seconds if given.seconds is None else given.seconds
+    require_positive(dt=dt, seconds=seconds)
+    if not dt <= seconds < math.inf:
+        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
+    step = driven_step(example, dt, cast(Integrator, given.integrator))
+    return Prepared(given, example, step, dt, round(seconds / dt))
+
+
+def simulate(prepared: Prepared, folder: Path, console: Console) -> Moments:
+    """Simulates one scene and writes its folder; gives its picture."""
+    given, example, _, dt, steps = prepared
+    write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
+    mesh = example.scene.mesh
+    console.print(
+        f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements, "
+        f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
+    )
+    motion = run_motion(prepared)
+    rows = results(given.scene, mesh, motion)
+    numbers = {row.quantity: row.value for row in rows if math.isfinite(row.value)}
+    write_json(folder / "metrics.json", numbers)
+    facts = conditions(dtype=given.precision, seeds=[given.seed], integrator=given.integrator, dt=dt)
+    write_report(folder / "report.json", rows, facts)
+    console.print(results_table(rows))
+    warn(motion, console)
+    title = f"{given.scene}: {given.integrator}, dt = {dt:.4g} s"
+    return draw(given.scene, example, motion, folder, title=title, gif=given.gif)
+
+
+def example_of(given: Arguments) -> Example:
+    """The scene with what was chosen for it.
+
+    Raises:
+        InputError: an unknown name, a choice that the scene does not have, or a value that cannot be.
+    """
+    scene = chosen("--scene", given.scene, EXAMPLES, ALL)
+    chosen("--integrator", given.integrator, dict.fromkeys(get_args(Integrator)))
+    precision = chosen("--precision", given.precision, PRECISIONS)
+    choices: dict[str, Any] = {
+        name: getattr(given, name)
+        for name in ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
+    }
+    choices["strain_energy"] = None if given.material is None else chosen("--material", given.material, MATERIALS)
+    choices = {name: value for name, value in choices.items() if value is not None}
+    known = inspect.signature(scene).parameters
+    for name in choices:
+        if name not in known:
+            option = "material" if name == "strain_energy" else name.replace("_", "-")
+            raise InputError(f"--{option} is no choice of the {given.scene} scene; leave it out")
+    if given.mesh is not None:
+        if beside := [name for name in ("cells", "dimension") if name in choices]:
+            raise InputError(f"--{beside[0]} is for the scene's own mesh; leave it or --mesh out")
+        choices["mesh"], held = read_mesh(given.mesh)
+        if held is not None and "held" in known:
+            choices["held"] = held
+    if given.seed < 0:
+        raise InputError(f"--seed is {given.seed}; expected 0 or a positive integer")
+    if "seed" in known:
+        choices["seed"] = given.seed
+    example = scene(**choices)
+    params = in_precision(example.scene.params, precision)
+    return example._replace(scene=example.scene._replace(params=params), state=in_precision(example.state, precision))
+
+
+def chosen(option: str, name: str, names: dict[str, Any], *others: str) -> Any:
+    """What a name stands for; `InputError` lists the names."""
+    if name not in names:
+        raise InputError(f"{option} '{name}' is unknown; choose from {', '.join([*names, *others])}")
+    return names[name]
+
+
+def read_mesh(path: Path) -> tuple[Mesh, np.ndarray | None]:
+    """The mesh of a file and its held vertices, if it names any."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else "it is not an .npz of plain arrays"
+        raise InputError(f"--mesh {path}: {reason}; expected `vertices` [n, dim] and `elements` [m, dim + 1]") from None
+    for name in ("vertices", "elements"):
+        if name not in arrays:
+            held = ", ".join(arrays) or "nothing"
+            raise InputError(f"--mesh {path}: '{name}' is missing (the file holds {held}); save it under this name")
+    held = arrays.get("held")
+    try:
+        mesh = make_mesh(arrays["vertices"], arrays["elements"])
+    except InputError as error:
+        raise InputError(f"--mesh {path}: {error}") from None
+    if held is not None and (held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0):
+        raise InputError(
+            f"--mesh {path}: held is {held.dtype} of shape {list(held.shape)}; expected integers [k], k >= 1: vertices"
+        )
+    return mesh, held
+
+
+def in_precision(tree: Any, precision: Any) -> Any:
+    """Floating point arrays in this precision."""
+    return jax.tree.map(lambda leaf: leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
+
+
+def run_motion(prepared: Prepared) -> Motion:
+    """The motion, in chunks of one compiled program; compilation is timed apart, and results are waited for."""
+    given, example, step, dt, steps = prepared
+    count = max(1, steps // CHUNKS)
+    params = example.scene.params
+    state = beginning(example, cast(Integrator, given.integrator))
+
+    def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
+        # Whether the Hessian is definite is not asked for: it would cost a factorisation.
+        return state.x, state.v, info._replace(definite=info.converged)
+
+    def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
+        return rollout(step, state, params, driven, observe=observe)
+
+    with progress(steps) as show:
+        began = time.perf_counter()
+        program = jax.jit(advance).lower(state, params, drive(example, dt, count)).compile()
+        compiled = time.perf_counter() - began
+        seen, spent, done = [], 0.0, 0
+        while done < steps:
+            driven = drive(example, dt, count, first=done)
+            began = time.perf_counter()
+            state, chunk = jax.block_until_ready(program(state, params, driven))
+            spent += time.perf_counter() - began
+            done += count
+            seen.append(jax.tree.map(np.asarray, chunk))
+            show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
+    x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
+    start = example.state
+    x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
+    return Motion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)
+
+
+if __name__ == "__main__":
+    run(main, Arguments)
