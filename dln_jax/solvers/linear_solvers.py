@@ -169,9 +169,11 @@ def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2
 
 
 def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
+    """Reverse Cuthill-McKee, or the given order where its band is narrower (meshes built row by row)."""
     rows, columns = at.rows // at.width, at.columns // at.width
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
-    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+    found = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+    return min(found, np.arange(at.blocks), key=lambda order: _band(at, order))
 
 
 def _band(at: Pattern, order: np.ndarray) -> int:
