@@ -1,6 +1,8 @@
 """Time steps of soft bodies: what they keep exactly, what they compile, and what they refuse."""
 
 import functools
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -145,6 +147,18 @@ def test_the_potential_is_the_sum_of_the_terms():
     scene = make_scene(MESH, (SOLID, WEIGHT), masses=2.0)
     height = 9.81 * 2.0 * MESH.vertices[:, 1].sum()
     np.testing.assert_allclose(potential(scene, scene.params.rest, scene.params), height, rtol=1e-13)
+
+
+def test_the_readme_example_runs():
+    text = (Path(__file__).parent.parent / "README.md").read_text()
+    example = re.search(r"## Soft bodies\n\n```python\n(.*?)```", text, re.DOTALL)
+    assert example is not None
+    names = {}
+    exec(example.group(1), names)
+    # It slides to the right, by less than it would without friction.
+    assert 0.01 < names["distance"] < 0.3
+    stiffer = names["slope"].terms["elastic"].youngs_modulus
+    assert np.isfinite(stiffer) and stiffer != 0.0
 
 
 @pytest.mark.parametrize(

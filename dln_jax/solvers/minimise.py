@@ -29,15 +29,13 @@ from dln_jax.solvers.element_energies import (
     pattern,
     value_and_gradient,
 )
+from dln_jax.solvers.line_search import Point, line_search
 from dln_jax.solvers.linear_solvers import LinearSolver, LinearSolverFactory, by_size
 from dln_jax.solvers.projection import project
 from dln_jax.types import InputError, require_positive
 
 # Gradients and energies cannot be told from zero below so many units of rounding.
 _ROUNDING_UNITS = 16
-# Sufficient decrease of the line search (Armijo), and how often it halves the step.
-_DECREASE = 1e-4
-_HALVINGS = 40
 # Shifts of the projected Hessian's diagonal, relative to the largest eigenvalue of an element, tried in turn: projected
 # elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
 _SHIFTS = (1e-6, 1e-3, 1.0)
@@ -215,7 +213,8 @@ def _newton(
         extent = jnp.max(jnp.abs(state.x), initial=0)
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(state.energy) + floor.sum() * extent
-        x, energy, gradient, accepted = _line_search(evaluate, state, direction, slope, unclear, scale)
+        point = Point(state.x, state.energy, state.gradient)
+        (x, energy, gradient), accepted = line_search(evaluate, point, direction, slope, unclear, scale)
         return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
 
     energy, first = evaluate(x0)
@@ -245,46 +244,3 @@ def _descent_direction(
 
     direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians, values), jnp.asarray(0)))
     return jnp.where(descends, direction, -gradient)
-
-
-def _line_search(
-    evaluate: Callable[[Blocks], tuple[Array, Blocks]],
-    state: _State,
-    direction: Blocks,
-    slope: Array,
-    unclear: Array,
-    scale: Array,
-) -> tuple[Blocks, Array, Blocks, Array]:
-    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell.
-
-    Changes of the energy below `unclear` tell nothing: terms that cancel at rest are that large. A stiff body's
-    gradient is balanced to many digits after its energy has become blind.
-    """
-
-    class Trial(NamedTuple):
-        x: Blocks
-        energy: Array
-        gradient: Blocks
-        length: Array
-        accepted: Array
-
-    def size(gradient: Blocks) -> Array:
-        return jnp.max(jnp.abs(gradient) / scale, initial=0)
-
-    before = size(state.gradient)
-
-    def attempt(trial: Trial) -> Trial:
-        x = state.x + trial.length * direction
-        energy, gradient = evaluate(x)
-        change = energy - state.energy
-        lower = change <= _DECREASE * trial.length * slope
-        flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
-        accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
-        return Trial(x, energy, gradient, trial.length / 2, accepted)
-
-    one = jnp.ones((), state.x.dtype)
-    start = Trial(state.x, state.energy, state.gradient, one, jnp.asarray(False))
-    smallest = 2.0**-_HALVINGS
-    last = jax.lax.while_loop(lambda trial: ~trial.accepted & (trial.length > smallest), attempt, start)
-    kept = [jnp.where(last.accepted, new, old) for new, old in zip(last[:3], state[:3], strict=True)]
-    return kept[0], kept[1], kept[2], last.accepted

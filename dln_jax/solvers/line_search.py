@@ -1,0 +1,74 @@
+"""A backtracking line search that still sees descent where the energy is lost in rounding."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Blocks = Float[Array, "n b"]
+
+# Sufficient decrease of the line search (Armijo), and how often it halves the step.
+_DECREASE = 1e-4
+_HALVINGS = 40
+
+
+class Point(NamedTuple):
+    """A point and what is known there."""
+
+    x: Blocks
+    energy: Float[Array, ""]
+    gradient: Blocks
+
+
+class _Trial(NamedTuple):
+    point: Point
+    length: Float[Array, ""]
+    accepted: Bool[Array, ""]
+
+
+def line_search(
+    evaluate: Callable[[Blocks], tuple[Float[Array, ""], Blocks]],
+    start: Point,
+    direction: Blocks,
+    slope: Float[Array, ""],
+    unclear: Float[Array, ""],
+    scale: Float[Array, "n 1"],
+) -> tuple[Point, Bool[Array, ""]]:
+    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell.
+
+    Changes of the energy below `unclear` tell nothing: terms that cancel at rest are that large. A stiff body's
+    gradient is balanced to many digits after its energy has become blind. Returns the point, which is the start if no
+    step is accepted, and whether one is.
+
+    Args:
+        evaluate: x -> energy and gradient.
+        start: where the search starts.
+        direction: of descent.
+        slope: of the energy along the direction, <= 0.
+        unclear: what the energy cannot tell from zero.
+        scale: unit of the gradient's rows.
+    """
+
+    def size(gradient: Blocks) -> Array:
+        return jnp.max(jnp.abs(gradient) / scale, initial=0)
+
+    before = size(start.gradient)
+
+    def attempt(trial: _Trial) -> _Trial:
+        x = start.x + trial.length * direction
+        energy, gradient = evaluate(x)
+        change = energy - start.energy
+        lower = change <= _DECREASE * trial.length * slope
+        flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
+        accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
+        return _Trial(Point(x, energy, gradient), trial.length / 2, accepted)
+
+    one = jnp.ones((), start.x.dtype)
+    smallest = 2.0**-_HALVINGS
+    last = jax.lax.while_loop(
+        lambda trial: ~trial.accepted & (trial.length > smallest), attempt, _Trial(start, one, jnp.asarray(False))
+    )
+    kept = [jnp.where(last.accepted, new, old) for new, old in zip(last.point, start, strict=True)]
+    return Point(*kept), last.accepted
