@@ -44,7 +44,7 @@ Loss = Callable[[dict[str, Any]], Array]
 
 def creature(quick: bool) -> Findings:
     """A crawler of 28 vertices over contact steps with ground, friction and muscles: reverse mode for everything."""
-    loss, at = crawling(20 if quick else STEPS)
+    loss, at = crawling(40 if quick else STEPS)
     return _compared("crawler", loss, at)
 
 
