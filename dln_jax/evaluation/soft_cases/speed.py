@@ -172,9 +172,13 @@ def speed_against_error(quick: bool) -> Findings:
             x, seconds = _swung(scene, integrator, duration, count)
             errors.append(largest(abs(x - exact)) / moved)
             rates.append(count / seconds)
-            where = f"speed/{integrator}/{count}-steps"
-            text = f"error {errors[-1]:.2g} of the motion at dt = {duration / count:.3g} s"
-            cases.append(Case(where, "steps_per_second", text, rates[-1], 0.0, "1/s", at_least=True))
+        order = float(np.log(errors[-2] / errors[-1]) / np.log(counts[-1] / counts[-2]))
+        spent = ", ".join(
+            f"{e:.1g} at {count / rate:.2g} s" for e, count, rate in zip(errors, counts, rates, strict=True)
+        )
+        text = f"error of the motion against seconds: {spent}"
+        least = 0.7 if integrator == "backward-euler" else 1.6
+        cases.append(Case(f"speed/{integrator}", "order_at_shortest_step", text, order, least, at_least=True))
         curves[integrator] = (np.array(errors), np.array(rates))
     gain = curves["backward-euler"][0][-1] / curves["bdf2"][0][-1]
     text = "error of backward Euler over that of bdf2 at the shortest step: the second order pays"
