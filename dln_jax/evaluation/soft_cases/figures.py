@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
 from dln_jax.evaluation.soft_cases.motions import DT
 from dln_jax.evaluation.soft_cases.statics import ELASTICA
 
@@ -57,14 +58,9 @@ def recovery(curves: dict) -> Figure:
 
 
 def twisted_bar(curves: dict) -> Figure:
-    """The twisted bar from the side, and from its end."""
-    figure, axis = _figure()
-    x = curves["x"]
-    pairs = np.unique(np.sort(curves["elements"][:, [[0, 1], [1, 2], [2, 3]]].reshape(-1, 2), axis=1), axis=0)
-    ends = np.insert(x[pairs], 2, np.nan, axis=1).reshape(-1, x.shape[1])
-    axis.plot(ends[:, 0], ends[:, 1], color="C0", linewidth=0.4)
-    axis.set(xlabel="x, m", ylabel="y, m", aspect="equal", title=f"least J on the way {curves['least_J'].min():.2f}")
-    return figure
+    """The bar at a few moments of its twist."""
+    title = f"twisted by up to {curves['turns'][-1]:g} turns"
+    return moments_figure([Moments(title, curves["mesh"], curves["x"], curves["t"], stacked=True)], columns=1)
 
 
 def differences(curves: dict) -> Figure:

@@ -134,7 +134,9 @@ def twist(quick: bool) -> Findings:
     )
     least = _least_J(mesh, found["x"])
     text = "no element inverts on the way, turned by less than 45 degrees per cell"
-    curves = {"x": np.asarray(found["x"][-1]), "elements": mesh.elements, "least_J": least}
+    shown = np.linspace(0, steps - 1, 4).round().astype(int)
+    t = DT * (shown + 1)
+    curves = {"mesh": mesh, "x": np.asarray(found["x"])[shown], "t": t, "turns": turns * t / (DT * steps)}
     return Findings(
         [
             *_converged(f"twist/{turns:g}-turns", found, 30, "a bar of constant strain tetrahedra"),
