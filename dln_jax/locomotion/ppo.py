@@ -87,8 +87,8 @@ def learn_ppo(
         InputError: stable-baselines3 is not installed.
     """
     require_stable_baselines3()
-    import torch
-    from stable_baselines3 import PPO
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
     from dln_jax.locomotion.vector_environment import VectorEnvironment
 

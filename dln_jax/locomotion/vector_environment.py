@@ -7,7 +7,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from dln_jax.locomotion.learning import chosen
 from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
