@@ -22,7 +22,7 @@ from dln_jax.softbody.mesh import Mesh
 from dln_jax.softbody.mesh_builders import beam
 from dln_jax.softbody.scene import Params, SoftScene, State, initial_state, make_scene, potential
 from dln_jax.softbody.springs import springs
-from dln_jax.softbody.step import Integrator
+from dln_jax.softbody.step import Integrator, make_step
 from dln_jax.softbody.strain_energies import stable_neo_hookean
 
 DT = 0.01
@@ -115,16 +115,18 @@ def orders(quick: bool) -> Findings:
     """Errors of a swing of two masses on springs against an explicit method with tiny steps."""
     counts = _counts(quick)
     cases, curves = [], {"dt": DURATION / np.array(counts)}
-    reference = None
+    scene = _two_masses()
+    reference = _reference_swing(scene, initial_state(scene, v=_swing()))
     for integrator in get_args(Integrator):
-        errors = []
-        for count in counts:
-            scene, run = _pendulum(integrator, count)
-            start = initial_state(scene, v=_swing(), two_steps=integrator == "bdf2")
-            if reference is None:
-                reference = _reference_swing(scene, start)
-            x, *_ = run(start, scene.params)
-            errors.append(largest(abs(np.asarray(x[-1]) - reference)))
+
+        @jax.jit
+        def end(start: State, count: Any, integrator: Integrator = integrator) -> Any:
+            # One program for every step length.
+            step = make_step(scene, DURATION / count, integrator, tolerance=TOLERANCE)
+            return jax.lax.fori_loop(0, count, lambda _, state: step(state, scene.params)[0], start).x
+
+        start = initial_state(scene, v=_swing(), two_steps=integrator == "bdf2")
+        errors = [largest(abs(np.asarray(end(start, count)) - reference)) for count in counts]
         curves[integrator] = np.array(errors)
         order = float(np.log2(errors[-2] / errors[-1]))
         expected = ORDERS[integrator]
@@ -145,14 +147,19 @@ def _thrown(integrator: Integrator) -> tuple[SoftScene, Callable[[State, Params]
 
 @functools.cache
 def _pendulum(integrator: Integrator, steps: int) -> tuple[SoftScene, Callable[[State, Params], Any]]:
+    scene = _two_masses()
+    return scene, motion(scene, DURATION / steps, steps, integrator, tolerance=TOLERANCE)
+
+
+@functools.cache
+def _two_masses() -> SoftScene:
     """Two masses that hang from a point by springs."""
     mesh = Mesh(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), np.zeros((0, 3), int))
     terms = [
         springs([[0, 1], [1, 2]], stiffness=[100.0, 60.0], rest_length=[1.0, 1.0]),
         gravity(mesh, (0.0, -GRAVITY)),
     ]
-    scene = make_scene(mesh, terms, masses=[1.0, 1.0, 0.7], held=[0])
-    return scene, motion(scene, DURATION / steps, steps, integrator, tolerance=TOLERANCE)
+    return make_scene(mesh, terms, masses=[1.0, 1.0, 0.7], held=[0])
 
 
 def _counts(quick: bool) -> tuple[int, ...]:
