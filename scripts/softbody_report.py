@@ -4,7 +4,6 @@ Prints one table (case, quantity, expected, got, bound, unit, pass), writes repo
 float64 unless a case says otherwise.
 """
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +11,12 @@ from pathlib import Path
 from rich.console import Console
 
 from dln_jax.evaluation.case import Case
-from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.evaluation.report import conditions
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.evaluation.soft_cases.figures import FIGURES
 from dln_jax.types import InputError
+from scripts.case_report import write_and_print
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
-from scripts.stability import table
 
 
 @dataclass(frozen=True)
@@ -63,12 +62,7 @@ def main(given: Arguments) -> None:
         quick=given.quick,
         expected={f"{case.name} {case.quantity}": case.expected for case in cases},
     )
-    write_report(folder / "report.json", [case.row for case in cases], facts)
-    # A file or a pipe has no width to keep to.
-    Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table(cases))
-    failing = [f"{case.name} {case.quantity}" for case in cases if not case.passed]
-    console.print(f"{len(cases) - len(failing)} of {len(cases)} pass" + "".join(f"\nfails: {name}" for name in failing))
-    console.print(f"report: {folder / 'report.json'}")
+    write_and_print(folder, cases, facts)
 
 
 if __name__ == "__main__":

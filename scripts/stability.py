@@ -4,18 +4,17 @@ Prints one table (case, expected, got, pass), writes report.json, and draws figu
 says otherwise.
 """
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from dln_jax.evaluation.hard_cases import NAMES, Case, measure
 from dln_jax.evaluation.hard_cases.figures import FIGURES
-from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.evaluation.report import conditions
 from dln_jax.types import InputError, require_positive
+from scripts.case_report import write_and_print
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
 
 
@@ -60,23 +59,7 @@ def main(given: Arguments) -> None:
         steps=given.steps,
         expected={f"{case.name} {case.quantity}": case.expected for case in cases},
     )
-    write_report(folder / "report.json", [case.row for case in cases], facts)
-    # A file or a pipe has no width to keep to.
-    Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table(cases))
-    failing = [f"{case.name} {case.quantity}" for case in cases if not case.passed]
-    console.print(f"{len(cases) - len(failing)} of {len(cases)} pass" + "".join(f"\nfails: {name}" for name in failing))
-    console.print(f"report: {folder / 'report.json'}")
-
-
-def table(cases: list[Case]) -> Table:
-    """One line per case."""
-    shown = Table("case", "quantity", "expected", "got", "bound", "unit", "pass")
-    for case in cases:
-        sign = "≥" if case.at_least else "≤"
-        passed = "yes" if case.passed else "[bold red]no[/]"
-        numbers = (f"{case.got:.3g}", f"{sign} {case.bound:.3g}", case.unit)
-        shown.add_row(case.name, case.quantity, case.expected, *numbers, passed)
-    return shown
+    write_and_print(folder, cases, facts)
 
 
 if __name__ == "__main__":
