@@ -4,7 +4,7 @@
 
 after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0. The
 force is mu lambda_n against the slip from the threshold speed e/dt on, and falls smoothly to zero below it: a block
-that "sticks" on a slope creeps at less than the threshold. f is twice continuously differentiable. The threshold slip must be
+that "sticks" on a slope creeps at less than the threshold. f is twice continuously differentiable. The slip e must be
 well above the rounding of the positions: in float32, 1e-4 m for a body of a metre.
 """
 
