@@ -19,11 +19,12 @@ from dln_jax.data.splits import Split, select, split
 from dln_jax.deploy.kinds import KINDS
 from dln_jax.evaluation.figures import error_against_time
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import write_json
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, require_positive
 from scripts.arm_models import Curve, gauss_newton_rows, measure_adam, measure_seeds, measure_trigonometric, plant_rows
 from scripts.arm_published import COLUMNS, PUBLISHED, published
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.report_table import print_report
 

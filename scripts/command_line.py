@@ -113,13 +113,6 @@ def with_stored_arguments(given: Arguments) -> Arguments:
     return dataclasses.replace(cast(Any, given), **kept)
 
 
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Writes JSON, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(values, indent=2) + "\n")
-    partial.replace(path)
-
-
 def cache_folder() -> Path:
     """Folder for generated default data: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

@@ -11,9 +11,10 @@ from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.evaluation.function_metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import write_json
 from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, train
 from dln_jax.nn.activations import activation
-from scripts.command_line import CONFIG, new_folder, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, stored_arguments
 
 LOSSES = ("type1", "type2")
 ACTIVATIONS = ("relu", "softplus", "tanh", "cos")

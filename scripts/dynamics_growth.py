@@ -10,9 +10,9 @@ from rich.table import Table
 
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.load import compiled
+from dln_jax.files import write_json
 from dln_jax.learning.runs import Training, data_type
 from dln_jax.learning.train import train
-from scripts.command_line import write_json
 from scripts.dynamics_metrics import Task, latency_of
 
 WIDTHS = (4, 8, 16, 32)

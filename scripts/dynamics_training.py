@@ -1,6 +1,7 @@
 """What train_delan and train_hnn share: from a command line to a trained model of dynamics in a run folder."""
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.data.splits import Split, split
 from dln_jax.deploy.kinds import build, describe, objective_of
 from dln_jax.deploy.load import save_model
+from dln_jax.files import write_json
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.residuals import TORQUE, Objective
 from dln_jax.learning.runs import Progress, Stop, Training
@@ -20,7 +22,7 @@ from dln_jax.learning.train import Settings, automatic_optimizer, check, train, 
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import CONFIG, new_folder, scene_named, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, results_table
@@ -57,8 +59,8 @@ class Arguments:
     """trigonometric: degree of the polynomials in each joint."""
     steps: int | None = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
-    seconds: float = float("inf")
-    """gauss-newton: seconds after which to stop, compilation included."""
+    seconds: float | None = None
+    """gauss-newton: seconds after which to stop, compilation included (default: no limit)."""
     batch: int = 512
     """adam: samples per step."""
     learning_rate: float = 5e-3
@@ -163,6 +165,7 @@ def model_and_settings(
         "precision": precision,
         "steps": given.steps if given.steps is not None else DEFAULT_STEPS[optimizer],
         "target": given.target or 0.0,
+        "seconds": given.seconds if given.seconds is not None else math.inf,
     }
     return description, Settings(**{**given_as_is, **stated}), reason
 

@@ -14,9 +14,10 @@ import numpy as np
 from rich.console import Console
 
 from dln_jax.evaluation.report import conditions, write_report
+from dln_jax.files import write_json
 from dln_jax.types import InputError, require_positive
 from scripts import pixel_task as pixels
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import description_of, models_of, train
 from scripts.hnn_published import PIXELS, markdown, rows_of

@@ -15,9 +15,10 @@ from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.evaluation import animations, figures
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.phase_figures import TRUTH
+from dln_jax.files import write_json
 from dln_jax.learning.runs import Progress
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import CONFIG, new_folder, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of

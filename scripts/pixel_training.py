@@ -7,10 +7,11 @@ from rich.console import Console
 
 from dln_jax.deploy.load_latent import save_latent
 from dln_jax.evaluation import figures
+from dln_jax.files import write_json
 from dln_jax.learning.runs import Checkpoint, Progress, fingerprint
 from dln_jax.types import InputError, require_positive
 from scripts import pixel_task
-from scripts.command_line import CONFIG, new_folder, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, stored_arguments
 from scripts.progress import progress
 
 if TYPE_CHECKING:

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
+from dln_jax.files import write_json
 from dln_jax.softbody.driven import Example, beginning, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.mesh import Mesh, make_mesh
@@ -34,7 +35,7 @@ from dln_jax.softbody.step import Integrator, Step
 from dln_jax.softbody.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.solvers.minimise import Info
 from dln_jax.types import InputError, require_positive
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 from scripts.progress import progress
 from scripts.simulate_outputs import Motion, draw, results, results_table, warn
 

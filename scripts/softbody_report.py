@@ -14,9 +14,10 @@ from dln_jax.evaluation.case import Case
 from dln_jax.evaluation.report import conditions
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.evaluation.soft_cases.figures import FIGURES
+from dln_jax.files import write_json
 from dln_jax.types import InputError
 from scripts.case_report import write_and_print
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from rich.console import Console
 from dln_jax.evaluation.hard_cases import NAMES, Case, measure
 from dln_jax.evaluation.hard_cases.figures import FIGURES
 from dln_jax.evaluation.report import conditions
+from dln_jax.files import write_json
 from dln_jax.types import InputError, require_positive
 from scripts.case_report import write_and_print
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 
 
 @dataclass(frozen=True)

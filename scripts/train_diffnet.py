@@ -23,13 +23,14 @@ from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.evaluation import function_figures as figures
 from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
+from dln_jax.files import write_json
 from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, steps_of, train
 from dln_jax.learning.runs import Checkpoint, Training, fingerprint
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from scripts import diffnet_table
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 
 NAMED = {

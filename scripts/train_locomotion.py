@@ -21,6 +21,7 @@ from rich.table import Table
 from dln_jax.deploy.load import save_model
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.evaluation.soft_body_animations import write_soft_body_gif
+from dln_jax.files import write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.learning import Goal, Record
 from dln_jax.locomotion.methods import METHODS, STEPS, Method, Trained, settings_of, shown_walk, train
@@ -29,7 +30,7 @@ from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, FALLEN, UPRIGHT, Task, creature_named, make_task
 from dln_jax.softbody.creature_terms import TIME_STEP
 from dln_jax.types import InputError, require_positive
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments, write_json
+from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 from scripts.report_table import print_report
 

@@ -7,7 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 FLOORS = {
-    "types": -1,  # symbols: everyone may read them
+    "types": -2,  # symbols: everyone may read them
+    "files": -1,
     "nn": 0,
     "solvers": 0,
     "mechanics": 1,
