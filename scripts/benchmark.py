@@ -27,6 +27,7 @@ from scripts import (
     benchmark_throughput,
     benchmark_training,
 )
+from scripts.arguments import Unstated
 from scripts.command_line import new_folder, run
 from scripts.report_table import print_report
 
@@ -52,7 +53,7 @@ class Arguments:
     """What is measured."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json, a Markdown table and a figure of each subject (default: runs/benchmark-1, -2, ...)."""
 
 

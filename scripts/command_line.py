@@ -6,10 +6,9 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import jax
-import tyro
 
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
@@ -21,6 +20,7 @@ from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
+from scripts.arguments import choice, parse
 
 CONFIG = "config.json"
 """Name of the file in a run's folder that holds the arguments it was started with."""
@@ -39,6 +39,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "three-body": lambda: n_body(3),
     **{f"chain-{d}": (lambda d=d: chain(d)) for d in range(1, 13)},
 }
+SceneName = Annotated[str, choice(SCENES)]
 
 Arguments = TypeVar("Arguments")
 
@@ -49,14 +50,18 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
     jax.config.update("jax_enable_x64", True)
     module = sys.modules[main.__module__]
     name = module.__spec__.name if module.__spec__ else module.__name__
-    given = tyro.cli(arguments, prog=f"python -m {name}", description=module.__doc__)
     try:
-        main(given)
+        main(parse(arguments, prog=f"python -m {name}", description=module.__doc__))
+        sys.stdout.flush()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except BrokenPipeError:
+        # Whoever read the output has gone; the interpreter must not try to flush it once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
+    except KeyboardInterrupt as stop:
+        print("\n".join(["interrupted", *map(str, stop.args)]), file=sys.stderr)
         raise SystemExit(130) from None
 
 

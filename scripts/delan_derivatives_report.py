@@ -21,6 +21,7 @@ from dln_jax.models.delan import cholesky_factor
 from dln_jax.nn import differential_mlp as network
 from dln_jax.nn.activations import tanh
 from dln_jax.types import require_positive
+from scripts.arguments import Unstated
 from scripts.command_line import new_folder, run
 from scripts.report_table import print_report
 
@@ -36,7 +37,7 @@ class Arguments:
     """Interleaved timings of each way, of which the median counts."""
     width: int = 64
     """Hidden units of the two layers of each network."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json (default: runs/delan_derivatives_report-1, -2, ...)."""
 
 

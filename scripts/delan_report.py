@@ -23,6 +23,7 @@ from dln_jax.learning.train import Settings, train
 from dln_jax.scenes.scene import closed_form_forward_dynamics, closed_form_inverse_dynamics, dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import require_positive
+from scripts.arguments import Unstated
 from scripts.command_line import new_folder, run
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.progress import progress
@@ -52,7 +53,7 @@ UNITS = {"power_mse": "W^2", "forward_mse": "1/s^4"}
 class Arguments:
     """What to measure on."""
 
-    data: Path | None = None
+    data: Unstated[Path] = None
     """Trajectories of the two-link arm in the npz schema (default: the embedded letters)."""
     test: str = ",".join(CHARACTERS_TEST)
     """Labels of the test trajectories, comma separated."""
@@ -60,7 +61,7 @@ class Arguments:
     """How many seeds to train, from 0 upwards; each also draws its own validation letters."""
     steps: int = 20_000
     """Optimiser steps."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json (default: runs/delan_report-1, -2, ...)."""
 
 

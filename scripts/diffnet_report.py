@@ -10,6 +10,7 @@ machine slows all alike; medians are compared. Prints a table and writes report.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,8 @@ from dln_jax.evaluation.latency import medians_in_turns
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import require_positive
+from scripts.arguments import Unstated, choice, names_in
 from scripts.command_line import new_folder, run
 from scripts.report_table import report_table
 
@@ -40,19 +42,18 @@ class Arguments:
     """Hidden layers."""
     batch: int = 512
     """Samples at once."""
-    activation: str = "tanh"
-    """Of the hidden layers: tanh, softplus, cos, sin or silu."""
+    activation: Annotated[str, choice(PLAIN)] = "tanh"
+    """Of the hidden layers."""
     repetitions: int = 30
     """Timed calls of each program."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json (default: runs/diffnet_report-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_positive(width=given.width, depth=given.depth, batch=given.batch, repetitions=given.repetitions)
-    if given.activation not in PLAIN:
-        raise InputError(f"activation '{given.activation}' is unknown; choose one of {', '.join(PLAIN)}")
+    names_in("--activation", given.activation, PLAIN)
     folder = new_folder(given.out, "diffnet_report")
     rows = [row for inputs in INPUTS for row in rows_for(inputs, given)]
     network = f"{given.depth} layers of {given.width}, {given.activation}, batch {given.batch}"

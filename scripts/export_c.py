@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from dln_jax.deploy.c_source import export_run
+from scripts.arguments import Unstated
 from scripts.command_line import run
 
 
@@ -21,7 +22,7 @@ class Arguments:
     """Folder of a training run, with model.json and model.safetensors."""
     out: Path
     """Folder for NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt; created where it is missing."""
-    precision: Literal["f32", "f64"] | None = None
+    precision: Unstated[Literal["f32", "f64"]] = None
     """float or double (default: that of the training)."""
     name: str = "model"
     """A C name; files and functions start with it."""

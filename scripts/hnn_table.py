@@ -9,6 +9,7 @@ table, writes report.json and table.md, and draws each task's motions and energi
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from rich.console import Console
@@ -17,6 +18,7 @@ from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.files import write_json
 from dln_jax.types import InputError, require_positive
 from scripts import pixel_task as pixels
+from scripts.arguments import Unstated, choice, names_in
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import description_of, models_of, train
@@ -34,17 +36,17 @@ JOBS = "jobs.json"
 class Arguments:
     """What to measure."""
 
-    tasks: str = ",".join(TASKS)
-    """Comma separated, from spring, pendulum, real-pendulum, two-body, three-body, pixels."""
-    real_pendulum: Path | None = None
+    tasks: Annotated[str, choice(TASKS, several=True)] = ",".join(TASKS)
+    """Tasks (default: all)."""
+    real_pendulum: Unstated[Path] = None
     """The measured pendulum (Schmidt and Lipson 2009) in the npz schema; without it that task is left out."""
     seeds: int = 3
     """Seeds of each model: 0, 1, ..."""
-    trajectories: int | None = None
+    trajectories: Unstated[int] = None
     """Generated trajectories of each task, for a trial (default: as published)."""
-    steps: int | None = None
+    steps: Unstated[int] = None
     """Iterations of each fit (default: each task's own)."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json and the figures (default: runs/hnn_table-1, -2, ...)."""
     resume: bool = False
     """Continue the measurement in --out."""
@@ -96,10 +98,7 @@ def chosen_tasks(given: Arguments) -> list[str]:
     for key in ("steps", "trajectories"):
         if getattr(given, key) is not None:
             require_positive(**{key: getattr(given, key)})
-    names = given.tasks.split(",")
-    for name in names:
-        if name not in TASKS:
-            raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}")
+    names = names_in("--tasks", given.tasks, TASKS)
     if given.real_pendulum is None:
         names = [name for name in names if name != REAL]
         if not names:

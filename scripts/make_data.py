@@ -11,7 +11,15 @@ from typing import Literal
 from dln_jax.data import generators, schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
-from scripts.command_line import run, scene_named
+from scripts.arguments import Unstated, refuse_stated
+from scripts.command_line import SceneName, run, scene_named
+
+OF_KIND = {
+    "characters": ("dt",),
+    "uniform": ("samples", "position_bound", "rate_bound", "acceleration_bound", "control_bound", "seed"),
+    "free-swing": ("trajectories", "steps", "dt", "seed"),
+}
+"""Options of each kind; what is not given is the generator's own choice."""
 
 
 @dataclass(frozen=True)
@@ -20,28 +28,28 @@ class Arguments:
 
     out: Path
     """File to write; its name ends in .npz."""
-    scene: str = "two-link-arm"
-    """two-link-arm, two-link-arm-hanging, pendulum, double-pendulum, cart-pole, or chain-1 to chain-12."""
+    scene: SceneName = "two-link-arm"
+    """What moves."""
     kind: Literal["characters", "uniform", "free-swing"] = "characters"
     """How to sample the scene."""
-    samples: int = 3000
-    """States of the uniform kind."""
-    position_bound: float = 3.141592653589793
-    """Uniform kind: half the box of q, rad or m."""
-    rate_bound: float = 5.0
-    """Uniform kind: half the box of qd, 1/s."""
-    acceleration_bound: float = 20.0
-    """Uniform kind: half the box of qdd, 1/s² (fully actuated scenes)."""
-    control_bound: float = 10.0
-    """Uniform kind: half the box of the controls, N m or N (under-actuated scenes)."""
-    trajectories: int = 10
-    """Motions of the free-swing kind."""
-    steps: int = 400
-    """Free-swing kind: samples per motion."""
-    dt: float | None = None
-    """Time between samples, s (default 0.04 for characters, 0.02 for free-swing)."""
-    seed: int = 0
-    """Of everything that is drawn."""
+    samples: Unstated[int] = None
+    """uniform: states (default: 3000)."""
+    position_bound: Unstated[float] = None
+    """uniform: half the box of q, rad or m (default: pi)."""
+    rate_bound: Unstated[float] = None
+    """uniform: half the box of qd, 1/s (default: 5)."""
+    acceleration_bound: Unstated[float] = None
+    """uniform, fully actuated scenes: half the box of qdd, 1/s² (default: 20)."""
+    control_bound: Unstated[float] = None
+    """uniform, under-actuated scenes: half the box of the controls, N m or N (default: 10)."""
+    trajectories: Unstated[int] = None
+    """free-swing: motions (default: 10)."""
+    steps: Unstated[int] = None
+    """free-swing: samples per motion (default: 400)."""
+    dt: Unstated[float] = None
+    """characters, free-swing: time between samples, s (default: 0.04 for characters, 0.02 for free-swing)."""
+    seed: Unstated[int] = None
+    """uniform, free-swing: of everything that is drawn (default: 0)."""
     overwrite: bool = False
     """Replace the file if it exists."""
 
@@ -57,27 +65,18 @@ def main(given: Arguments) -> None:
 def generate(given: Arguments) -> Trajectories:
     """The trajectories that the arguments ask for."""
     scene = scene_named(given.scene)
+    unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[given.kind])
+    refuse_stated(given, unused, f"for --kind {given.kind}")
+    chosen = {name: getattr(given, name) for name in OF_KIND[given.kind] if getattr(given, name) is not None}
     if given.kind == "characters":
         if scene.name != "two-link-arm":
             raise InputError(f"characters are written by the two-link-arm, not by {scene.name}; choose another --kind")
-        return generators.characters(dt=0.04 if given.dt is None else given.dt)
+        return generators.characters(**chosen)
     if given.kind == "uniform":
-        return generators.uniform(
-            scene,
-            samples=given.samples,
-            position_bound=given.position_bound,
-            rate_bound=given.rate_bound,
-            acceleration_bound=given.acceleration_bound,
-            control_bound=given.control_bound,
-            seed=given.seed,
-        )
-    return generators.free_swing(
-        scene,
-        trajectories=given.trajectories,
-        steps=given.steps,
-        dt=0.02 if given.dt is None else given.dt,
-        seed=given.seed,
-    )
+        actuated = scene.needs.actuation is None
+        refuse_stated(given, {"control_bound" if actuated else "acceleration_bound"}, f"for the scene {given.scene}")
+        return generators.uniform(scene, **chosen)
+    return generators.free_swing(scene, **chosen)
 
 
 if __name__ == "__main__":

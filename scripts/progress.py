@@ -1,31 +1,35 @@
 """Live progress: a bar on a terminal, a line now and then elsewhere."""
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 5.0
+ROOM_FOR_RATE = 110
+"""Columns of a terminal from which there is room for the rate beside the count, the time left and the text."""
 
 
 @contextmanager
-def progress(total: int, unit: str = "steps") -> Iterator[Callable[[int, str], None]]:
-    """Yields `show(done, text)`; the bar adds rate and time left."""
-    if sys.stdout.isatty():
-        columns = (
-            BarColumn(bar_width=24),
+def progress(
+    total: int, unit: str = "steps", *, console: Console | None = None
+) -> Iterator[Callable[[int, str], None]]:
+    """Yields `show(done, text)`; count, text and time left are whole at 80 columns, and the bar takes what is over."""
+    console = console or Console()
+    if console.is_terminal:
+        columns = [
             MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            BarColumn(bar_width=None),
+            TextColumn("{task.fields[left]}"),
+            TimeRemainingColumn(compact=True),
             TextColumn("{task.description}"),
-        )
-        with Progress(*columns, console=Console()) as bar:
-            task = bar.add_task("compiling", total=total, rate="")
+        ]
+        if console.width >= ROOM_FOR_RATE:
+            columns.insert(1, TextColumn("{task.fields[rate]}"))
+        with Progress(*columns, console=console, expand=True) as bar:
+            task = bar.add_task("compiling", total=total, rate="", left="left")
             first: list[tuple[int, float]] = []
 
             def show(done: int, text: str) -> None:
@@ -41,7 +45,7 @@ def progress(total: int, unit: str = "steps") -> Iterator[Callable[[int, str], N
             first.append((done, now)) if not first else None
             if done >= total or now - last[0] >= SECONDS_BETWEEN_LINES:
                 last[0] = now
-                print(f"{done}/{total} {unit}  {text}  {_rate(first[0], done, unit)}", flush=True)
+                print(f"{done}/{total} {unit}  {text}  {_rate(first[0], done, unit)}".rstrip(), flush=True)
 
         yield show_line
 

@@ -16,7 +16,7 @@ import time
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ from dln_jax.softbody.step import Integrator, Step
 from dln_jax.softbody.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.solvers.minimise import Info
 from dln_jax.types import InputError, require_positive
+from scripts.arguments import Unstated
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 from scripts.progress import progress
 from scripts.simulate_outputs import Motion, draw, results, results_table, warn
@@ -45,7 +46,7 @@ MATERIALS = {
     "st-venant-kirchhoff": st_venant_kirchhoff,
     "corotated": corotated,
 }
-PRECISIONS = {"float32": jnp.float32, "float64": jnp.float64}
+PRECISIONS = {"f32": jnp.float32, "f64": jnp.float64}
 CHUNKS = 20
 """Programs called for a motion, after each of which progress is shown."""
 ALL = "all"
@@ -57,38 +58,38 @@ GALLERY = (0, 3, 2, 1, 4)
 class Arguments:
     """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
 
-    scene: str = "beam"
-    """beam, twist, slope, drop or creature; or all, each in a folder of its own, with one picture of them."""
-    integrator: str = "backward-euler"
-    """backward-euler (damps), bdf2 (second order, damps little) or midpoint (second order, does not damp)."""
-    dt: float | None = None
+    scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
+    """What to simulate; all: each in a folder of its own, with one picture of them."""
+    integrator: Integrator = "backward-euler"
+    """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
+    dt: Unstated[float] = None
     """Time step in s."""
-    seconds: float | None = None
+    seconds: Unstated[float] = None
     """Length of the motion in s."""
-    cells: int | None = None
+    cells: Unstated[int] = None
     """Cells across the body (drop: rings of the disc); not for the creature."""
-    dimension: int | None = None
+    dimension: Unstated[int] = None
     """2 or 3, for beam and drop."""
-    youngs_modulus: float | None = None
+    youngs_modulus: Unstated[float] = None
     """E in Pa; not for the creature."""
-    poisson_ratio: float | None = None
+    poisson_ratio: Unstated[float] = None
     """Between -1 and 0.5; not for the creature."""
-    friction: float | None = None
+    friction: Unstated[float] = None
     """Coulomb's coefficient, for slope and drop."""
-    turns: float | None = None
+    turns: Unstated[float] = None
     """Turns of one end against the other, for twist."""
-    material: str | None = None
-    """stable-neo-hookean, neo-hookean, st-venant-kirchhoff or corotated; not for the creature."""
-    mesh: Path | None = None
+    material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
+    """Not for the creature (default: stable-neo-hookean)."""
+    mesh: Unstated[Path] = None
     """Your own mesh, for beam and drop: see above."""
-    precision: str = "float64"
-    """float32 or float64."""
+    precision: Literal["f32", "f64"] = "f64"
+    """Floating-point type."""
     seed: int = 0
     """Of the turning rate in drop, and of its box's tilt; nothing else is random."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Run folder (default: runs/simulate-1, -2, ...)."""
-    gif: bool = True
-    """Write the GIF."""
+    figures: bool = True
+    """Draw the figures and the GIF."""
 
 
 class Prepared(NamedTuple):
@@ -113,7 +114,7 @@ def main(given: Arguments) -> None:
         own = folder if len(names) == 1 else folder / each.given.scene
         own.mkdir(exist_ok=True)
         pictures.append(simulate(each, own, console))
-    if len(names) > 1:
+    if len(names) > 1 and given.figures:
         gallery = moments_figure([pictures[i] for i in GALLERY], columns=3, width=11.5)
         gallery.savefig(folder / "soft-bodies.png", dpi=86)
     console.print(f"run folder: {folder}")
@@ -144,12 +145,14 @@ def simulate(prepared: Prepared, folder: Path, console: Console) -> Moments:
     rows = results(given.scene, mesh, motion)
     numbers = {row.quantity: row.value for row in rows if math.isfinite(row.value)}
     write_json(folder / "metrics.json", numbers)
-    facts = conditions(dtype=given.precision, seeds=[given.seed], integrator=given.integrator, dt=dt)
+    facts = conditions(
+        dtype=jnp.dtype(PRECISIONS[given.precision]).name, seeds=[given.seed], integrator=given.integrator, dt=dt
+    )
     write_report(folder / "report.json", rows, facts)
     console.print(results_table(rows))
     warn(motion, console)
     title = f"{given.scene}: {given.integrator}, dt = {dt:.4g} s"
-    return draw(given.scene, example, motion, folder, title=title, gif=given.gif)
+    return draw(given.scene, example, motion, folder, title=title, figures=given.figures)
 
 
 def example_of(given: Arguments) -> Example:
@@ -158,14 +161,12 @@ def example_of(given: Arguments) -> Example:
     Raises:
         InputError: an unknown name, a choice that the scene does not have, or a value that cannot be.
     """
-    scene = chosen("--scene", given.scene, EXAMPLES, ALL)
-    chosen("--integrator", given.integrator, dict.fromkeys(get_args(Integrator)))
-    precision = chosen("--precision", given.precision, PRECISIONS)
+    scene = EXAMPLES[given.scene]
     choices: dict[str, Any] = {
         name: getattr(given, name)
         for name in ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
     }
-    choices["strain_energy"] = None if given.material is None else chosen("--material", given.material, MATERIALS)
+    choices["strain_energy"] = None if given.material is None else MATERIALS[given.material]
     choices = {name: value for name, value in choices.items() if value is not None}
     known = inspect.signature(scene).parameters
     for name in choices:
@@ -183,15 +184,9 @@ def example_of(given: Arguments) -> Example:
     if "seed" in known:
         choices["seed"] = given.seed
     example = scene(**choices)
+    precision = PRECISIONS[given.precision]
     params = in_precision(example.scene.params, precision)
     return example._replace(scene=example.scene._replace(params=params), state=in_precision(example.state, precision))
-
-
-def chosen(option: str, name: str, names: dict[str, Any], *others: str) -> Any:
-    """What a name stands for; `InputError` lists the names."""
-    if name not in names:
-        raise InputError(f"{option} '{name}' is unknown; choose from {', '.join([*names, *others])}")
-    return names[name]
 
 
 def read_mesh(path: Path) -> tuple[Mesh, np.ndarray | None]:

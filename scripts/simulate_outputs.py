@@ -88,7 +88,7 @@ def finite_moments(motion: Motion) -> int:
     return int(np.argmax(bad)) if bad.any() else len(bad)
 
 
-def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: str, gif: bool) -> Moments:
+def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: str, figures: bool) -> Moments:
     """Writes the figures and the GIF; gives what the picture of moments shows."""
     shown = finite_moments(motion)
     dt = float(motion.t[1])
@@ -98,13 +98,13 @@ def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: s
     if control is not None:
         # The start has the actuation of the first step.
         control = jnp.concatenate([control[:1], control])[:shown]
+    picture = moments(scene, example, t, x)
+    if not figures:
+        return picture
     energies = motion_energies(example.scene, example.scene.params, jnp.asarray(x), jnp.asarray(v), control)
     figure = energies_against_time(t, energies, taken=what_takes(example), title=title)
     figure.savefig(folder / "energy.png")
-    picture = moments(scene, example, t, x)
     moments_figure([picture], columns=1).savefig(folder / "moments.png")
-    if not gif:
-        return picture
     stride = max(round(1 / (FRAMES_PER_SECOND * dt)), math.ceil(shown / MOST_FRAMES), 1)
     mesh, positions = with_slope(example, x)
     write_soft_body_gif(

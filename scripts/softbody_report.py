@@ -7,6 +7,7 @@ float64 unless a case says otherwise.
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
@@ -15,7 +16,7 @@ from dln_jax.evaluation.report import conditions
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.evaluation.soft_cases.figures import FIGURES
 from dln_jax.files import write_json
-from dln_jax.types import InputError
+from scripts.arguments import Unstated, choice, names_in
 from scripts.case_report import write_and_print
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 
@@ -24,11 +25,11 @@ from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 class Arguments:
     """What to measure."""
 
-    only: str = ",".join(SUBJECTS)
-    """Subjects, comma separated."""
+    only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
+    """Subjects (default: all)."""
     quick: bool = False
     """Smaller meshes, fewer and shorter motions: 90 s instead of minutes."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json and the figures (default: runs/softbody-1, -2, ...)."""
     figures: bool = True
     """Draw the figures."""
@@ -36,11 +37,7 @@ class Arguments:
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
-    subjects = [name.strip() for name in given.only.split(",") if name.strip()]
-    if unknown := [name for name in subjects if name not in SUBJECTS]:
-        raise InputError(f"--only: '{unknown[0]}' is unknown; choose from {', '.join(SUBJECTS)}")
-    if not subjects:
-        raise InputError(f"--only names no subject; choose from {', '.join(SUBJECTS)}")
+    subjects = names_in("--only", given.only, SUBJECTS)
     folder = new_folder(given.out, "softbody")
     write_json(folder / CONFIG, stored_arguments(given))
     console = Console(highlight=False, soft_wrap=True)

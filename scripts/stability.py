@@ -7,6 +7,7 @@ says otherwise.
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 
@@ -14,7 +15,8 @@ from dln_jax.evaluation.hard_cases import NAMES, Case, measure
 from dln_jax.evaluation.hard_cases.figures import FIGURES
 from dln_jax.evaluation.report import conditions
 from dln_jax.files import write_json
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import require_positive
+from scripts.arguments import Unstated, choice, names_in
 from scripts.case_report import write_and_print
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 
@@ -23,11 +25,11 @@ from scripts.command_line import CONFIG, new_folder, run, stored_arguments
 class Arguments:
     """What to measure."""
 
-    only: str = ",".join(NAMES)
-    """Hard cases, comma separated."""
+    only: Annotated[str, choice(NAMES, several=True)] = ",".join(NAMES)
+    """Hard cases (default: all)."""
     steps: int = 100_000
     """Of the long motions: the separatrix and the double pendulum."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json and the figures (default: runs/stability-1, -2, ...)."""
     figures: bool = True
     """Draw the figures."""
@@ -36,11 +38,7 @@ class Arguments:
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_positive(steps=given.steps)
-    names = [name.strip() for name in given.only.split(",") if name.strip()]
-    if unknown := [name for name in names if name not in NAMES]:
-        raise InputError(f"--only: '{unknown[0]}' is unknown; choose from {', '.join(NAMES)}")
-    if not names:
-        raise InputError(f"--only names no case; choose from {', '.join(NAMES)}")
+    names = names_in("--only", given.only, NAMES)
     folder = new_folder(given.out, "stability")
     write_json(folder / CONFIG, stored_arguments(given))
     console = Console(highlight=False, soft_wrap=True)

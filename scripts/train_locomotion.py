@@ -30,12 +30,15 @@ from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, FALLEN, UPRIGHT, Task, creature_named, make_task
 from dln_jax.softbody.creature_terms import TIME_STEP
 from dln_jax.types import InputError, require_positive
+from scripts.arguments import Unstated, refuse_stated
 from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 from scripts.report_table import print_report
 
 GOAL = 1.0
 """Body lengths that the methods are compared by."""
+UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
+"""Options that a method does not use."""
 COMPARED_UNTIL = 1.2
 """Body lengths at which a seed ends in a comparison."""
 
@@ -52,11 +55,11 @@ class Arguments:
     """All methods, 3 seeds each unless --seeds says otherwise, until 1.2 body lengths or --steps."""
     seed: int = 0
     """The first seed."""
-    seeds: int | None = None
+    seeds: Unstated[int] = None
     """How many seeds, one after the other (default: 1, with --compare 3)."""
-    steps: int | None = None
+    steps: Unstated[int] = None
     """Environment steps of each seed (default: 40000 by gradient, 500000 by evolution, 300000 by ppo)."""
-    until: float | None = None
+    until: Unstated[float] = None
     """Body lengths at which a seed ends (default: none, with --compare 1.2)."""
     upright: float = UPRIGHT
     """Weight of the posture in the reward, body lengths per episode."""
@@ -64,11 +67,11 @@ class Arguments:
     """Steps of 0.033 s of one turn of the policy's clock."""
     episode: int = EPISODE
     """Steps of 0.033 s."""
-    window: int | None = None
-    """Steps that gradients go back; divides the episode (default: 40, of the biped 80)."""
-    width: int = WIDTH
-    """Hidden units of the policy (gradient and evolution)."""
-    out: Path | None = None
+    window: Unstated[int] = None
+    """gradient: steps that gradients go back; divides the episode (default: 40, of the biped 80)."""
+    width: Unstated[int] = None
+    """gradient, evolution: hidden units of the policy (default: 32)."""
+    out: Unstated[Path] = None
     """Run folder (default: runs/train_locomotion-1, -2, ...)."""
     resume: bool = False
     """Continue the run in --out bit for bit (gradient and evolution)."""
@@ -103,8 +106,9 @@ def main(given: Arguments) -> None:
 
 def check(given: Arguments) -> None:
     """Refuses what cannot be trained, before anything is written."""
-    require_positive(width=given.width, episode=given.episode, clock_period=given.clock_period)
-    for name in ("seeds", "steps", "until", "window"):
+    require_positive(episode=given.episode, clock_period=given.clock_period)
+    refuse_stated(given, () if given.compare else UNUSED[given.method], f"by --method {given.method}")
+    for name in ("seeds", "steps", "until", "window", "width"):
         if getattr(given, name) is not None:
             require_positive(**{name: getattr(given, name)})
     if not (math.isfinite(given.upright) and given.upright >= 0):
@@ -113,6 +117,11 @@ def check(given: Arguments) -> None:
         raise InputError("--resume is for one run of gradient or evolution; train again without it")
     if given.compare or given.method == "ppo":
         require_stable_baselines3()
+
+
+def width_of(given: Arguments) -> int:
+    """Hidden units of the policy."""
+    return WIDTH if given.width is None else given.width
 
 
 def learned(given: Arguments, task: Task, method: Method, folder: Path) -> Trained:
@@ -133,7 +142,7 @@ def learned(given: Arguments, task: Task, method: Method, folder: Path) -> Train
             method,
             seeds=seeds,
             goal=Goal(steps, until),
-            width=given.width,
+            width=width_of(given),
             window=given.window,
             directory=None if given.compare else folder,
             resume=given.resume,
@@ -146,8 +155,11 @@ def write_run(given: Arguments, task: Task, method: Method, trained: Trained, fo
     best = trained.best
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
-    description = {"kind": f"locomotion-{method}", "creature": given.creature, "width": given.width, "precision": "f64"}
-    description |= {
+    description = {
+        "kind": f"locomotion-{method}",
+        "creature": given.creature,
+        "width": width_of(given),
+        "precision": "f64",
         "clock_period": given.clock_period,
         "settings": settings_of(method, given.creature, given.window)._asdict(),
     }

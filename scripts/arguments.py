@@ -1,0 +1,87 @@
+"""Typed command lines: what help shows, and a mistake as one line."""
+
+import contextlib
+import dataclasses
+import io
+import re
+from collections.abc import Iterable
+from types import NoneType
+from typing import Annotated, Any, TypeVar, get_args
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from dln_jax.types import InputError
+
+T = TypeVar("T")
+Arguments = TypeVar("Arguments")
+
+Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
+"""An option that is `None` where it is not given; its own text says what then holds."""
+
+_rules = ConstructorRegistry()
+
+
+@_rules.primitive_rule
+def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Shows `X | None` as X: nobody types None."""
+    members = [member for member in get_args(info.type) if member is not NoneType]
+    if len(members) != 1 or NoneType not in get_args(info.type):
+        return None
+    of_value = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(members[0], info.markers))
+    if not isinstance(of_value, PrimitiveConstructorSpec):
+        return None
+    return dataclasses.replace(
+        of_value,
+        is_instance=lambda value: value is None or of_value.is_instance(value),
+        str_from_instance=lambda value: ["none"] if value is None else of_value.str_from_instance(value),
+    )
+
+
+def choice(names: Iterable[str], *, several: bool = False) -> Any:
+    """For `Annotated[str, ...]`: shows the names of which an option takes one, or several, by default all."""
+    return tyro.conf.arg(
+        metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several else None
+    )
+
+
+def parse(arguments: type[Arguments], *, prog: str, description: str | None) -> Arguments:
+    """The arguments of this process's command line; `--help` prints the text and exits.
+
+    Raises:
+        InputError: what cannot be parsed.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(arguments, prog=prog, description=description, registry=_rules)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(f"{_complaint(said.getvalue())} (see {prog} --help)") from None
+
+
+def refuse_stated(given: Any, names: Iterable[str], where: str) -> None:
+    """Raises `InputError` where one of these options, which are not used `where`, was given."""
+    for name in sorted(names):
+        if getattr(given, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')} is not used {where}; leave it out")
+
+
+def names_in(option: str, given: str, known: Iterable[str]) -> list[str]:
+    """The names of a comma-separated list; `InputError` lists those that there are."""
+    names = [name.strip() for name in given.split(",") if name.strip()]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"{option}: '{unknown[0]}' is unknown; choose from {', '.join(known)}")
+    if not names:
+        raise InputError(f"{option} names nothing; choose from {', '.join(known)}")
+    return names
+
+
+def _complaint(box: str) -> str:
+    """The first section below the title of a box of text, on one line; a rule follows the title of one in ASCII."""
+    framed = "│" in box
+    lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
+    sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
+    section = sections[0] if framed else sections[min(1, len(sections) - 1)]
+    return " ".join(section.split()).rstrip(".")
