@@ -5,14 +5,16 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.deploy import load_c as loading
+from dln_jax.deploy import c_interface
 from dln_jax.deploy.c_source import export_c, source_files
+from dln_jax.deploy.exports import described, read_export, write_exports
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.load import save_model
 from dln_jax.deploy.load_c import FLAGS, CFunction, compile_c, load_c
@@ -236,8 +238,8 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     model = random_model("delan-2-shared")
     once, again = (source_files(*model, name="arm", precision="f32") for _ in range(2))
     assert once == again
-    header, source = once["arm.h"], once["arm.c"]
-    for words in ("kind structured-delan", "C format 1", "prismatic (m), revolute (rad)", "N m", "without friction"):
+    header, source = once["arm.h"].decode(), once["arm.c"].decode()
+    for words in ("kind structured-delan", "C format 2", "prismatic (m), revolute (rad)", "N m", "without friction"):
         assert words in header
     assert "void arm_inverse_dynamics(const float q[2], const float qd[2], const float qdd[2], float tau[2]);" in header
     assert re.findall(r"#include (\S+)", source) == ["<math.h>", '"arm.h"']
@@ -338,6 +340,182 @@ def test_the_loader_says_what_is_missing(tmp_path, monkeypatch):
     if shutil.which("cc"):
         with pytest.raises(InputError, match=r"could not compile the model: .*error"):
             load_c(tmp_path, flags=("--no-such-flag",))
-    monkeypatch.setattr(loading, "FORMAT", 2)
-    with pytest.raises(InputError, match="C format 1; this release reads format 2"):
+    monkeypatch.setattr(c_interface, "FORMAT", 3)
+    with pytest.raises(InputError, match="C format 2; this release reads format 3"):
         load_c(tmp_path)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("name", ["model", "checkpoint", "config", "metrics", "arm"])
+def test_a_run_is_never_written_over(folder, monkeypatch, capsys, name):
+    (folder / "config.json").write_text("{}")
+    before = contents(folder)
+    line = refused(monkeypatch, capsys, "--run", folder, "--out", folder, "--name", name, "--overwrite")
+    assert "the folder of a run" in line and contents(folder) == before
+    # Where no manifest says so, what describes no export stays as it is.
+    (folder.parent / "other").mkdir()
+    (folder.parent / "other" / f"{name}.json").write_text('{"torque_mse": 1.0}')
+    there = ("--run", folder, "--out", folder.parent / "other", "--name", name, "--overwrite")
+    assert "describes no export of this name" in refused(monkeypatch, capsys, *there)
+    assert contents(folder.parent / "other") == {f"{name}.json": b'{"torque_mse": 1.0}'}
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    (tmp_path / "model.c").mkdir()
+    with pytest.raises(InputError, match=r"model\.c is no file"):
+        export_c(*random_model("delan-1"), tmp_path, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.c"]
+
+
+class Killed(BaseException):
+    """Ends a process as a signal would."""
+
+
+@pytest.mark.parametrize("renamed", range(7))
+def test_a_kill_leaves_an_old_export_or_a_new_one_or_a_refusal(tmp_path, monkeypatch, renamed):
+    """Two exports of two files, in place of older ones, killed before any of the six renames."""
+    old, new = ({f"{name}.{end}": age + end.encode() for name in "ab" for end in "hc"} for age in (b"old ", b"new "))
+
+    def written(files):
+        ours = {name: {key: data for key, data in files.items() if key.startswith(name)} for name in "ab"}
+        return {**files, **{f"{name}.json": described({"age": 1}, each) for name, each in ours.items()}}
+
+    write_exports(tmp_path, written(old), overwrite=False)
+    replace, count = Path.replace, iter(range(7))
+
+    def killed_before(self, target):
+        if next(count) == renamed:
+            raise Killed
+        return replace(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", killed_before)
+        patch.setattr(Path, "unlink", lambda self, **_: None)
+        if renamed == 6:
+            write_exports(tmp_path, written(new), overwrite=True)
+        else:
+            with pytest.raises(Killed):
+                write_exports(tmp_path, written(new), overwrite=True)
+    read = {}
+    for name in "ab":
+        try:
+            read |= read_export(tmp_path / f"{name}.json", (f"{name}.h", f"{name}.c"))[1]
+        except InputError as error:
+            assert "truncated or altered" in str(error)
+    # Never old beside new among what is accepted.
+    assert read.items() <= old.items() or read.items() <= new.items()
+    assert renamed not in (0, 6) or read == (new if renamed else old)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Files of an exported model with d = 1, by name."""
+    folder = tmp_path_factory.mktemp("exported")
+    export_c(*random_model("delan-1"), folder)
+    return contents(folder)
+
+
+ALTERED = {
+    "source": ({"model.c": b"int x;"}, r"model\.c: truncated or altered"),
+    "header": ({"model.h": b""}, r"model\.h: truncated or altered"),
+    "no source": ({"model.c": None}, r"model\.c: cannot be read"),
+    "no description": ({"model.json": None}, "no such file"),
+    "truncated": ({"model.json": b'{"format": 2,'}, "not readable as JSON"),
+    "no object": ({"model.json": b"[]"}, "holds a list"),
+    "older": ({"model.json": b'{"format": 1, "precision": "f64", "d": 1}'}, "of an older release"),
+    "files": ({"model.json": b'{"sha256": "0", "files": "model.c"}'}, "describes no export"),
+}
+
+
+@pytest.mark.parametrize("case", ALTERED)
+def test_files_that_are_not_as_written_are_refused(case, exported, tmp_path):
+    changes, message = ALTERED[case]
+    for name, data in {**exported, **changes}.items():
+        if data is not None:
+            (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=message) as error:
+        load_c(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+STATED = {
+    "precision": ("f32", "functions is"),
+    "kind": ("black-box-delan", "functions is"),
+    "d": (2, "functions is"),
+    "name": ("arm", "name is 'arm', expected 'model'"),
+    "version": (1, "version is 1"),
+    "functions": ({}, "functions is {}"),
+    "n": (3, "n is 3, expected None"),
+    "format": (7, "C format 7"),
+}
+OUT_OF_RANGE = [
+    *(("d", value) for value in (0, -1, True, 1.0, "1", None, [1], 10**9)),
+    *(("precision", value) for value in ("f16", None, {})),
+    *(("kind", value) for value in ("pairwise", None, [])),
+]
+
+
+def test_no_field_of_a_description_is_believed(exported, tmp_path):
+    stated = json.loads(exported["model.json"])
+    facts = {key: value for key, value in stated.items() if key not in ("files", "sha256")}
+    files = {name: exported[name] for name in stated["files"]}
+    for name, data in exported.items():
+        (tmp_path / name).write_bytes(data)
+    cases = [(key, *case) for key, case in STATED.items()]
+    cases += [(key, value, rf"{key} is .*; expected") for key, value in OUT_OF_RANGE]
+    for key, value, message in cases:
+        (tmp_path / "model.json").write_text(json.dumps({**stated, key: value}))
+        with pytest.raises(InputError, match="truncated or altered"):
+            load_c(tmp_path)
+        # The same with digests that fit.
+        (tmp_path / "model.json").write_bytes(described({**facts, key: value}, files))
+        with pytest.raises(InputError, match=message):
+            load_c(tmp_path)
+    with pytest.raises(InputError, match="expected a C name"):
+        load_c(tmp_path, name="../model")
+
+
+WRONG = {
+    "one number": 0.1,
+    "of one": [0.1],
+    "of four": np.zeros(4),
+    "a batch": np.zeros((5, 2)),
+    "a batch of one": np.zeros((1, 2)),
+    "columns": np.zeros((2, 1)),
+    "words": ["a", "b"],
+    "ragged": [1, [2]],
+    "nothing": None,
+}
+
+
+@needs_compiler
+def test_arguments_of_another_shape_are_refused_by_name(tmp_path):
+    for case in ("hnn-2", "black-box-delan-3", "delan-1"):
+        export_c(*random_model(case), tmp_path / case, precision="f64")
+    export_c(*random_function("2-5-forward"), tmp_path / "function")
+    system = load_c(tmp_path / "hnn-2", flags=("-O0",))
+    calls = {
+        "qdd": lambda x: system.inverse_dynamics(np.zeros(2), np.zeros(2), x),
+        "tau": lambda x: system.forward_dynamics(np.zeros(2), np.zeros(2), x),
+        "q": lambda x: system.inverse_dynamics(x, [0.0, 0.0], np.zeros(2)),
+        "qd": lambda x: system.energy(np.zeros(2), x),
+        "q ": system.mass_matrix,
+        "qd ": lambda x: system.mass_matrix(np.zeros(2), x),
+        "x": load_c(tmp_path / "function", flags=("-O0",)).value_and_jacobian,
+    }
+    for name, call in calls.items():
+        for sort, wrong in WRONG.items():
+            if name == "qd " and sort == "nothing":
+                continue  # which it may be
+            with pytest.raises(InputError, match=rf"^{name.strip()} is .*expected.*shape \(2,\)"):
+                call(wrong)
+        call(np.ones(2, np.float32)), call([1, 2])
+    of_state = load_c(tmp_path / "black-box-delan-3", flags=("-O0",)).mass_matrix
+    with pytest.raises(InputError, match="qd is"):
+        of_state(np.zeros(3), np.zeros(2))
+    # Leading axes of one are no batch to NumPy's assignment.
+    with pytest.raises(InputError, match="q is"):
+        load_c(tmp_path / "delan-1", flags=("-O0",)).inverse_dynamics(np.zeros((1, 1)), np.zeros(1), np.zeros(1))

@@ -5,7 +5,6 @@ library but <math.h>. The same model, name and precision give the same files, by
 """
 
 import importlib.metadata
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,10 @@ from dln_jax.data.schema import needs_from_json
 from dln_jax.deploy import c_black_box, c_function, c_structured, c_trigonometric
 from dln_jax.deploy.c_activations import EXPORTABLE
 from dln_jax.deploy.c_demo import cmake, demo
+from dln_jax.deploy.c_interface import FORMAT, interface, signatures
 from dln_jax.deploy.c_library import helpers
 from dln_jax.deploy.c_text import PRECISIONS, check_name, comment, fill
+from dln_jax.deploy.exports import described, write_exports
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.load import MODEL
 from dln_jax.deploy.load_function import KIND as FUNCTION
@@ -24,8 +25,6 @@ from dln_jax.deploy.load_function import load_function
 from dln_jax.learning.checkpoints import load_manifest, load_tree
 from dln_jax.types import InputError
 
-FORMAT = 1
-"""Version of the names and signatures in exported sources."""
 KINDS = {
     "structured-delan": c_structured.source,
     "structured-hnn": c_structured.source,
@@ -33,18 +32,6 @@ KINDS = {
     "black-box-hnn": c_black_box.source,
     "trigonometric": c_trigonometric.source,
     "feed-forward": c_function.feed_forward_source,
-}
-_STATE = "const {real} q[{d}], const {real} qd[{d}]"
-_DYNAMICS = {
-    "inverse_dynamics": ("void", _STATE + ", const {real} qdd[{d}], {real} tau[{d}]"),
-    "forward_dynamics": ("void", _STATE + ", const {real} tau[{d}], {real} qdd[{d}]"),
-}
-_ENERGY = {"energy": ("{real}", _STATE)}
-_MASS = {"mass_matrix": ("void", "const {real} q[{d}], {real} M[{d} * {d}]")}
-_MASS_OF_STATE = {"mass_matrix": ("void", _STATE + ", {real} M[{d} * {d}]")}
-_FUNCTION = {
-    "value": ("void", "const {real} x[{n}], {real} y[{m}]"),
-    "value_and_jacobian": ("void", "const {real} x[{n}], {real} y[{m}], {real} jacobian[{m} * {n}]"),
 }
 _MEANINGS = {
     "inverse_dynamics": "Generalised force tau that the motion (q, qd, qdd) takes, friction included.",
@@ -77,24 +64,12 @@ def export_c(
         overwrite: replace files that exist.
 
     Raises:
-        InputError: a model that has no C export, a name that is none in C, or files that exist.
+        InputError: a model that has no C export, a name that is none in C, files that exist, or the folder of a run,
+            whose files are never replaced.
     """
     directory = Path(directory)
     texts = source_files(description, parameters, name=check_name(name), precision=precision)
-    paths = [directory / file_name for file_name in texts]
-    existing = [path.name for path in paths if path.exists()]
-    if existing and not overwrite:
-        raise InputError(f"{directory} holds {', '.join(existing)} already; choose another folder or overwrite them")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        partials = [path.with_name(path.name + ".partial") for path in paths]
-        for partial, text in zip(partials, texts.values(), strict=True):
-            partial.write_text(text, encoding="utf-8")
-        for partial, path in zip(partials, paths, strict=True):
-            partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
-    return paths
+    return write_exports(directory, texts, overwrite=overwrite)
 
 
 def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[Path]:
@@ -110,8 +85,8 @@ def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[
     return export_c(description, load_tree(directory, MODEL, like), out, **keywords)
 
 
-def source_files(description: dict[str, Any], parameters: Any, *, name: str, precision: str | None) -> dict[str, str]:
-    """Text of each file, by its name."""
+def source_files(description: dict[str, Any], parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
+    """Content of each file, by its name."""
     _check_kind(description)
     kind = description["kind"]
     precision = precision or str(description.get("precision", "f64"))
@@ -122,42 +97,29 @@ def source_files(description: dict[str, Any], parameters: Any, *, name: str, pre
         raise InputError(f"activation is '{activation}'; C export knows {', '.join(EXPORTABLE)}")
     if kind == FUNCTION:
         sizes = {"n": parameters[0][0].shape[1], "m": parameters[-1][0].shape[2]}
-        body, functions = c_function.source(parameters, precision), _FUNCTION
+        body = c_function.source(parameters, precision)
         about = f"{sizes['n']} inputs x, {sizes['m']} outputs y"
     else:
         needs = needs_from_json(description["needs"])
         sizes = {"d": needs.degrees_of_freedom}
         body = KINDS[kind](description, parameters, needs, precision)
-        energies = {**_ENERGY, **(_MASS_OF_STATE if kind.startswith("black-box") else _MASS)}
-        functions = {**_DYNAMICS, **({} if kind == "feed-forward" else energies)}
         units = ", ".join(f"{joint} ({'rad' if joint == 'revolute' else 'm'})" for joint in needs.joints)
         about = f"joints: {units}; {'with' if needs.friction else 'without'} friction"
     version = importlib.metadata.version("dln-jax")
     written_by = (
         f"Written by dln-jax {version}, C format {FORMAT}, from a model of kind {kind}.\n{about[0].upper()}{about[1:]}."
     )
-    real = PRECISIONS[precision][1]
-    signatures = {
-        function: (result.format(real=real), arguments.format(real=real, **sizes))
-        for function, (result, arguments) in functions.items()
-    }
+    stated = interface(name, kind, precision, sizes, version)
+    declared = signatures(kind, precision, sizes)
     filled = fill(body, precision, name=name)
-    interface = {
-        "format": FORMAT,
-        "version": version,
-        "name": name,
-        "kind": kind,
-        "precision": precision,
-        **sizes,
-        "functions": {function: list(signature) for function, signature in signatures.items()},
-    }
-    return {
-        f"{name}.h": _header(name, written_by, signatures, sizes),
+    texts = {
+        f"{name}.h": _header(name, written_by, declared, sizes),
         f"{name}.c": _source(name, written_by, filled, precision, activation),
-        f"{name}_demo.c": demo(name, signatures, sizes, precision),
+        f"{name}_demo.c": demo(name, declared, sizes, precision),
         "CMakeLists.txt": cmake(name),
-        f"{name}.json": json.dumps(interface, indent=2) + "\n",
     }
+    files = {file_name: text.encode() for file_name, text in texts.items()}
+    return {**files, f"{name}.json": described(stated, files)}
 
 
 def _check_kind(description: dict[str, Any]) -> None:
@@ -166,7 +128,7 @@ def _check_kind(description: dict[str, Any]) -> None:
         raise InputError(f"a model of kind {kind!r} has no C export; exportable are {', '.join((*KINDS, FUNCTION))}")
 
 
-def _header(name: str, written_by: str, signatures: dict[str, tuple[str, str]], sizes: dict[str, int]) -> str:
+def _header(name: str, written_by: str, declared: dict[str, tuple[str, str]], sizes: dict[str, int]) -> str:
     guard = f"{name.upper()}_H"
     conventions = "Units: q in rad or m, qd in 1/s and qdd in 1/s^2 of that, tau in N m or N.\n" * ("d" in sizes)
     about = comment(
@@ -178,13 +140,13 @@ def _header(name: str, written_by: str, signatures: dict[str, tuple[str, str]], 
     )
     size_names = {"d": "DEGREES_OF_FREEDOM", "n": "INPUTS", "m": "OUTPUTS"}
     defines = "".join(f"#define {name.upper()}_{size_names[key]} {size}\n" for key, size in sizes.items())
-    declared = "".join(
+    declarations = "".join(
         f"\n/* {_MEANINGS[function].format(**sizes)} */\n{result} {name}_{function}({arguments});\n"
-        for function, (result, arguments) in signatures.items()
+        for function, (result, arguments) in declared.items()
     )
     return (
         f'{about}#ifndef {guard}\n#define {guard}\n\n{defines}\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
-        f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
+        f"{declarations}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
     )
 
 

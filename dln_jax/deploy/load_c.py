@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import json
 import os
 import shutil
 import subprocess
@@ -13,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.deploy.c_source import FORMAT
-from dln_jax.deploy.c_text import PRECISIONS
+from dln_jax.deploy.c_interface import read_interface
+from dln_jax.deploy.c_text import PRECISIONS, check_name
+from dln_jax.deploy.host_arrays import as_shaped
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
@@ -25,7 +25,8 @@ WARNINGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 class CDynamics(NamedTuple):
     """Functions of one state, NumPy arrays [d] in and out, as those of `mechanics.dynamics.Dynamics`.
 
-    Each keeps buffers between calls: not for two threads at once, which load a copy each.
+    Arguments of other shapes are refused with `InputError`. Each keeps buffers between calls: not for two threads at
+    once, which load a copy each.
     """
 
     inverse_dynamics: Callable[[Any, Any, Any], np.ndarray]
@@ -39,7 +40,7 @@ class CDynamics(NamedTuple):
 
 
 class CFunction(NamedTuple):
-    """A differential network, NumPy arrays in and out; threads as for `CDynamics`."""
+    """A differential network, NumPy arrays in and out; shapes and threads as for `CDynamics`."""
 
     value: Callable[[Any], np.ndarray]
     """x [n] -> y [m]."""
@@ -50,7 +51,10 @@ class CFunction(NamedTuple):
 def load_c(
     directory: str | Path, *, name: str = "model", compiler: str | None = None, flags: Sequence[str] = FLAGS
 ) -> CDynamics | CFunction:
-    """Compiles an exported model into a temporary folder, and loads it.
+    """Compiles an exported model in a temporary folder, and loads it.
+
+    What is there is compiled and run: take a folder only from whom you trust. The digests in the description tell that
+    a file was altered or does not belong to the others, not who wrote them.
 
     Args:
         directory: with the files that `export_c` wrote.
@@ -59,16 +63,20 @@ def load_c(
         flags: for the compiler, beside those that make a C99 library without warnings.
 
     Raises:
-        InputError: files are missing or of another format, or there is no compiler, or it fails.
+        InputError: files are missing, altered or of another format, or there is no compiler, or it fails.
     """
-    directory = Path(directory)
-    interface = _interface(directory, name)
-    with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / f"lib{name}.so"
-        arguments = [*WARNINGS, *flags, "-fPIC", "-shared", str(directory / f"{name}.c"), "-lm", "-o", str(built)]
-        compile_c(arguments, compiler)
-        # The functions take microseconds: handing the interpreter's lock to another thread and back would take longer.
-        library = ctypes.PyDLL(str(built))
+    interface, sources = read_interface(Path(directory), check_name(name))
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            # Compiled is what was checked, whatever happens to the folder meanwhile.
+            for file_name, content in sources.items():
+                (Path(folder) / file_name).write_bytes(content)
+            source, built = Path(folder) / f"{name}.c", Path(folder) / f"lib{name}.so"
+            compile_c([*WARNINGS, *flags, "-fPIC", "-shared", str(source), "-lm", "-o", str(built)], compiler)
+            # The functions take microseconds: handing the interpreter's lock on and back would take longer.
+            library = ctypes.PyDLL(str(built))
+    except OSError as error:
+        raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
     numpy_type = PRECISIONS[interface["precision"]][0]
     functions = {key: getattr(library, f"{name}_{key}") for key in interface["functions"]}
     if "d" not in interface:
@@ -83,42 +91,36 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
     found = next((path for candidate in names if candidate and (path := shutil.which(candidate))), None)
     if found is None:
         raise InputError(f"no C compiler ({', '.join(names)}) on the PATH; install gcc or clang, or set CC")
-    result = subprocess.run([found, *arguments], capture_output=True, text=True)
+    result = subprocess.run([found, *arguments], capture_output=True, text=True, errors="replace")
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr.strip())
         raise InputError(f"{found} could not compile the model: {complaint}; export it again, or name other flags")
 
 
-def _interface(directory: Path, name: str) -> dict[str, Any]:
-    path = directory / f"{name}.json"
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the folder and the name of an exported model")
-    try:
-        interface = json.loads(path.read_text())
-        found = interface["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: describes no exported model ({error}); export it again") from error
-    if found != FORMAT:
-        raise InputError(f"{path}: C format {found!r}; this release reads format {FORMAT}, so export it again")
-    return interface
-
-
 def _dynamics(functions: dict[str, Any], d: int, numpy_type, with_velocity: bool) -> CDynamics:
     has_energy = "energy" in functions
     return CDynamics(
-        inverse_dynamics=_of_three(functions["inverse_dynamics"], d, numpy_type),
-        forward_dynamics=_of_three(functions["forward_dynamics"], d, numpy_type),
+        inverse_dynamics=_of_three(functions["inverse_dynamics"], ("q", "qd", "qdd"), d, numpy_type),
+        forward_dynamics=_of_three(functions["forward_dynamics"], ("q", "qd", "tau"), d, numpy_type),
         energy=_scalar(functions["energy"], d, numpy_type) if has_energy else None,
         mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity) if has_energy else None,
     )
 
 
-def _of_three(function, d: int, numpy_type) -> Callable[[Any, Any, Any], np.ndarray]:
+def _of_three(function, names: tuple[str, str, str], d: int, numpy_type) -> Callable[[Any, Any, Any], np.ndarray]:
     """The buffers' addresses are converted once, and a call copies 3 d numbers in and d out."""
     first, second, third, result = (np.zeros(d, numpy_type) for _ in range(4))
     call, copy = _bound(function, first, second, third, result), result.copy
+    shape = (d,)
 
     def evaluate(q, qd, x):
+        # Arrays of the right shape pass in a fraction of a microsecond; others go the long way.
+        try:
+            fits = q.shape == qd.shape == x.shape == shape
+        except AttributeError:
+            fits = False
+        if not fits:
+            q, qd, x = (as_shaped(*pair, shape) for pair in zip(names, (q, qd, x), strict=True))
         first[:], second[:], third[:] = q, qd, x
         call()
         return copy()
@@ -130,9 +132,10 @@ def _scalar(function, d: int, numpy_type) -> Callable[[Any, Any], float]:
     first, second = (np.zeros(d, numpy_type) for _ in range(2))
     result = ctypes.c_float if numpy_type is np.float32 else ctypes.c_double
     call = _bound(function, first, second, result=result)
+    shape = (d,)
 
     def evaluate(q, qd):
-        first[:], second[:] = q, qd
+        first[:], second[:] = as_shaped("q", q, shape), as_shaped("qd", qd, shape)
         return call()
 
     return evaluate
@@ -141,14 +144,17 @@ def _scalar(function, d: int, numpy_type) -> Callable[[Any, Any], float]:
 def _matrix(function, d: int, numpy_type, with_velocity: bool) -> Callable[..., np.ndarray]:
     first, second, result = np.zeros(d, numpy_type), np.zeros(d, numpy_type), np.zeros((d, d), numpy_type)
     call = _bound(function, first, second, result) if with_velocity else _bound(function, first, result)
+    shape = (d,)
 
     def of_coordinates(q, qd=None):
-        first[:] = q
+        if qd is not None:
+            as_shaped("qd", qd, shape)
+        first[:] = as_shaped("q", q, shape)
         call()
         return result.copy()
 
     def of_state(q, qd):
-        first[:], second[:] = q, qd
+        first[:], second[:] = as_shaped("q", q, shape), as_shaped("qd", qd, shape)
         call()
         return result.copy()
 
@@ -158,14 +164,15 @@ def _matrix(function, d: int, numpy_type, with_velocity: bool) -> Callable[..., 
 def _function(functions: dict[str, Any], n: int, m: int, numpy_type) -> CFunction:
     point, y, jacobian = np.zeros(n, numpy_type), np.zeros(m, numpy_type), np.zeros((m, n), numpy_type)
     value, both = _bound(functions["value"], point, y), _bound(functions["value_and_jacobian"], point, y, jacobian)
+    shape = (n,)
 
     def evaluate(x):
-        point[:] = x
+        point[:] = as_shaped("x", x, shape)
         value()
         return y.copy()
 
     def evaluate_both(x):
-        point[:] = x
+        point[:] = as_shaped("x", x, shape)
         both()
         return y.copy(), jacobian.copy()
 
