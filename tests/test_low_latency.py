@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from dln_jax.deploy import export_stablehlo as stablehlo
+from dln_jax.deploy.exports import described
 from dln_jax.deploy.low_latency import low_latency
+from dln_jax.learning.checkpoints import save_tree
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.dynamics import Decomposition
 from dln_jax.scenes.pendulum import pendulum
@@ -57,9 +59,12 @@ def test_numpy_in_and_out():
     # The buffer of the second call leaves the first result as it was.
     np.testing.assert_array_equal(first, [3.5, 7.5])
     np.testing.assert_array_equal(second, [2.0, 4.0])
-    with pytest.raises(ValueError, match="broadcast"):
-        function(np.zeros(3), A, 0.0)
-    with pytest.raises(ValueError, match="zip"):
+    for x in (np.zeros(3), np.zeros(1), 0.0, [0.0], np.zeros((1, 2)), "x"):
+        with pytest.raises(InputError, match=r"^argument 1 is .*expected.*shape \(2,\)"):
+            function(x, A, 0.0)
+    with pytest.raises(InputError, match=r"^argument 3 is float64 \(2,\); expected.*shape \(\)"):
+        function(np.zeros(2), A, np.zeros(2))
+    with pytest.raises(InputError, match="2 arguments were given; expected 3"):
         function(np.zeros(2), A)
 
 
@@ -101,16 +106,96 @@ def test_artefacts_give_the_same_results_and_state_what_they_are(tmp_path):
         note = json.loads(stablehlo.note_of(path).read_text())
         assert note["jax"] == jax.__version__ and note["platforms"] == ["cpu"] and "six months" in note["reading"]
         assert note["arguments"] == ["float64[1]"] * len(arguments)
-    with pytest.raises(InputError, match="exists"):
+    with pytest.raises(InputError, match="already"):
         stablehlo.export_dynamics(system, 1, tmp_path / "swing", dtype=jnp.float64)
     other = stablehlo.export_stablehlo(
         jnp.sin, np.zeros(2), path=tmp_path / "sin.stablehlo", platforms=["cuda"], overwrite=True
     )
     with pytest.raises(InputError, match="is for cuda, and JAX runs on cpu"):
         stablehlo.load_stablehlo(other)
-    other.write_bytes(other.read_bytes()[:40])
-    with pytest.raises(InputError, match="no artefact that JAX"):
-        stablehlo.load_stablehlo(other)
+
+
+@pytest.fixture
+def doubled(tmp_path):
+    """An artefact of (float64[2], float64) -> float64[2], alone in its folder."""
+    pytest.importorskip("flatbuffers", reason="jax.export writes artefacts with flatbuffers")
+    return stablehlo.export_stablehlo(lambda x, s: x * s, np.zeros(2), 1.0, path=tmp_path / "a" / "double.stablehlo")
+
+
+def altered(path):
+    path.write_bytes(path.read_bytes()[:-5])
+
+
+def with_a_note_edited(path):
+    note = stablehlo.note_of(path)
+    note.write_text(note.read_text().replace("float64[2]", "float64[3]"))
+
+
+def described_anew(path):
+    path.write_bytes(b"no artefact")
+    stablehlo.note_of(path).write_bytes(described({}, {path.name: b"no artefact"}))
+
+
+DAMAGED = {
+    "truncated": (altered, r"double\.stablehlo: truncated or altered"),
+    "edited note": (with_a_note_edited, r"double\.json: truncated or altered"),
+    "no note": (lambda path: stablehlo.note_of(path).unlink(), r"double\.json: no such file"),
+    "renamed": (lambda path: stablehlo.note_of(path).write_bytes(described({}, {})), "truncated or altered"),
+    "no artefact": (described_anew, "no artefact that JAX"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_what_is_not_as_written_is_refused(doubled, damage):
+    function, message = DAMAGED[damage]
+    function(doubled)
+    with pytest.raises(InputError, match=message):
+        stablehlo.load_stablehlo(doubled)
+
+
+def test_arguments_of_another_shape_or_type_are_refused(doubled):
+    double = stablehlo.load_stablehlo(doubled)
+    np.testing.assert_array_equal(double(np.ones(2), 2.0), [2.0, 2.0])
+    several = [(x, 2.0) for x in (np.ones(3), np.ones((5, 2)), np.ones(2, np.float32), [1, 2])]
+    for wrong in (*several, (np.ones(2),)):
+        with pytest.raises(InputError, match=r"double.stablehlo takes \(float64\[2\], float64\[\]\), got \("):
+            double(*wrong)
+
+
+def test_an_export_refuses_what_makes_none_and_writes_nothing(doubled, tmp_path):
+    system = lagrangian.dynamics(pendulum().lagrangian)
+    place = doubled.parent
+    for wrong in ({"platforms": "cpu"}, {"platforms": ("tpux",)}, {"platforms": ()}):
+        with pytest.raises(InputError, match="platforms is"):
+            stablehlo.export_dynamics(system, 1, tmp_path / "b", dtype=jnp.float64, **wrong)
+    for d in (0, -1, True):
+        with pytest.raises(InputError, match="degrees_of_freedom is"):
+            stablehlo.export_dynamics(system, d, tmp_path / "b", dtype=jnp.float64)
+    for example in ([1.0], "a", None, np.array(["a"])):
+        with pytest.raises(InputError, match="example 1 is"):
+            stablehlo.export_stablehlo(jnp.sin, example, path=tmp_path / "b" / "sin.stablehlo")
+    with jax.enable_x64(False), pytest.raises(InputError, match="set jax_enable_x64"):
+        stablehlo.export_dynamics(system, 1, tmp_path / "b", dtype=jnp.float64)
+    assert not (tmp_path / "b").exists()
+    # One of four artefacts is there already: none is written.
+    doubled.rename(place / "energy.stablehlo")
+    with pytest.raises(InputError, match=r"holds energy\.stablehlo already"):
+        stablehlo.export_dynamics(system, 1, place, dtype=jnp.float64)
+    with pytest.raises(InputError, match="cannot write there"):
+        stablehlo.export_dynamics(system, 1, place / "double.json", dtype=jnp.float64)
+    with pytest.raises(InputError, match="no such file"):
+        stablehlo.load_stablehlo(place)
+    assert {path.name for path in place.iterdir()} == {"energy.stablehlo", "double.json"}
+
+
+def test_an_artefact_never_takes_the_place_of_a_runs_file(tmp_path):
+    pytest.importorskip("flatbuffers", reason="jax.export writes artefacts with flatbuffers")
+    save_tree(tmp_path, "model", {"w": np.ones(2)}, {})
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for name in ("model", "config", "inverse"):
+        with pytest.raises(InputError, match="is the folder of a run"):
+            stablehlo.export_stablehlo(jnp.sin, np.zeros(2), path=tmp_path / f"{name}.stablehlo", overwrite=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_an_artefact_needs_its_package_and_its_ending(tmp_path, monkeypatch):

@@ -24,7 +24,5 @@ def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
     except (ValueError, TypeError):
         raise InputError(f"{name} is no array of numbers; expected shape {shape}, one state at a time") from None
     if not fits:
-        raise InputError(
-            f"{name} is {array.dtype} {array.shape}; expected numbers of shape {shape}, one state at a time"
-        )
+        raise InputError(f"{name} is {array.dtype} {array.shape}; expected shape {shape}, one state at a time")
     return array

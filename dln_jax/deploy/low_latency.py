@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.deploy.host_arrays import as_shaped
 from dln_jax.types import InputError
 
 _SETTING = "jax_cpu_enable_async_dispatch"
@@ -55,7 +56,8 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
             for each argument) and results device arrays; another shape or type compiles anew.
 
     Raises:
-        InputError: no examples, or with `numpy` ones of several types.
+        InputError: no examples, or with `numpy` ones of several types; from the callable with `numpy`, an argument of
+            another shape than its example.
     """
     if not examples:
         raise InputError("low_latency got no example; give one argument of each kind that calls will have")
@@ -76,21 +78,28 @@ def _packed(function: Callable[..., Any], arrays: list[np.ndarray]) -> Callable[
     buffer = np.concatenate([array.ravel() for array in arrays])
     ends = list(accumulate(array.size for array in arrays))
     pieces = [(end - array.size, end, array.shape) for end, array in zip(ends, arrays, strict=True)]
-    views = [buffer[start:end].reshape(shape) for start, end, shape in pieces]
+    views = [
+        (f"argument {number}", shape, buffer[start:end].reshape(shape))
+        for number, (start, end, shape) in enumerate(pieces, 1)
+    ]
 
     @jax.jit
     def compiled(packed):
         return function(*(packed[start:end].reshape(shape) for start, end, shape in pieces))
 
+    def fill(arguments):
+        if len(arguments) != len(views):
+            raise InputError(f"{len(arguments)} arguments were given; expected {len(views)}, as in the examples")
+        for (name, shape, view), argument in zip(views, arguments, strict=True):
+            view[...] = as_shaped(name, argument, shape)
+
     def evaluate(*arguments):
-        for view, argument in zip(views, arguments, strict=True):
-            view[...] = argument
+        fill(arguments)
         # A copy, also where JAX would hand back memory of its own or the buffer's.
         return np.array(compiled(buffer))
 
     def evaluate_tree(*arguments):
-        for view, argument in zip(views, arguments, strict=True):
-            view[...] = argument
+        fill(arguments)
         return jax.tree.map(np.array, compiled(buffer))
 
     single = isinstance(jax.eval_shape(compiled, jnp.asarray(buffer)), jax.ShapeDtypeStruct)
