@@ -24,7 +24,7 @@ from scripts.arguments import choice, parse
 
 CONFIG = "config.json"
 """Name of the file in a run's folder that holds the arguments it was started with."""
-PLACES = ("out", "resume", "figures")
+PLACES = ("out", "resume", "figures", "low_latency")
 """Arguments that do not decide the result."""
 
 SCENES: dict[str, Callable[[], Scene]] = {

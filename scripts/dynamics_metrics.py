@@ -93,9 +93,14 @@ def parameters_of(training: Training, index: int) -> Any:
 
 def latency_of(dynamics: Dynamics, task: Task, *, calls: int = 5000) -> Latency:
     """Of one inverse-dynamics call."""
-    test, dtype = task.sets.test, data_type(task.settings.precision)
-    states = list(zip(*(jnp.asarray(a[:512], dtype) for a in (test.q, test.qd, test.qdd)), strict=True))
+    states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
     return one_step(dynamics.inverse_dynamics, states, calls=calls)
+
+
+def latency_states(task: Task) -> tuple[np.ndarray, ...]:
+    """q, qd and qdd of the test, in the precision of the model."""
+    test, dtype = task.sets.test, data_type(task.settings.precision)
+    return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
 
 
 def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:

@@ -25,7 +25,8 @@ from dln_jax.types import InputError, Needs, require_positive
 from scripts.command_line import CONFIG, new_folder, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
-from scripts.dynamics_metrics import Task, best_seed, evaluate, results_table
+from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
+from scripts.low_latency_calls import low_latency_metrics
 from scripts.progress import progress
 
 DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
@@ -84,6 +85,8 @@ class Arguments:
     """Continue the run in --out with the settings it was started with."""
     figures: bool = True
     """Draw the figures."""
+    low_latency: bool = True
+    """Time single calls also in low-latency mode, in a process of its own (about 2 s)."""
 
 
 def run_training(given: Arguments, script: str, kinds: dict[str, str]) -> None:
@@ -104,6 +107,8 @@ def run_training(given: Arguments, script: str, kinds: dict[str, str]) -> None:
     chosen, best = best_seed(training, given.seeds)
     save_model(folder, task.description, chosen)
     metrics = evaluate(folder, task, training, seeds=given.seeds, draw=given.figures)
+    if given.low_latency:
+        metrics |= low_latency_metrics(folder, latency_states(task), console.print)
     write_json(folder / "metrics.json", metrics)
     write_json(folder / CONFIG, {**stored_arguments(given), "chosen": {**task.description, **task.settings._asdict()}})
     console.print(results_table(metrics, task))

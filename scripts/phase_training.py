@@ -22,6 +22,7 @@ from scripts.command_line import CONFIG, new_folder, stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
+from scripts.low_latency_calls import low_latency_metrics
 from scripts.progress import progress
 
 if TYPE_CHECKING:
@@ -63,6 +64,9 @@ def run_task(given: "Arguments") -> None:
     save_model(folder, description, trained.fits[-1].parameters)
     numbers, seen = measured_once(problem, trained)
     metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.fits[-1].validation)}
+    if given.low_latency:
+        truth = problem.truth[0]
+        metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
     write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
     if given.figures:
         draw(folder, problem, description["kind"], seen, trained.fits[-1].history)
@@ -153,7 +157,10 @@ def draw(folder: Path, problem: Problem, kind: str, seen: Seen, history: list[Pr
         figures.training_curve(history, best_step=best, error="error (weighted)").savefig(folder / "training.png")
 
 
-UNITS = {"train_seconds": "s", "compile_seconds": "s", "one_step_p50_us": "µs", "one_step_p99_us": "µs"}
+UNITS = {
+    **dict.fromkeys(("train_seconds", "compile_seconds"), "s"),
+    **{f"one_step_{mode}{quantile}_us": "µs" for mode in ("", "low_latency_") for quantile in ("p50", "p99")},
+}
 
 
 def results_table(metrics: dict[str, float], problem: Problem) -> Table:

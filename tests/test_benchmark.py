@@ -1,6 +1,7 @@
 """The benchmarks' own parts: the full-Hessian reference, integrators in one program for every dt, reports and paths."""
 
 import json
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,14 @@ from dln_jax.evaluation.report import Row, markdown
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.types import Needs
-from scripts import benchmark, benchmark_calls, benchmark_integrators, benchmark_one_step, benchmark_throughput
+from scripts import (
+    benchmark,
+    benchmark_calls,
+    benchmark_integrators,
+    benchmark_one_step,
+    benchmark_throughput,
+    low_latency_calls,
+)
 from scripts.arm_models import needs_of
 from scripts.arm_table import letters
 from scripts.hnn_tasks import Problem
@@ -99,6 +107,39 @@ def small_run(tmp_path_factory):
     )
     save_model(folder, description, build(description).init(jax.random.key(0)))
     return folder
+
+
+def test_low_latency_is_timed_in_a_process_of_its_own(small_run):
+    said = []
+    states = (np.zeros((7, 2)), np.ones((7, 2)), np.ones((7, 2)))
+    found = low_latency_calls.low_latency_metrics(small_run, states, said.append)
+    assert not said
+    assert 0 < found["one_step_low_latency_p50_us"] <= found["one_step_low_latency_p99_us"]
+
+
+BROKEN = {
+    "no such program": ({"side_effect": FileNotFoundError("no python")}, "no python"),
+    "too slow": ({"side_effect": subprocess.TimeoutExpired("python", 1)}, "no answer in 120 s"),
+    "a mistake": ({"returncode": 2, "stderr": b"x\nerror: no model\n"}, "exit status 2: error: no model"),
+    "killed": ({"returncode": -9}, "exit status -9: it printed nothing"),
+    "no answer": ({"stdout": b"hello"}, "Expecting value"),
+    "no time": ({"stdout": b"{}"}, "p50_us"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, monkeypatch):
+    outcome, reason = BROKEN[case]
+
+    def failing(command, **_):
+        if "side_effect" in outcome:
+            raise outcome["side_effect"]
+        return subprocess.CompletedProcess(command, **{"returncode": 0, "stdout": b"", "stderr": b"", **outcome})
+
+    monkeypatch.setattr(low_latency_calls.subprocess, "run", failing)
+    said = []
+    assert low_latency_calls.low_latency_metrics(tmp_path, (np.zeros((3, 2)),), said.append) == {}
+    assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
 
 
 def test_call_paths_are_timed(small_run, capsys, monkeypatch):

@@ -178,7 +178,7 @@ def positions(workplace):
     return workplace / "positions.npz"
 
 
-OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": ["prismatic"]}')
+OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": ["prismatic"]}', "--no-low-latency")
 
 
 def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
@@ -191,7 +191,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     stored = load_file(folder / "model.safetensors")
     for name in ("model.json", "model.safetensors", "metrics.json"):
         (folder / name).unlink()
-    command(train_hnn, "--out", str(folder), "--resume", "--no-figures")
+    command(train_hnn, "--out", str(folder), "--resume", "--no-figures", "--no-low-latency")
     again = load_file(folder / "model.safetensors")
     assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
     field = load_phase_field(folder)

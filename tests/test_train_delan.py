@@ -20,7 +20,7 @@ from scripts import make_data, train_delan
 from scripts.command_line import run
 
 ROOT = Path(__file__).parent.parent
-TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64")
+TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64", "--no-low-latency")
 FILES = {
     "config.json",
     "metrics.json",
@@ -109,7 +109,7 @@ def test_a_second_run_takes_the_next_folder_and_an_explicit_one_is_never_overwri
 
 def test_a_finished_run_resumes_to_itself(trained):
     model = (trained / "model.safetensors").read_bytes()
-    command(train_delan, "--out", trained, "--resume", "--no-figures")
+    command(train_delan, "--out", trained, "--resume", "--no-figures", "--no-low-latency")
     assert (trained / "model.safetensors").read_bytes() == model
 
 
@@ -134,6 +134,7 @@ def test_a_killed_run_resumes_to_the_same_parameters(workplace):
         "--batch",
         "32",
         "--no-figures",
+        "--no-low-latency",
         "--scene",
         "pendulum",
     )
@@ -151,7 +152,7 @@ def test_a_killed_run_resumes_to_the_same_parameters(workplace):
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (workplace / "killed" / "model.json").exists(), "the run was over before it could be killed"
-    command(train_delan, "--out", "killed", "--resume", "--no-figures")
+    command(train_delan, "--out", "killed", "--resume", "--no-figures", "--no-low-latency")
     one, other = ((workplace / name / "model.safetensors").read_bytes() for name in ("unbroken", "killed"))
     assert one == other
 

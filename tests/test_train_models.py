@@ -1,6 +1,8 @@
 """Every model and optimiser through the command line, on a pendulum and a tiny budget."""
 
+import io
 import json
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +17,9 @@ from dln_jax.deploy.kinds import build, describe, objective_of
 from dln_jax.learning.residuals import CANONICAL, TORQUE
 from dln_jax.learning.train import Settings, train
 from dln_jax.scenes.pendulum import pendulum
-from scripts import dynamics_growth, train_delan, train_hnn
+from scripts import dynamics_growth, low_latency_calls, train_delan, train_hnn
 
-QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures")
+QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +40,23 @@ def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_the_trigonometric_model_is_exact(workplace, capsys):
+def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
+    asked = []
+
+    def answer(command, *, input, **_):
+        asked.append((command[-4:], np.load(io.BytesIO(input)).shape))
+        return subprocess.CompletedProcess(command, 0, b'a warning\n{"p50_us": 11.75, "p99_us": 14.5}\n', b"")
+
+    monkeypatch.setattr(low_latency_calls.subprocess, "run", answer)
     command(train_delan, "--data", "swing.npz", "--model", "trigonometric", "--no-figures", "--out", "linear")
-    assert metrics_of(workplace / "linear")["torque_mse"] < 1e-20
+    metrics = metrics_of(workplace / "linear")
+    assert metrics["torque_mse"] < 1e-20 and metrics["one_step_p50_us"] > 0
+    assert (metrics["one_step_low_latency_p50_us"], metrics["one_step_low_latency_p99_us"]) == (11.75, 14.5)
+    ((options, shape),) = asked
+    assert options == ["--run", str((workplace / "linear").resolve()), "--function", "inverse_dynamics"]
+    assert shape[1:] == (3, 1)
     out = capsys.readouterr().out
+    assert "one step p50 us" in out and "one step low latency p50 us" in out
     assert "least squares: 6 parameters, rank" in out and "condition" in out
     system = load_run(workplace / "linear")
     tau = system.inverse_dynamics(*np.array([[0.5], [1.0], [2.0]]))
@@ -85,12 +100,12 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2, 3))
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
-    command(train_delan, "--data", "swing.npz", "--steps", "8", "--no-figures", "--target", "1e6", "--out", "easy")
+    command(train_delan, "--data", "swing.npz", "--steps", "8", *QUICK[-2:], "--target", "1e6", "--out", "easy")
     easy = json.loads((workplace / "easy" / "candidates.json").read_text())["candidates"]
     assert {(each["width"], each["networks"]) for each in easy} == {(2, 1), (2, 2)}
     assert min(each["parameters"] for each in easy) == 2 * 2 + 2 + 2 * 2 + 2 + 1
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
-    command(train_delan, "--data", "swing.npz", "--steps", "2", "--no-figures", "--target", "1e-30", "--out", "hard")
+    command(train_delan, "--data", "swing.npz", "--steps", "2", *QUICK[-2:], "--target", "1e-30", "--out", "hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
     candidates = json.loads((workplace / "hard" / "candidates.json").read_text())["candidates"]
     best = min(candidates, key=lambda each: each["validation_error"])
