@@ -44,7 +44,7 @@ class Arguments:
     data: Path | None = None
     """Letters written by the two-link arm, in the npz schema (default: the embedded ones)."""
     uniform: Path | None = None
-    """Training states of the hanging arm, in the npz schema (default: 3,000 generated ones)."""
+    """Training states of the arm, in the npz schema (default: 3,000 generated ones)."""
     seeds: int = 5
     """Seeds of each model, in one program."""
     steps: int | None = None
@@ -74,8 +74,7 @@ def main(given: Arguments) -> None:
     found: dict[str, Any] = json.loads(stored.read_text()) if given.resume and stored.is_file() else {}
     jobs = {}
     for dataset, data in sets.items():
-        scene = two_link_arm(zero="horizontal" if dataset == "characters" else "hanging")
-        jobs[f"plant/{dataset}"] = lambda scene=scene, data=data: plant_rows(scene, data)
+        jobs[f"plant/{dataset}"] = lambda data=data: plant_rows(two_link_arm(), data)
         jobs[f"trigonometric/{dataset}"] = lambda data=data: measure_trigonometric(data)
         for kind in PUBLISHED:
             jobs[f"{kind}/{dataset}"] = lambda kind=kind, data=data: measure_seeds(
@@ -123,8 +122,8 @@ def letters(path: Path | None) -> Split:
 
 
 def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:
-    """Random states of the hanging arm for training, the published free swings for the test."""
-    scene = two_link_arm(zero="hanging")
+    """Random states of the arm for training, the published free swings for the test."""
+    scene = two_link_arm()
     data = generators.uniform(scene, samples=samples) if path is None else schema.load(path)
     if data.degrees_of_freedom != 2:
         raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")

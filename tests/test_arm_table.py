@@ -77,5 +77,7 @@ def test_the_trigonometric_model_and_the_plant_are_measured(tmp_path):
     numbers, curve = arm_models.measure_trigonometric(sets)
     assert numbers["torque_mse"] < 1e-20 and numbers["noisy_torque_mse"] < 1e-2
     assert curve.errors == [numbers["torque_mse"]] or curve.errors == [1e-32]
-    plant, _ = arm_models.plant_rows(arm_table.two_link_arm(zero="hanging"), sets)
-    assert numbers["vpt_seconds"] == pytest.approx(plant["vpt_seconds"]) and plant["vpt_seconds"] > 3
+    plant, _ = arm_models.plant_rows(arm_table.two_link_arm(), sets)
+    assert numbers["vpt_seconds"] == pytest.approx(plant["vpt_seconds"])
+    # What the published motions give, which symplectic Euler made; those of the hanging arm would give 6.62 s.
+    assert plant["vpt_seconds"] == pytest.approx(6.467, abs=0.01)

@@ -159,15 +159,15 @@ def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
     np.testing.assert_array_equal(data.tau, 0.0)
     np.testing.assert_array_equal(data.q[::400], published.STARTS)
-    # The published formulas of the plant, with the hanging arm's gravity, by plain numpy.
+    # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
     q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
     for step in range(200):
         if step % 10 == 0:
             np.testing.assert_allclose(data.q[step // 10 :: 400].T, q, atol=1e-12)
         cosine, sine = np.cos(q[1]), np.sin(q[1])
         a, b, c = 1.3727291666666667 + cosine, 0.5176145833333333 + 0.5 * cosine, 0.5176145833333333
-        first = 0.5 * sine * (2 * qd[0] * qd[1] + qd[1] ** 2) - 2.625 * np.sin(q[0]) - 1.5 * np.sin(q[0] + q[1])
-        second = -0.5 * sine * qd[0] ** 2 - 1.5 * np.sin(q[0] + q[1])
+        first = 0.5 * sine * (2 * qd[0] * qd[1] + qd[1] ** 2) - 2.625 * np.cos(q[0]) - 1.5 * np.cos(q[0] + q[1])
+        second = -0.5 * sine * qd[0] ** 2 - 1.5 * np.cos(q[0] + q[1])
         qdd = np.array([c * first - b * second, a * second - b * first]) / (a * c - b**2)
         if step % 10 == 0:
             np.testing.assert_allclose(data.qdd[step // 10 :: 400].T, qdd, atol=1e-11)

@@ -21,8 +21,8 @@ _ELBOW_WEIGHT = 1.5
 def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Scene:
     """The arm with q2 relative to link 1.
 
-    `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of the published
-    characters (gravity in cos q), "hanging" that of the published uniform data (gravity in sin q).
+    `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of all published data
+    (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
     """
     # The vertical of one convention is the other's, turned by a quarter.
     offset = 0.0 if zero == "horizontal" else -jnp.pi / 2
