@@ -70,6 +70,21 @@ def split(
     )
 
 
+def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[list[str]]:
+    """The labels of the trajectories in groups of nearly equal size, for as many splits: each is a test once.
+
+    The sorted labels are permuted by the seed and cut, so that their order in a file decides nothing.
+
+    Raises:
+        InputError: fewer than two parts, or more than there are trajectories.
+    """
+    labels = np.sort(data.label[np.unique(data.trajectory)])
+    if not 2 <= parts <= len(labels):
+        raise InputError(f"{len(labels)} trajectories cannot be cut into {parts} tests; ask for 2 to {len(labels)}")
+    permuted = np.random.default_rng(seed).permutation(labels)
+    return [part.tolist() for part in np.array_split(permuted, parts)]
+
+
 def merged(sets: Split) -> Trajectories:
     """All trajectories of a split in their original order."""
     parts = [part for part in sets if len(part.t)]
