@@ -11,6 +11,8 @@ from dln_jax.data import generators
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.mechanics.hamiltonian import hamiltonian_from_lagrangian
+from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 
@@ -35,6 +37,21 @@ def test_errors_are_sums_over_joints_and_means_over_samples(data):
     assert result["power_mse"] == pytest.approx(np.mean((data.qd @ [0.3, -0.4]) ** 2))
     without_truth = errors(off, data._replace(tau_gravity=None))
     assert "gravity_mse" not in without_truth and "coriolis_mse" in without_truth
+
+
+def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
+    """The true plant, damped: exact momenta give exact torques, and difference quotients their own error."""
+    scene = pendulum(friction=0.3)
+    data = generators.free_swing(scene, trajectories=1, steps=50)
+    plant = dynamics(scene)._replace(hamiltonian=hamiltonian_from_lagrangian(scene.lagrangian))
+    assert errors(predictions(plant, data, jnp.float64), data)["torque_from_momenta_mse"] < 1e-20
+    assert data.p is not None and data.pd is not None
+    quotients = np.gradient(data.p, data.t, axis=0)
+    result = errors(predictions(plant, data._replace(pd=quotients), jnp.float64), data)
+    assert result["torque_from_momenta_mse"] == pytest.approx(np.mean((quotients - data.pd) ** 2), rel=1e-9)
+    assert result["torque_from_momenta_mse"] > 1e-6 > 1e-20 > result["torque_mse"]
+    without = errors(predictions(plant, data._replace(p=None), jnp.float64), data)
+    assert "torque_from_momenta_mse" not in without
 
 
 def test_latency_counts_what_it_says():
