@@ -222,6 +222,49 @@ def test_a_relativistic_particle():
         np.testing.assert_allclose(got, jnp.broadcast_to(expected, got.shape), rtol=1e-12)
 
 
+def test_the_default_transform_is_right_without_a_choice():
+    """H = ½ |p|² + ¼ (1 + q·q) |p|⁴ at velocities of known momenta: its derivatives by hand, no equation solved."""
+
+    def H(q, p):
+        return 0.5 * p @ p + 0.25 * (1 + q @ q) * (p @ p) ** 2
+
+    q, p, tau = np.random.default_rng(0).normal(size=(3, 20, 2))
+    square, size = np.sum(p**2, axis=1)[:, None], 1 + np.sum(q**2, axis=1)[:, None]
+    qd = p * (1 + size * square)
+    inverse_mass = np.eye(2) * (1 + size * square)[:, None] + 2 * size[:, None] * p[:, :, None] * p[:, None]
+    drift = 2 * square * p * np.sum(q * qd, axis=1)[:, None]
+    qdd = drift + np.einsum("nij,nj->ni", inverse_mass, tau - 0.5 * square**2 * q)
+    system = hamiltonian.dynamics(H)
+    got = jax.jit(
+        jax.vmap(
+            lambda q, qd, x: (
+                conjugate(H, q, qd),
+                system.forward_dynamics(q, qd, x),
+                system.energy(q, qd),
+                system.mass_matrix(q, qd),
+                legendre(H)(q, qd),
+            )
+        )
+    )(q, qd, tau)
+    energy = 0.5 * square[:, 0] + 0.25 * size[:, 0] * square[:, 0] ** 2
+    expected = p, qdd, energy, np.linalg.inv(inverse_mass), np.sum(p * qd, axis=1) - energy
+    for one, other in zip(got, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
+
+
+def test_a_velocity_without_a_momentum_gives_nan_in_value_and_derivative():
+    """Of H = sqrt(1 + p²) no momentum makes |qd| = 1 or more; just below, p = qd / sqrt(1 - qd²)."""
+
+    def momentum(qd):
+        return conjugate(lambda q, p: jnp.sum(jnp.sqrt(1 + p**2)), qd, qd)[0]
+
+    qd = np.array([[0.0], [0.6], [0.99], [1.0], [1.2]])
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(momentum)))(qd)
+    np.testing.assert_allclose(value[:3], [0, 0.75, 0.99 / np.sqrt(1 - 0.99**2)], rtol=1e-12)
+    np.testing.assert_allclose(slope[:3, 0], (1 - qd[:3, 0] ** 2) ** -1.5, rtol=1e-10)
+    assert np.isnan(value[3:]).all() and np.isnan(slope[3:]).all()
+
+
 def test_a_charged_particle_in_a_magnetic_field():
     """H = ½ |p - A(q)|² is no natural system: the velocity turns at the cyclotron rate."""
 

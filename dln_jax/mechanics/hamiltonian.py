@@ -28,6 +28,8 @@ Energy = Callable[[Array, Array], Array]
 """Lagrangian or Hamiltonian."""
 Guess = Callable[[Array, Array], Array]
 """(q, slope [d]) -> where a Newton iteration starts [d]."""
+MOST_STEPS = 30
+"""Newton steps after which the Legendre transform is given up, and NaN."""
 
 
 def velocity(H: Hamiltonian, q: Vector, p: Vector) -> Vector:
@@ -62,43 +64,65 @@ def energy_rate(H: Hamiltonian, q: Vector, p: Vector, tau: Vector, *, dissipatio
 
 
 def conjugate(
-    energy: Energy, q: Vector, slope: Vector, *, iterations: int = 1, initial_guess: Guess | None = None
+    energy: Energy, q: Vector, slope: Vector, *, iterations: int | None = None, initial_guess: Guess | None = None
 ) -> Vector:
     """x [d] where d(energy)/dx (q, x) = slope: the momentum of a velocity (of H), or the reverse (of L).
 
-    A fixed number of full Newton steps from `initial_guess(q, slope)`, by default from zero. One step is exact for an
-    energy that is quadratic in x, as every natural system's is. Otherwise check what is left,
-    `velocity(H, q, x) - slope`: no step is damped, and an energy that is not convex in x may have no solution.
+    Full Newton steps from `initial_guess(q, slope)`, by default from zero, until they have converged; NaN, derivatives
+    included, where they have not after `MOST_STEPS`. No step is damped: an energy that is not convex in x may have no
+    solution. With `iterations` they are so many and unchecked: one is exact for an energy that is quadratic in x, as
+    every natural system's is; otherwise see what `velocity(H, q, x) - slope` leaves.
     Derivatives are those of the implicit function, of every order; what `energy` closes over is differentiated too.
 
     Raises InputError if `iterations` is not positive.
     """
-    require_positive(iterations=iterations)
+    _require_iterations(iterations)
     identity = jnp.eye(slope.shape[0], dtype=slope.dtype)
+    start = jnp.zeros_like(slope) if initial_guess is None else initial_guess(q, slope)
 
     def residual(x: Vector) -> Vector:
         return jax.grad(energy, argnums=1)(q, x) - slope
 
-    def newton(residual, start: Vector) -> Vector:
-        def step(x, _):
-            value, hessian_product = jax.linearize(residual, x)
-            return x - solve(jax.vmap(hessian_product)(identity), value), None
+    def step(residual, x: Vector) -> tuple[Vector, Vector]:
+        value, hessian_product = jax.linearize(residual, x)
+        return x - solve_hessian(hessian_product, value), value
 
-        return jax.lax.scan(step, start, length=iterations)[0]
+    def so_many(residual, start: Vector) -> Vector:
+        return jax.lax.scan(lambda x, _: (step(residual, x)[0], None), start, length=iterations)[0]
+
+    def until_converged(residual, start: Vector) -> tuple[Vector, Array]:
+        eps = jnp.finfo(slope.dtype).eps
+
+        def turn(state):
+            count, x, _ = state
+            better, left = step(residual, x)
+            # After a step this small the error is of the order of its square. A root at zero shrinks with its steps.
+            settled = jnp.max(jnp.abs(better - x)) < jnp.sqrt(eps) * jnp.max(jnp.abs(better))
+            return count + 1, better, settled | (jnp.max(jnp.abs(left)) <= 16 * eps * jnp.max(jnp.abs(slope)))
+
+        def running(state):
+            count, x, converged = state
+            return ~converged & (count < MOST_STEPS) & jnp.isfinite(x).all()
+
+        _, x, converged = jax.lax.while_loop(running, turn, (0, start, jnp.asarray(False)))
+        return x, converged.astype(x.dtype)
 
     def solve_hessian(hessian_product, right: Vector) -> Vector:
         return solve(jax.vmap(hessian_product)(identity), right)
 
-    start = jnp.zeros_like(slope) if initial_guess is None else initial_guess(q, slope)
-    return jax.lax.custom_root(residual, start, newton, solve_hessian)
+    if iterations is not None:
+        return jax.lax.custom_root(residual, start, so_many, solve_hessian)
+    x, converged = jax.lax.custom_root(residual, start, until_converged, solve_hessian, has_aux=True)
+    # A factor, and not a choice: derivatives become NaN as well.
+    return x * jnp.where(converged > 0, 1, jnp.nan).astype(x.dtype)
 
 
-def legendre(energy: Energy, *, iterations: int = 1, initial_guess: Guess | None = None) -> Energy:
+def legendre(energy: Energy, *, iterations: int | None = None, initial_guess: Guess | None = None) -> Energy:
     """H(q, p) = p·qd - L(q, qd) of a Lagrangian, and L(q, qd) of a Hamiltonian: the transform is its own inverse.
 
     Keywords as for `conjugate`; `initial_guess` is not differentiated, and must not close over what is.
     """
-    require_positive(iterations=iterations)
+    _require_iterations(iterations)
 
     def transform(q: Vector, slope: Vector) -> Scalar:
         # What the energy closes over becomes arguments, which a function with its own derivative rule needs.
@@ -130,6 +154,11 @@ def _conjugate(function, iterations, initial_guess, q, slope, *closed_over):
     )
 
 
+def _require_iterations(iterations: int | None) -> None:
+    if iterations is not None:
+        require_positive(iterations=iterations)
+
+
 hamiltonian_from_lagrangian = legendre
 """L(q, qd) -> H(q, p), solving dL/dqd = p for qd."""
 lagrangian_from_hamiltonian = legendre
@@ -140,11 +169,11 @@ def dynamics(
     H: Hamiltonian,
     *,
     dissipation: Dissipation | None = None,
-    iterations: int = 1,
+    iterations: int | None = None,
     initial_guess: Guess | None = None,
 ) -> Dynamics:
     """All functions of the system at once, of (q, qd); `iterations` and `initial_guess` as for `conjugate`."""
-    require_positive(iterations=iterations)
+    _require_iterations(iterations)
 
     def momentum(q: Vector, qd: Vector) -> Vector:
         return conjugate(H, q, qd, iterations=iterations, initial_guess=initial_guess)
