@@ -16,14 +16,18 @@
 Equation of motion: `tau = M(q) qdd + c(q, qd) + g(q)`, plus `dD/dqd` where there is friction.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, "d"]
 Matrix = Float[Array, "d d"]
+
+VectorLike = ArrayLike | Sequence[ArrayLike]
+"""What a caller may give for a vector: an array, or a list or tuple of numbers."""
 
 Lagrangian = Callable[[Array, Array], Array]
 """L(q, qd) -> scalar, in J."""

@@ -68,7 +68,6 @@ def lagrangian_of(model: Dynamics) -> Lagrangian:
     """L = T - V of a natural system: qdᵀ M(q) qd - E, since E = T + V."""
 
     def L(q: Array, qd: Array) -> Array:
-        assert model.mass_matrix is not None and model.energy is not None
         return qd @ model.mass_matrix(q) @ qd - model.energy(q, qd)
 
     return L

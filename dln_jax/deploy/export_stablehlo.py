@@ -13,10 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
+from jax import Array, export
 
 from dln_jax.deploy.exports import described, read_export, write_exports
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.learning.runs import require_double_precision
+from dln_jax.mechanics.arguments import require_shape
+from dln_jax.mechanics.dynamics import Dynamics, no_energy
 from dln_jax.types import InputError
 
 SUFFIX = ".stablehlo"
@@ -75,20 +77,22 @@ def export_dynamics(
     """
     if type(degrees_of_freedom) is not int or degrees_of_freedom < 1:
         raise InputError(f"degrees_of_freedom is {degrees_of_freedom!r}; expected a whole number from 1")
+    if jnp.dtype(dtype) == jnp.float64:
+        require_double_precision("dtype float64")
     state = jax.ShapeDtypeStruct((degrees_of_freedom,), dtype)
     files: dict[str, bytes] = {}
     for name, count in _ARGUMENTS.items():
-        if (function := getattr(dynamics, name)) is not None:
+        if (function := getattr(dynamics, name)) is not no_energy:
             files |= _artefact(f"{name}{SUFFIX}", function, [state] * count, platforms)
     return [path for path in write_exports(Path(directory), files, overwrite=overwrite) if path.suffix == SUFFIX]
 
 
 def load_stablehlo(path: str | Path) -> Callable[..., Any]:
-    """The function of an artefact, jitted; arguments of other shapes or types are refused with `InputError`.
+    """The function of an artefact, jitted; it takes arrays, or lists of numbers, of the exported shapes, and no others.
 
     Raises:
-        InputError: no such file, no note beside it, one that is altered or too old, one for other platforms, or no
-            `flatbuffers`.
+        InputError: no such file, no note beside it, one that is altered or too old, one for other platforms, one in
+            double precision while JAX computes in single, or no `flatbuffers`.
     """
     path = Path(path)
     if path.suffix != SUFFIX or not path.is_file():
@@ -106,21 +110,41 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
             f"{path} is for {', '.join(exported.platforms)}, and JAX runs on {platform}; export it with that platform"
         )
 
-    def call(*arguments):
-        try:
-            return exported.call(*arguments)
-        except (ValueError, TypeError) as error:
-            got = ", ".join(str(getattr(each, "aval", type(each).__name__)) for each in arguments)
-            wanted = ", ".join(map(str, exported.in_avals))
-            raise InputError(f"{path} takes ({wanted}), got ({got}); one state at a time, of that type") from error
-
-    # Called where JAX traces, that is once for each shape and type.
-    return jax.jit(call)
+    if any(each.dtype == "float64" for each in exported.in_avals):
+        require_double_precision(str(path))
+    return _refusing(path, exported)
 
 
 def note_of(path: Path) -> Path:
     """Path of the note beside an artefact."""
     return path.with_suffix(".json")
+
+
+def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
+    """The function, jitted; arguments that are arrays are converted to the exported types, other shapes refused."""
+    wanted = exported.in_avals
+    plain = exported.in_tree == jax.tree.structure(((0,) * len(wanted), {}))
+
+    def converted(number: int, argument: Any, like: Any) -> Array:
+        try:
+            array = jnp.asarray(argument, like.dtype)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"argument {number} makes no array; expected {like}") from error
+        require_shape(f"argument {number}", array.shape, like.shape)
+        return array
+
+    # What is refused is refused where JAX traces, that is once for each shape and type.
+    @jax.jit
+    def call(*arguments):
+        if plain and len(arguments) == len(wanted):
+            arguments = [converted(*each) for each in zip(range(1, len(wanted) + 1), arguments, wanted, strict=True)]
+        try:
+            return exported.call(*arguments)
+        except (ValueError, TypeError) as error:
+            got = ", ".join(str(getattr(each, "aval", type(each).__name__)) for each in arguments)
+            raise InputError(f"{path} takes ({', '.join(map(str, wanted))}), got ({got})") from error
+
+    return call
 
 
 def _require_flatbuffers() -> None:

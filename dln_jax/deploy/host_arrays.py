@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
 
@@ -20,9 +21,9 @@ def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
         pass
     try:
         array = np.asarray(argument)
-        fits = array.shape == shape and array.dtype.kind in "biuf"
     except (ValueError, TypeError):
-        raise InputError(f"{name} is no array of numbers; expected shape {shape}, one state at a time") from None
-    if not fits:
-        raise InputError(f"{name} is {array.dtype} {array.shape}; expected shape {shape}, one state at a time")
+        raise InputError(f"{name} makes no array; expected real numbers of shape {shape}") from None
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} has type {array.dtype}; expected real numbers of shape {shape}")
+    require_shape(name, array.shape, shape)
     return array

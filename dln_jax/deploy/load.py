@@ -1,5 +1,6 @@
 """A trained run as jitted functions: dynamics (train_delan, train_hnn), or a phase field (train_hnn --task)."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,8 +11,8 @@ import jax.numpy as jnp
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
-from dln_jax.learning.runs import data_type
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.learning.runs import data_type, require_double_precision
+from dln_jax.mechanics.dynamics import Dynamics, no_energy
 from dln_jax.models.model import Parameters
 from dln_jax.models.phase_field import PhaseField
 from dln_jax.types import InputError
@@ -30,10 +31,11 @@ def save_model(directory: Path, description: dict[str, Any], parameters: Paramet
 def load_run(directory: str | Path) -> Dynamics:
     """The jitted dynamics of a trained run, its parameters closed over.
 
-    Each function takes one state as NumPy or JAX arrays [d] and computes in the precision of the training.
+    Each function takes one state, as arrays or lists of d numbers, and computes in the precision of the training.
 
     Raises:
-        InputError: no model in the folder, or one that is damaged, altered or of another schema.
+        InputError: no model in the folder, one that is damaged, altered or of another schema, or one in double
+            precision while JAX computes in single: the message names the line to add.
     """
     model, parameters, dtype = _stored(Path(directory), build)
     return compiled(model.apply(parameters), dtype)
@@ -43,17 +45,31 @@ def load_phase_field(directory: str | Path) -> PhaseField:
     """The jitted phase field of a run of train_hnn --task, its parameters closed over: rates, energy, dissipation.
 
     Raises:
-        InputError: no phase model in the folder, or one that is damaged, altered or of another schema.
+        InputError: as `load_run`, for phase models.
     """
     model, parameters, dtype = _stored(Path(directory), build_phase)
     return compiled(model.apply(parameters), dtype)
 
 
 def compiled(functions: Functions, dtype) -> Functions:
-    """The same functions, jitted, with their arguments converted to one type; `None` stays `None`."""
+    """The same functions, jitted, with numbers in their arguments converted to one type; what is absent stays so."""
 
-    def convert_and_call(function):
-        return function and jax.jit(lambda *state: function(*(jnp.asarray(array, dtype) for array in state)))
+    def convert(leaf):
+        # What is no real number stays as it is, for the function to refuse.
+        kinds = (jnp.floating, jnp.integer)
+        return leaf.astype(dtype) if any(jnp.issubdtype(leaf.dtype, kind) for kind in kinds) else leaf
+
+    def convert_and_call(function) -> Any:
+        if function is None or function is no_energy:
+            return function
+
+        @jax.jit
+        @functools.wraps(function)
+        def call(*state, **named):
+            state, named = jax.tree.map(convert, (state, named))
+            return function(*state, **named)
+
+        return call
 
     return type(functions)(*map(convert_and_call, functions))
 
@@ -63,6 +79,8 @@ def _stored(directory: Path, build: Callable[[dict[str, Any]], Any]) -> tuple[An
     description = load_manifest(directory, MODEL).get("model")
     if not isinstance(description, dict):
         raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
+    if description.get("precision") == "f64":
+        require_double_precision(str(directory))
     model = build(description)
     like = jax.eval_shape(model.init, jax.random.key(0))
     return model, load_tree(directory, MODEL, like), data_type(description["precision"])

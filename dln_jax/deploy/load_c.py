@@ -15,6 +15,7 @@ import numpy as np
 from dln_jax.deploy.c_interface import read_interface
 from dln_jax.deploy.c_text import PRECISIONS, check_name
 from dln_jax.deploy.host_arrays import as_shaped
+from dln_jax.mechanics.dynamics import no_energy
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
@@ -33,10 +34,15 @@ class CDynamics(NamedTuple):
     """(q, qd, qdd) -> tau [d]."""
     forward_dynamics: Callable[[Any, Any, Any], np.ndarray]
     """(q, qd, tau) -> qdd [d]."""
-    energy: Callable[[Any, Any], float] | None
-    """(q, qd) -> T + V; `None` for a model that has none."""
-    mass_matrix: Callable[..., np.ndarray] | None
-    """(q, qd) -> M [d, d], or (q) where M depends on q alone; `None` as above."""
+    energy: Callable[[Any, Any], Any]
+    """(q, qd) -> T + V; raises InputError for a model that comes from no energy (`has_energy` says so)."""
+    mass_matrix: Callable[..., Any]
+    """(q, qd=None) -> M [d, d], by default at rest, qd = 0; raises as `energy` does."""
+
+    @property
+    def has_energy(self) -> bool:
+        """Whether there are an energy and a mass matrix."""
+        return self.energy is not no_energy
 
 
 class CFunction(NamedTuple):
@@ -102,8 +108,8 @@ def _dynamics(functions: dict[str, Any], d: int, numpy_type, with_velocity: bool
     return CDynamics(
         inverse_dynamics=_of_three(functions["inverse_dynamics"], ("q", "qd", "qdd"), d, numpy_type),
         forward_dynamics=_of_three(functions["forward_dynamics"], ("q", "qd", "tau"), d, numpy_type),
-        energy=_scalar(functions["energy"], d, numpy_type) if has_energy else None,
-        mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity) if has_energy else None,
+        energy=_scalar(functions["energy"], d, numpy_type) if has_energy else no_energy,
+        mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity) if has_energy else no_energy,
     )
 
 
@@ -146,19 +152,15 @@ def _matrix(function, d: int, numpy_type, with_velocity: bool) -> Callable[..., 
     call = _bound(function, first, second, result) if with_velocity else _bound(function, first, result)
     shape = (d,)
 
-    def of_coordinates(q, qd=None):
-        if qd is not None:
-            as_shaped("qd", qd, shape)
+    rest = np.zeros(d, numpy_type)
+
+    def evaluate(q, qd=None):
         first[:] = as_shaped("q", q, shape)
+        second[:] = rest if qd is None else as_shaped("qd", qd, shape)
         call()
         return result.copy()
 
-    def of_state(q, qd):
-        first[:], second[:] = as_shaped("q", q, shape), as_shaped("qd", qd, shape)
-        call()
-        return result.copy()
-
-    return of_state if with_velocity else of_coordinates
+    return evaluate
 
 
 def _function(functions: dict[str, Any], n: int, m: int, numpy_type) -> CFunction:
@@ -177,6 +179,21 @@ def _function(functions: dict[str, Any], n: int, m: int, numpy_type) -> CFunctio
         return y.copy(), jacobian.copy()
 
     return CFunction(evaluate, evaluate_both)
+
+
+def _arrays(shape: tuple[int, ...], numpy_type, **given: Any) -> list[np.ndarray]:
+    """The arguments as arrays of this shape and type; InputError names the one that is none."""
+    arrays = []
+    for name, value in given.items():
+        try:
+            array = np.asarray(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} makes no array; expected one vector of real numbers") from error
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{name} has type {array.dtype}; expected one vector of real numbers")
+        require_shape(name, array.shape, shape)
+        arrays.append(array.astype(numpy_type, copy=False))
+    return arrays
 
 
 def _bound(function, *buffers: np.ndarray, result=None) -> Callable[[], Any]:

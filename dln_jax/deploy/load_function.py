@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
 from dln_jax.deploy.load import MODEL
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
-from dln_jax.learning.runs import data_type
+from dln_jax.learning.runs import data_type, require_double_precision
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import activation
 from dln_jax.nn.differential_mlp import Layers
-from dln_jax.types import InputError
+from dln_jax.types import InputError, VectorLike
 
 KIND = "differential-mlp"
 KEYS = {"kind", "sizes", "activation", "members", "precision"}
@@ -36,8 +36,8 @@ class LoadedFunction(NamedTuple):
     """With the members on the leading axis, also when there is one."""
     description: dict[str, Any]
     """Of the model, as it was saved."""
-    derivatives: Callable[[Array], Derivatives]
-    """Jitted: x [n] -> value, Jacobian and Hessian, in the precision of the training."""
+    derivatives: Callable[[VectorLike], Derivatives]
+    """Jitted: x [n] -> value, Jacobian and Hessian, in the precision of the training; refuses what is no such x."""
 
 
 def save_function(directory: Path, layers: Layers, *, activation: str, precision: str) -> None:
@@ -55,7 +55,8 @@ def load_function(directory: str | Path) -> LoadedFunction:
     """The differential network of a trained run.
 
     Raises:
-        InputError: no such model in the folder, or one that is damaged, altered or of another schema.
+        InputError: no such model in the folder, one that is damaged, altered or of another schema, or one in double
+            precision while JAX computes in single: the message names the line to add.
     """
     directory = Path(directory)
     description = load_manifest(directory, MODEL).get("model")
@@ -65,6 +66,8 @@ def load_function(directory: str | Path) -> LoadedFunction:
         raise InputError(
             f"{directory / MODEL}.json: lacks {', '.join(sorted(missing))}; train again or restore the file"
         )
+    if description["precision"] == "f64":
+        require_double_precision(str(directory))
     dtype, function = data_type(description["precision"]), activation(description["activation"])
     like = jax.eval_shape(
         lambda key: ensembles.init(key, description["sizes"], members=description["members"], dtype=dtype),
@@ -74,7 +77,7 @@ def load_function(directory: str | Path) -> LoadedFunction:
 
     @jax.jit
     def derivatives(x):
-        x = jnp.asarray(x, dtype)
+        x = vectors(description["sizes"][0], x=x)[0].astype(dtype)
         every = jax.vmap(lambda ours: differential_mlp.value_jacobian_and_hessian(ours, x, activation=function))(layers)
         return Derivatives(*(array.mean(axis=0) for array in every))
 

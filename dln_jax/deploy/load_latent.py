@@ -9,6 +9,7 @@ import numpy as np
 
 from dln_jax.deploy.load import MODEL, compiled
 from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
 from dln_jax.models.model import Parameters
 from dln_jax.models.principal_components import Components
@@ -59,8 +60,12 @@ def load_latent(directory: str | Path) -> LatentPhase:
     mean, basis, scale = (np.asarray(stored["components"][key]) for key in ("mean", "basis", "scale"))
     model = build_latent(facts["field"], Components(mean, basis, float(scale), 0.0)).of_pictures
     system = model.apply(stored["parameters"])
+
+    def single(size, **given):
+        return (array.astype(jnp.float32) for array in vectors(size, **given))
+
     return LatentPhase(
-        jax.jit(lambda frames: system.encode(jnp.asarray(frames, jnp.float32))),
-        jax.jit(lambda q, p: system.decode(jnp.asarray(q, jnp.float32), jnp.asarray(p, jnp.float32))),
+        jax.jit(lambda frames: system.encode(*single(2 * facts["pixels"], frames=frames))),
+        jax.jit(lambda q, p: system.decode(*single(1, q=q, p=p))),
         compiled(system.field, jnp.float32),
     )

@@ -32,7 +32,7 @@ def definiteness(
     Raises:
         InputError: a model without a mass matrix, or no states.
     """
-    if dynamics.mass_matrix is None:
+    if not dynamics.has_energy:
         raise InputError("definiteness: the model has no mass matrix; give one that comes from an energy")
     if len(q) == 0:
         raise InputError("definiteness: q has no states; give at least one row")

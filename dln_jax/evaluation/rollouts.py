@@ -193,7 +193,7 @@ def rollout_metrics(
         "rollout_seconds": float(np.mean(durations)),
         "normalised_state_error": normalised_state_error(data, interpolated),
     }
-    if dynamics.energy is not None:
+    if dynamics.has_energy:
         metrics["energy_error_j"] = energy_error(dynamics.energy, interpolated, dtype=dtype)
     return metrics
 

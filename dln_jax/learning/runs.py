@@ -89,9 +89,21 @@ def data_type(precision: str) -> Any:
     kinds = {"f32": jnp.float32, "f64": jnp.float64}
     if precision not in kinds:
         raise InputError(f"precision is '{precision}'; expected f32 or f64")
-    if precision == "f64" and not jax.config.read("jax_enable_x64"):
-        raise InputError("f64 needs jax.config.update('jax_enable_x64', True) before the first JAX call")
+    if precision == "f64":
+        require_double_precision("f64")
     return kinds[precision]
+
+
+def require_double_precision(what: str) -> None:
+    """Raises `InputError` that says how to switch on double precision, where JAX computes in 32 bits.
+
+    The setting is the process's, which a caller's own arrays, `vmap` and `grad` follow: the caller sets it.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            f"{what} needs double precision, which JAX leaves off; "
+            'add `jax.config.update("jax_enable_x64", True)` behind the imports'
+        )
 
 
 def fingerprint(arrays: Iterable[np.ndarray | None]) -> str:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
 from dln_jax.mechanics.lagrangian import friction_force
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Hamiltonian, Scalar, Vector, require_positive
@@ -171,8 +171,12 @@ def dynamics(
     dissipation: Dissipation | None = None,
     iterations: int | None = None,
     initial_guess: Guess | None = None,
+    degrees_of_freedom: int | None = None,
 ) -> Dynamics:
-    """All functions of the system at once, of (q, qd); `iterations` and `initial_guess` as for `conjugate`."""
+    """All functions of the system at once, of (q, qd); `iterations` and `initial_guess` as for `conjugate`.
+
+    With `degrees_of_freedom` they refuse states of another size; H itself does not say what it is a function of.
+    """
     _require_iterations(iterations)
 
     def momentum(q: Vector, qd: Vector) -> Vector:
@@ -195,7 +199,7 @@ def dynamics(
         _, pd = time_derivative(H, q, p, tau, dissipation=dissipation)
         return jax.jvp(lambda *state: velocity(H, *state), (q, p), (qd, pd))[1]
 
-    return Dynamics(
+    return make_dynamics(
         inverse_dynamics=with_friction,
         forward_dynamics=accelerate,
         energy=lambda q, qd: H(q, momentum(q, qd)),
@@ -203,4 +207,5 @@ def dynamics(
         decompose=lambda q, qd, qdd: decompose_by_differences(frictionless, q, qd, qdd),
         hamiltonian=H,
         friction=dissipation and functools.partial(friction_force, dissipation),
+        degrees_of_freedom=degrees_of_freedom,
     )

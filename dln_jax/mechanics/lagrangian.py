@@ -12,7 +12,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
@@ -55,8 +55,13 @@ def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
     return jax.grad(D, argnums=1)(q, qd)
 
 
-def dynamics(L: Lagrangian, *, dissipation: Dissipation | None = None) -> Dynamics:
-    """All functions of the system at once; friction enters only where there is a Rayleigh function."""
+def dynamics(
+    L: Lagrangian, *, dissipation: Dissipation | None = None, degrees_of_freedom: int | None = None
+) -> Dynamics:
+    """All functions of the system at once; friction enters only where there is a Rayleigh function.
+
+    With `degrees_of_freedom` they refuse states of another size; L itself does not say what it is a function of.
+    """
 
     def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
         tau = inverse_dynamics(L, q, qd, qdd)
@@ -66,11 +71,12 @@ def dynamics(L: Lagrangian, *, dissipation: Dissipation | None = None) -> Dynami
         driving = tau if dissipation is None else tau - friction_force(dissipation, q, qd)
         return forward_dynamics(L, q, qd, driving)
 
-    return Dynamics(
+    return make_dynamics(
         inverse_dynamics=with_friction,
         forward_dynamics=accelerate,
         energy=functools.partial(energy, L),
         mass_matrix=functools.partial(mass_matrix, L),
         decompose=functools.partial(decompose, L),
         friction=dissipation and functools.partial(friction_force, dissipation),
+        degrees_of_freedom=degrees_of_freedom,
     )

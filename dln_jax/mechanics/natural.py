@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics
 from dln_jax.mechanics.lagrangian import friction_force
 from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Matrix, Potential, Scalar, Vector
@@ -96,15 +96,16 @@ def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Deco
     )
 
 
-def dynamics(system: NaturalSystem) -> Dynamics:
-    """All functions of the system at once."""
-    return Dynamics(
+def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
+    return make_dynamics(
         inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
         forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),
         energy=lambda q, qd: energy(system, q, qd),
-        mass_matrix=lambda q, qd=None: mass_matrix(system, q, qd),
+        mass_matrix=lambda q, qd: mass_matrix(system, q, qd),
         decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
         friction=system.dissipation and functools.partial(friction_force, system.dissipation),
+        degrees_of_freedom=degrees_of_freedom,
     )
 
 

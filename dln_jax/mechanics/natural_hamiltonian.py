@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics
 from dln_jax.mechanics.lagrangian import friction_force
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
@@ -40,8 +40,10 @@ def hamiltonian(system: NaturalHamiltonian) -> Hamiltonian:
     return total
 
 
-def dynamics(system: NaturalHamiltonian) -> Dynamics:
+def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """All functions of the system at once, by triangular solves with the factor.
+
+    With `degrees_of_freedom` they refuse states of another size.
 
     With y = L⁻¹ qd, p = L⁻ᵀ y: qdd = dL/dt y + L (dL/dtᵀ p + Lᵀ dp/dt), and dT/dq_k = pᵀ dL/dq_k y.
     """
@@ -82,14 +84,15 @@ def dynamics(system: NaturalHamiltonian) -> Dynamics:
             gravity=jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q),
         )
 
-    return Dynamics(
+    return make_dynamics(
         inverse_dynamics=lambda q, qd, qdd: kinetic_force(q, qd, qdd) + load(q, qd),
         forward_dynamics=accelerate,
         energy=energy,
-        mass_matrix=lambda q, qd=None: jax.vmap(lambda unit: mass_times(q, unit))(jnp.eye(q.shape[0], dtype=q.dtype)),
+        mass_matrix=lambda q, qd: jax.vmap(lambda unit: mass_times(q, unit))(jnp.eye(q.shape[0], dtype=q.dtype)),
         decompose=decompose,
         hamiltonian=hamiltonian(system),
         friction=system.dissipation and functools.partial(friction_force, system.dissipation),
+        degrees_of_freedom=degrees_of_freedom,
     )
 
 

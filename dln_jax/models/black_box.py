@@ -59,6 +59,7 @@ def make_black_box_lagrangian(
         return lagrangian.dynamics(
             functools.partial(energy, parameters),
             dissipation=dissipation and functools.partial(dissipation, parameters),
+            degrees_of_freedom=needs.degrees_of_freedom,
         )
 
     return Model(init=lambda key: networks.init(key, q, q), apply=apply)

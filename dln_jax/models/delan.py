@@ -64,7 +64,7 @@ def make_delan(
 
     return Model(
         init=lambda key: networks.init(key, q, q),
-        apply=lambda parameters: natural.dynamics(system(parameters)),
+        apply=lambda parameters: natural.dynamics(system(parameters), degrees_of_freedom=needs.degrees_of_freedom),
     )
 
 

@@ -12,7 +12,7 @@ import haiku as hk
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
 from dln_jax.models.black_box import Scale, per_coordinate
 from dln_jax.models.features import joint_features, unsaturated
 from dln_jax.models.model import Model, Parameters
@@ -73,12 +73,11 @@ def make_feed_forward(
 
     def apply(parameters: Parameters) -> Dynamics:
         inverse, forward = (functools.partial(function, parameters) for function in networks.apply)
-        return Dynamics(
+        return make_dynamics(
             inverse_dynamics=inverse,
             forward_dynamics=forward,
-            energy=None,
-            mass_matrix=None,
             decompose=functools.partial(decompose_by_differences, inverse),
+            degrees_of_freedom=needs.degrees_of_freedom,
         )
 
     return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), apply=apply)

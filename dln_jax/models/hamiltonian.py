@@ -59,7 +59,7 @@ def make_structured_hamiltonian(
             potential=potential and functools.partial(potential, parameters),
             dissipation=dissipation and functools.partial(dissipation, parameters),
         )
-        return natural_hamiltonian.dynamics(system)
+        return natural_hamiltonian.dynamics(system, degrees_of_freedom=needs.degrees_of_freedom)
 
     return Model(init=lambda key: networks.init(key, q, q), apply=apply)
 
@@ -107,6 +107,7 @@ def make_black_box_hamiltonian(
             dissipation=dissipation and functools.partial(dissipation, parameters),
             iterations=iterations,
             initial_guess=initial_guess,
+            degrees_of_freedom=needs.degrees_of_freedom,
         )
 
     return Model(init=lambda key: networks.init(key, q, q), apply=apply)

@@ -29,7 +29,13 @@ from jaxtyping import Float
 
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import PhaseField, PhaseModel, hamiltonian_phase_model, make_phase_network
+from dln_jax.models.phase_field import (
+    PhaseField,
+    PhaseModel,
+    hamiltonian_phase_model,
+    make_phase_field,
+    make_phase_network,
+)
 from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
 from dln_jax.types import InputError, Needs, Scalar, require_positive
@@ -112,7 +118,7 @@ def _slowed(model: PhaseModel, rate: float) -> PhaseModel:
             qd, pd = inner.rates(q, p / rate)
             return rate * qd, rate**2 * pd
 
-        return PhaseField(rates, energy if H is not None else None)
+        return make_phase_field(rates, energy if H is not None else None, degrees_of_freedom=1)
 
     return PhaseModel(model.init, apply)
 

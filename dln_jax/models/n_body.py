@@ -95,7 +95,8 @@ def make_pairwise_hamiltonian(
 
     def apply(parameters: Parameters) -> Dynamics:
         factor, energy = (functools.partial(function, parameters) for function in networks.apply)
-        return natural_hamiltonian.dynamics(NaturalHamiltonian(inverse_factor=factor, potential=energy))
+        system = NaturalHamiltonian(inverse_factor=factor, potential=energy)
+        return natural_hamiltonian.dynamics(system, degrees_of_freedom=bodies * dimension)
 
     # Where the parameters are made all bodies stand apart, so that no feature is infinite.
     start = np.arange(bodies * dimension)

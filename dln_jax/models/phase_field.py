@@ -19,22 +19,26 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.models.black_box import Scale, per_coordinate
 from dln_jax.models.features import joint_features, unsaturated
 from dln_jax.models.model import Model, Parameters
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import Dissipation, Hamiltonian, Needs, Scalar, Vector, require_positive
+from dln_jax.types import Dissipation, Hamiltonian, Needs, Scalar, Vector, VectorLike, require_positive
 
 
 class PhaseField(NamedTuple):
-    """A system without applied forces; functions of one state, which `vmap` takes over samples."""
+    """A system without applied forces; functions of one state, which `vmap` takes over samples.
 
-    rates: Callable[[Array, Array], tuple[Array, Array]]
+    `make_phase_field` makes one, whose functions convert or refuse their arguments as those of `Dynamics` do.
+    """
+
+    rates: Callable[[VectorLike, VectorLike], tuple[Array, Array]]
     """(q, p) -> (qd, pd), each [d]."""
-    energy: Hamiltonian | None = None
+    energy: Callable[[VectorLike, VectorLike], Array] | None = None
     """(q, p) -> H, scalar; `None` for a model that has no energy."""
-    dissipation: Dissipation | None = None
+    dissipation: Callable[[VectorLike, VectorLike], Array] | None = None
     """(q, qd) -> Rayleigh function D >= 0; `None` where nothing is lost, or where it is not known apart."""
 
 
@@ -47,19 +51,38 @@ class PhaseModel(NamedTuple):
     """Parameters -> phase field."""
 
 
-def phase_field(H: Hamiltonian, *, dissipation: Dissipation | None = None) -> PhaseField:
+def make_phase_field(
+    rates: Callable[..., tuple[Array, Array]],
+    energy: Hamiltonian | None = None,
+    dissipation: Dissipation | None = None,
+    *,
+    degrees_of_freedom: int | None = None,
+) -> PhaseField:
+    """A phase field from functions of vectors [d] of one type; d as in `mechanics.dynamics.make_dynamics`."""
+    d = degrees_of_freedom
+    return PhaseField(
+        rates=lambda q, p: rates(*vectors(d, q=q, p=p)),
+        energy=energy and (lambda q, p: energy(*vectors(d, q=q, p=p))),
+        dissipation=dissipation and (lambda q, qd: dissipation(*vectors(d, q=q, qd=qd))),
+    )
+
+
+def phase_field(
+    H: Hamiltonian, *, dissipation: Dissipation | None = None, degrees_of_freedom: int | None = None
+) -> PhaseField:
     """Hamilton's equations of an energy, with the friction of a Rayleigh function where there is one."""
 
     def rates(q: Vector, p: Vector) -> tuple[Vector, Vector]:
         return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=dissipation)
 
-    return PhaseField(rates, H, dissipation)
+    return make_phase_field(rates, H, dissipation, degrees_of_freedom=degrees_of_freedom)
 
 
 def from_dynamics(dynamics: Dynamics) -> PhaseField:
     """The phase field of dynamics that have a Hamiltonian."""
     H, friction = dynamics.hamiltonian, dynamics.friction
     assert H is not None, "the dynamics have no Hamiltonian"
+    # H and the friction refuse what is no state of theirs.
     conservative = phase_field(H)
     if friction is None:
         return conservative
@@ -68,7 +91,7 @@ def from_dynamics(dynamics: Dynamics) -> PhaseField:
         qd, pd = conservative.rates(q, p)
         return qd, pd - friction(q, qd)
 
-    return PhaseField(rates, H)
+    return make_phase_field(rates, H)
 
 
 def hamiltonian_phase_model(model: Model) -> PhaseModel:
@@ -122,7 +145,7 @@ def make_dissipative(
 
         H = model.apply(parameters["energy"]).hamiltonian
         assert H is not None, "the model has no Hamiltonian"
-        return phase_field(H, dissipation=dissipation)
+        return phase_field(H, dissipation=dissipation, degrees_of_freedom=d)
 
     return PhaseModel(init, apply)
 
@@ -167,5 +190,5 @@ def make_phase_network(
     start = jnp.zeros(d, dtype)
     return PhaseModel(
         init=lambda key: network.init(key, start, start),
-        apply=lambda parameters: PhaseField(functools.partial(network.apply, parameters)),
+        apply=lambda parameters: make_phase_field(functools.partial(network.apply, parameters), degrees_of_freedom=d),
     )

@@ -83,6 +83,6 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
         return product
 
     def apply(parameters: Parameters) -> PhaseField:
-        return phase_field(lambda q, p: jnp.dot(parameters, values(q, p)))
+        return phase_field(lambda q, p: jnp.dot(parameters, values(q, p)), degrees_of_freedom=d)
 
     return PhaseModel(init=lambda key: jnp.zeros(len(terms), dtype), apply=apply)

@@ -92,6 +92,7 @@ def make_separable_hamiltonian(
             dissipation=dissipation and functools.partial(dissipation, parameters),
             iterations=iterations,
             initial_guess=initial_guess,
+            degrees_of_freedom=needs.degrees_of_freedom,
         )
 
     return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), apply=apply)

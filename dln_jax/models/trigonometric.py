@@ -22,7 +22,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float, Int
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.dynamics import Decomposition, make_dynamics
 from dln_jax.models.model import Model
 from dln_jax.solvers import elimination
 from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector
@@ -178,11 +178,12 @@ def _dynamics(parameters: TrigonometricParameters, entry: Int[np.ndarray, "d d"]
             gravity=jnp.zeros_like(q) if potential is None else gravity(q),
         )
 
-    return Dynamics(
+    return make_dynamics(
         inverse_dynamics=inverse_dynamics,
         forward_dynamics=forward_dynamics,
         energy=energy,
         mass_matrix=mass_matrix,
         decompose=decompose,
         friction=None if friction is None else lambda q, qd: friction * qd,
+        degrees_of_freedom=len(entry),
     )

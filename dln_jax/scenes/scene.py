@@ -42,7 +42,9 @@ class Scene(NamedTuple):
 
 def dynamics(scene: Scene) -> Dynamics:
     """The scene's dynamics, derived from its energies by the generic mechanics."""
-    return lagrangian.dynamics(scene.lagrangian, dissipation=scene.dissipation)
+    return lagrangian.dynamics(
+        scene.lagrangian, dissipation=scene.dissipation, degrees_of_freedom=scene.needs.degrees_of_freedom
+    )
 
 
 def closed_form_decomposition(scene: Scene, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:

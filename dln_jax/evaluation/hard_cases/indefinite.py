@@ -27,7 +27,6 @@ def indefinite_hessians() -> Findings:
     system = model.apply(random_parameters(model))
     states = [np.random.default_rng(0).uniform(-1, 1, (64, 2)) * size for size in (np.pi, 2.0)]
     network = definiteness(system, *states)
-    assert system.mass_matrix is not None
     mass = np.asarray(jax.jit(jax.vmap(system.mass_matrix))(*states))
     # Sylvester: a symmetric 2x2 matrix is definite if its first entry and its determinant are positive.
     definite = (mass[:, 0, 0] > 0) & (mass[:, 0, 0] * mass[:, 1, 1] - mass[:, 0, 1] ** 2 > 0)

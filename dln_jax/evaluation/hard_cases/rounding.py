@@ -229,9 +229,7 @@ def _sizes(system: Dynamics, both_ways: Callable, q, qd, x) -> list[tuple[np.nda
             states = [q, qd, x]
             states[index] = states[index] * (1 + small * np.eye(2)[column])
             moved += abs(both_ways(*states) - truth) / small
-    mass_matrix = system.mass_matrix
-    assert mass_matrix is not None
-    parts, mass = jax.jit(jax.vmap(lambda *s: (system.decompose(*s), mass_matrix(*s[:2]))))(q, qd, x)
+    parts, mass = jax.jit(jax.vmap(lambda *s: (system.decompose(*s), system.mass_matrix(*s[:2]))))(q, qd, x)
     inertial, coriolis, gravity = (abs(np.asarray(part)) for part in parts)
     # What is solved for the acceleration is tau less the bias; the inverse of M passes the rounding on.
     solved = np.einsum("nij,nj->ni", abs(np.asarray(mass)), abs(truth[:, 1])) + abs(x) + coriolis + gravity
