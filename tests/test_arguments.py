@@ -2,14 +2,21 @@
 
 import functools
 import inspect
+import shutil
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax.deploy.c_source import export_c
+from dln_jax.deploy.export_stablehlo import export_stablehlo
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.load import load_phase_field, load_run, save_model
+from dln_jax.deploy.load_c import load_c
+from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.mechanics import hamiltonian, lagrangian, natural, natural_hamiltonian
 from dln_jax.mechanics.natural import NaturalSystem
@@ -202,3 +209,94 @@ def test_a_phase_field_refuses_and_converts_likewise(origin, tmp_path):
                     function(value, fine)
         got, expected = jax.jit(lambda f=function: (f((1, 0), [0.5, 1]), f(np.array([1.0, 0]), np.array([0.5, 1]))))()
         jax.tree.map(np.testing.assert_array_equal, got, expected)
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="there is no C compiler on the PATH")
+@pytest.mark.parametrize("kind", ["structured-delan", "black-box-delan", "feed-forward"])
+def test_exported_c_takes_and_refuses_what_the_model_does(kind, tmp_path):
+    model = network(kind)(tmp_path)
+    export_c(description(kind), parameters_of(build, kind), tmp_path)
+    system = load_c(tmp_path, flags=("-O0",))
+    q, qd, x = [0.3, -0.2], [1, 0], np.array([0.5, 1.0], np.float32)
+    expected = jax.jit(model.inverse_dynamics)(q, qd, x)
+    np.testing.assert_allclose(system.inverse_dynamics(q, qd, x), expected, rtol=1e-10)
+    np.testing.assert_allclose(system.inverse_dynamics(*map(np.asarray, (q, qd, x))), expected, rtol=1e-10)
+    calls = {"inverse_dynamics": ("q", "qd", "qdd"), "forward_dynamics": ("q", "qd", "tau")}
+    assert system.has_energy == model.has_energy
+    if model.has_energy:
+        np.testing.assert_allclose(system.mass_matrix(q), jax.jit(model.mass_matrix)(q), rtol=1e-10)
+        calls |= {"energy": ("q", "qd"), "mass_matrix": ("q", "qd")}
+    else:
+        with pytest.raises(InputError, match="comes from no energy"):
+            system.mass_matrix(q)
+    for name, names in calls.items():
+        for fault, (value, message) in MALFORMED.items():
+            message = message if "has shape" in message else "(has type|makes no array)"
+            for place, argument in enumerate(names):
+                if (fault, name, argument) == ("nothing", "mass_matrix", "qd"):
+                    continue
+                state = [value if index == place else np.ones(2) for index in range(len(names))]
+                # An array of the right shape is not looked at, which would cost too much; NumPy warns of complex ones.
+                if fault in ("complex", "truth values") and name.endswith("dynamics"):
+                    state = [list(each) for each in state]
+                with pytest.raises(InputError, match=f"^{argument} {message}"):
+                    getattr(system, name)(*state)
+
+
+def test_a_network_of_x_refuses_and_converts_likewise(tmp_path):
+    draw = np.random.default_rng(0).normal
+    layers = tuple((jnp.asarray(draw(size=(1, *size))), jnp.zeros((1, size[1]))) for size in ((2, 3), (3, 1)))
+    save_function(tmp_path, layers, activation="tanh", precision="f64")
+    derivatives = load_function(tmp_path).derivatives
+    jax.tree.map(np.testing.assert_array_equal, derivatives([1, 0]), derivatives(np.array([1.0, 0.0])))
+    for value, message in (MALFORMED[fault] for fault in MALFORMED if fault != "text"):
+        with pytest.raises(InputError, match=f"^x {message}"):
+            derivatives(value)
+
+
+DOUBLE = """
+import sys
+import jax
+from pathlib import Path
+from dln_jax import InputError, load_phase_field, load_run
+from dln_jax.deploy.c_source import export_run
+from dln_jax.deploy.export_stablehlo import load_stablehlo
+from dln_jax.deploy.load_function import load_function
+folder = Path(sys.argv[1])
+loads = {
+    "run": lambda: load_run(folder / "run"),
+    "field": lambda: load_phase_field(folder / "field"),
+    "function": lambda: load_function(folder / "function"),
+    "c": lambda: export_run(folder / "run", folder / "c"),
+    "export": lambda: load_stablehlo(folder / "sine.stablehlo"),
+}
+messages = {}
+for name, load in loads.items():
+    try:
+        load()
+    except InputError as error:
+        messages[name] = str(error)
+(line,) = {message.split("`")[1] for message in messages.values()}
+print(len(messages), *messages.values(), sep=chr(10))
+exec(line)
+results = {name: load() for name, load in loads.items()}
+print(results["run"].inverse_dynamics([0, 1], [1, 0], [0, 0]).dtype, results["export"]([1, 2]).dtype)
+"""
+
+
+def test_double_precision_is_asked_for_in_one_line_that_works(tmp_path):
+    """In a process of its own, in which JAX computes in 32 bits: each refusal names the line, after which all load."""
+    pytest.importorskip("flatbuffers", reason="jax.export writes artefacts with flatbuffers")
+    for folder in ("run", "field", "function"):
+        (tmp_path / folder).mkdir()
+    loaded("structured-delan")(tmp_path / "run")
+    loaded_field(tmp_path / "field")
+    save_function(
+        tmp_path / "function", ((jnp.ones((1, 2, 1)), jnp.zeros((1, 1))),), activation="tanh", precision="f64"
+    )
+    export_stablehlo(jnp.sin, np.zeros(2), path=tmp_path / "sine.stablehlo")
+    result = subprocess.run([sys.executable, "-c", DOUBLE, tmp_path], capture_output=True, text=True, timeout=200)
+    assert result.returncode == 0, result.stderr
+    count, *messages, types = result.stdout.splitlines()
+    assert count == "5" and len(messages) == 5 and types == "float64 float64"
+    assert messages[0].startswith(f"{tmp_path / 'run'} needs double precision")
