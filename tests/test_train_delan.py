@@ -89,17 +89,6 @@ def test_a_run_writes_all_its_files(trained):
     assert config["width"] == 4 and "out" not in config
 
 
-def test_the_readme_example_runs(trained, monkeypatch, capsys):
-    text = (ROOT / "README.md").read_text()
-    example = re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1)
-    assert len(example.strip().splitlines()) <= 15
-    monkeypatch.chdir(trained.parent.parent)
-    names = {}
-    exec(example, names)
-    assert names["tau"].shape == (2,) and np.isfinite(names["tau"]).all()
-    np.testing.assert_allclose(names["qdd"], names["again"], rtol=1e-2, atol=1e-2)
-
-
 def test_a_second_run_takes_the_next_folder_and_an_explicit_one_is_never_overwritten(trained, capsys):
     before = {path: path.read_bytes() for path in trained.iterdir()}
     line = refused(capsys, train_delan, *TINY, "--out", trained)
