@@ -18,6 +18,7 @@ from dln_jax.evaluation.rollouts import (
     valid_prediction_times,
 )
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.dynamics import no_energy
 from dln_jax.types import InputError
 
 FRICTION = 0.3
@@ -135,7 +136,7 @@ def test_the_true_plant_predicts_its_own_motions_and_another_does_not():
     assert 0 < truth["vpt_seconds"] < 1.0  # holding the torque loses a recorded motion
     assert truth["normalised_state_error"] < 1e-13 and truth["energy_error_j"] < 1e-12
     # A model without an energy is rolled out as well.
-    other = rollout_metrics(damped_oscillator()._replace(energy=None), data)
+    other = rollout_metrics(damped_oscillator()._replace(energy=no_energy), data)
     assert 0 < other["vpt_interpolated_seconds"] < 0.6
     assert other["normalised_state_error"] > 0.1
     assert "energy_error_j" not in other
