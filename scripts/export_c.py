@@ -27,7 +27,7 @@ class Arguments:
     name: str = "model"
     """A C name; files and functions start with it."""
     overwrite: bool = False
-    """Replace files that exist."""
+    """Replace the files of an earlier export; those of a run are never replaced."""
 
 
 def main(given: Arguments) -> None:
