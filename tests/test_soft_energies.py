@@ -341,12 +341,13 @@ def test_single_precision_stays_single():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_gravity_is_the_weight(dimension):
+    """Against the last axis: y in the plane, z in space."""
     mesh = MESHES[dimension]
     context = make_context(mesh.vertices)
     term = gravity(mesh)
     force = -gradient_of(lambda x: total(term, term.parameters, context, x), context.x)
     expected = np.zeros_like(mesh.vertices)
-    expected[:, 1] = -9.81 * np.asarray(context.masses)
+    expected[:, -1] = -9.81 * np.asarray(context.masses)
     np.testing.assert_allclose(force, expected, rtol=1e-14)
     tilted = gravity(2, np.arange(1.0, 1.0 + dimension))
     slope = gradient_of(lambda p: total(tilted, p, context, context.x), tilted.parameters).acceleration

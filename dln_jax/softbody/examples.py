@@ -75,7 +75,7 @@ def beam(
     if held is None:
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh))]
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh)]
     scene = make_scene(mesh, terms, density=DENSITY, held=held)
     return Example(scene, initial_state(scene), dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
@@ -121,7 +121,7 @@ def slope(
     normal = np.array([-along[1], along[0]])
     mesh = Mesh(mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal, mesh.elements)
     ground = _ground(mesh, friction, height=0.5, normal=normal)
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh)), ground]
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
     scene = make_scene(mesh, terms, density=DENSITY)
     return Example(
         scene, initial_state(scene), dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0)
@@ -152,8 +152,8 @@ def drop(
     lift = np.zeros(mesh.dimension)
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = Mesh(mesh.vertices + lift, mesh.elements)
-    ground = _ground(mesh, friction, height=height, normal=-np.array(_down(mesh)) / GRAVITY)
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh, _down(mesh)), ground]
+    ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
+    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
     scene = make_scene(mesh, terms, density=DENSITY)
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
@@ -200,10 +200,6 @@ EXAMPLES: dict[str, Callable[..., Example]] = {
 
 def _solid(mesh: Mesh, density: StrainEnergy, youngs_modulus: float, poisson_ratio: float) -> Term:
     return elastic(mesh, density, youngs_modulus=youngs_modulus, poisson_ratio=poisson_ratio)
-
-
-def _down(mesh: Mesh) -> tuple[float, ...]:
-    return (*(0.0,) * (mesh.dimension - 1), -GRAVITY)
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:

@@ -22,14 +22,14 @@ class Gravity(NamedTuple):
 def gravity(vertices: Mesh | int, acceleration: Numbers | None = None, *, name: str = "gravity") -> Term:
     """-m g·x for every vertex of a mesh, or for the first so many; g is the acceleration in m/s².
 
-    With a mesh, g defaults to 9.81 m/s² against the second axis (y points up in 2-D and in 3-D).
+    With a mesh, g defaults to 9.81 m/s² against the last axis, which points up: y in the plane, z in space.
     """
     count = vertices if isinstance(vertices, int) else len(vertices.vertices)
     require_positive(vertices=count)
     if acceleration is None:
         if isinstance(vertices, int):
             raise InputError("gravity got a number of vertices and no acceleration; pass its 2 or 3 components")
-        acceleration = (0.0, -9.81, 0.0)[: vertices.dimension]
+        acceleration = (*(0.0,) * (vertices.dimension - 1), -9.81)
     parameters = Gravity(vector("acceleration", acceleration))
 
     def prepare(parameters: Gravity, context: Context) -> Float[Array, "n dim"]:
