@@ -6,7 +6,7 @@ kg/m³; in the plane they are 1 m thick.
 
 Your own mesh: --mesh FILE.npz for the scenes beam and drop, with `vertices` [n, 2 or 3] in m, the last axis up,
 `elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam, optionally `held` [k] (vertices;
-by default those of least x).
+by default those of least x). Inverted elements are turned, and it says how many.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
 from dln_jax.files import write_json
 from dln_jax.softbody.driven import Example, beginning, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
-from dln_jax.softbody.mesh import Mesh, make_mesh
+from dln_jax.softbody.mesh import Mesh, make_mesh, overlaps
 from dln_jax.softbody.rollout import rollout
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import Integrator, Step
@@ -47,6 +47,7 @@ MATERIALS = {
     "corotated": corotated,
 }
 PRECISIONS = {"f32": jnp.float32, "f64": jnp.float64}
+FACETS = {2: "edges", 3: "triangles"}
 CHUNKS = 20
 """Programs called for a motion, after each of which progress is shown."""
 ALL = "all"
@@ -141,6 +142,12 @@ def simulate(prepared: Prepared, folder: Path, console: Console) -> Moments:
         f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements, "
         f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
     )
+    if mesh.turned:
+        console.print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
+    if count := len(overlaps(mesh)):
+        console.print(
+            f"elements overlap at {count} of their {FACETS[mesh.dimension]}: there, mass and stiffness add up"
+        )
     motion = run_motion(prepared)
     rows = results(given.scene, mesh, motion)
     numbers = {row.quantity: row.value for row in rows if math.isfinite(row.value)}

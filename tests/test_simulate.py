@@ -155,7 +155,9 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
 def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     mesh = beam_mesh(2.0, 1.0, 2, 1)
     right = np.flatnonzero(mesh.vertices[:, 0] == 2.0)
-    np.savez(tmp_path / "mesh.npz", vertices=mesh.vertices, elements=mesh.elements, held=right)
+    # Clockwise, and one more triangle on an edge that two share already.
+    elements = np.concatenate([mesh.elements[:, ::-1], [[0, 3, 4]]])
+    np.savez(tmp_path / "mesh.npz", vertices=mesh.vertices, elements=elements, held=right)
     options = ("--mesh", tmp_path / "mesh.npz", "--dt", "0.05", "--seconds", "0.2", "--youngs-modulus", "1e5")
     command(simulate, "--scene", "beam", *options, "--precision", "f32", "--out", tmp_path / "run")
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -171,6 +173,7 @@ def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     assert (tmp_path / "run" / "motion.gif").read_bytes().startswith(b"GIF")
     shown = capsys.readouterr().out
     assert "steps per second" in shown and "warning" not in shown
+    assert "of 5 elements were inverted and have been turned" in shown and "elements overlap at" in shown
 
 
 def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys):
@@ -204,7 +207,7 @@ def test_the_script_refuses_wrong_meshes(tmp_path, capsys):
     wrong = {
         "'elements' is missing (the file holds vertices)": {"vertices": mesh.vertices},
         "elements has shape [2, 2]; expected [m, 3]": {**good, "elements": mesh.elements[:, :2]},
-        "inverted": {**good, "elements": mesh.elements[:, ::-1]},
+        "element 1 is a duplicate": {**good, "elements": mesh.elements[[0, 0]]},
         "held is float64 of shape [1]": {**good, "held": np.array([0.5])},
         "held names vertex 9": {**good, "held": np.array([9])},
         "not an .npz of plain arrays": {**good, "held": np.array([{}], dtype=object)},

@@ -77,6 +77,33 @@ def test_a_body_without_inner_forces_falls_as_the_method_says(integrator):
         np.testing.assert_allclose(fallen, parabola[6] - behind[integrator], atol=1e-12)
 
 
+def test_elements_given_inverted_move_as_those_given_right():
+    mesh = make_mesh(MESH.vertices, [[0, 2, 1], [1, 3, 2]])
+    assert mesh.turned == 1
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5)
+    scene = make_scene(mesh, (solid, gravity(mesh)), held=[0, 1])
+    step = make_step(scene, DT)
+    last = jax.jit(lambda state: rollout(step, state, scene.params, steps=4)[0])(initial_state(scene))
+    expected, _ = program("backward-euler")(start("backward-euler"), held_body().params)
+    np.testing.assert_allclose(last.x, expected.x, rtol=1e-12)
+    assert np.abs(expected.x - MESH.vertices).max() > 0.05
+
+
+def test_elements_that_meet_at_one_edge_keep_momentum():
+    """Three triangles at an edge: what they do to each other cancels."""
+    mesh = make_mesh([*MESH.vertices, [1.4, 1.2]], [[0, 1, 2], [1, 3, 2], [1, 4, 2]])
+    scene = make_scene(mesh, (elastic(mesh, stable_neo_hookean, youngs_modulus=1e5),))
+    v = np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    step = make_step(scene, DT, tolerance=1e-10)
+    seen = jax.jit(lambda s: rollout(step, s, scene.params, steps=4, observe=lambda s, info: (s.v, info.converged))[1])(
+        initial_state(scene, v=v)
+    )
+    assert seen[1].all()
+    momentum = np.einsum("n,tni->ti", scene.params.masses, seen[0])
+    np.testing.assert_allclose(momentum, np.broadcast_to(scene.params.masses @ v, (4, 2)), rtol=1e-9)
+    assert np.abs(seen[0][-1] - v).max() > 0.1
+
+
 def test_a_hanging_weight_stretches_its_spring_by_its_weight_over_the_stiffness():
     pairs = [[0, 2], [1, 3]]
     scene = make_scene(MESH, (springs(pairs, stiffness=200.0), WEIGHT), masses=1.5, held=[2, 3])

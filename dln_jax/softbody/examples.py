@@ -119,7 +119,7 @@ def slope(
     mesh = beam_mesh(1.0, 0.5, 2 * cells, cells)
     along = np.array([1.0, SLOPE]) / math.hypot(1.0, SLOPE)
     normal = np.array([-along[1], along[0]])
-    mesh = Mesh(mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal, mesh.elements)
+    mesh = mesh._replace(vertices=mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal)
     ground = _ground(mesh, friction, height=0.5, normal=normal)
     terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
     scene = make_scene(mesh, terms, density=DENSITY)
@@ -151,7 +151,7 @@ def drop(
     height = float(np.ptp(mesh.vertices[:, -1]))
     lift = np.zeros(mesh.dimension)
     lift[-1] = height - mesh.vertices[:, -1].min()
-    mesh = Mesh(mesh.vertices + lift, mesh.elements)
+    mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
     terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
     scene = make_scene(mesh, terms, density=DENSITY)
@@ -221,7 +221,7 @@ def _tilted(mesh: Mesh, random: np.random.Generator) -> Mesh:
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     # Cayley's transform of a skew matrix is a rotation.
     rotation = np.linalg.solve(np.eye(3) - skew / 2, np.eye(3) + skew / 2)
-    return Mesh(mesh.vertices @ rotation.T, mesh.elements)
+    return mesh._replace(vertices=mesh.vertices @ rotation.T)
 
 
 def _require_dimension(dimension: int) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.mesh_quality import as_elements, as_vertices, require_valid
+from dln_jax.softbody.mesh_quality import as_elements, as_vertices, oriented, require_valid
 from dln_jax.softbody.simplices import facets, simplex_volumes
 from dln_jax.types import InputError
 
@@ -24,6 +24,8 @@ class Mesh(NamedTuple):
     """Rest shape in m; dim is 2 or 3."""
     elements: Int[np.ndarray, "m corners"]
     """Corners of each triangle (dim 2) or tetrahedron (dim 3), positively oriented."""
+    turned: int = 0
+    """How many of the elements given to `make_mesh` were inverted (clockwise, in the plane) and have been turned."""
 
     @property
     def dimension(self) -> int:
@@ -32,17 +34,19 @@ class Mesh(NamedTuple):
 
 
 def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
-    """A mesh of vertices [n, dim] in m and elements [m, dim + 1], checked.
+    """A mesh of vertices [n, dim] in m and elements [m, dim + 1], checked and its inverted elements turned.
+
+    `Mesh.turned` counts those. Elements may overlap, as the energies of all add up; `overlaps` says where.
 
     Raises:
         InputError: names the first vertex or element at fault: a position that is not finite, a corner out of range or
-            repeated, an element that is duplicate, degenerate or inverted, a facet of more than two elements or of two
-            on the same side, a vertex in no element.
+            repeated, an element that is duplicate or degenerate, a vertex in no element.
     """
     positions = as_vertices(vertices)
     corners = as_elements(elements, positions.shape[1])
     require_valid(positions, corners)
-    return Mesh(positions, corners.astype(np.int32))
+    corners, turned = oriented(positions, corners)
+    return Mesh(positions, corners.astype(np.int32), turned)
 
 
 def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
@@ -57,14 +61,22 @@ def edges(mesh: Mesh) -> Int[np.ndarray, "e 2"]:
 
 
 def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Facets that belong to one element only, oriented outwards.
+    """Facets with the body on one side only, oriented outwards.
 
     An edge [a, b] of the plane has the body on its left: its outward normal is (yb - ya, xa - xb). That of a triangle
     [a, b, c] in space is (b - a) x (c - a).
     """
-    oriented = facets(mesh.elements).reshape(-1, mesh.dimension)
-    _, group, counts = np.unique(np.sort(oriented, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return oriented[counts[group.reshape(-1)] == 1]
+    distinct, counts = _facet_sides(mesh)
+    return distinct[(counts == 0).any(axis=1)]
+
+
+def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
+    """Facets with two elements or more on one side, which overlap: what they share has the mass and stiffness of all.
+
+    Overlaps of elements without a common facet are not found.
+    """
+    distinct, counts = _facet_sides(mesh)
+    return distinct[(counts > 1).any(axis=1)]
 
 
 def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:
@@ -114,3 +126,14 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
     shares = densities * volumes(mesh) / (mesh.dimension + 1)
     weights = np.repeat(shares, mesh.dimension + 1)
     return np.bincount(mesh.elements.reshape(-1), weights=weights, minlength=len(mesh.vertices))
+
+
+def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, "f 2"]]:
+    """Distinct facets, as their first element has them, and how many elements lie on either side of each."""
+    every = facets(mesh.elements).reshape(-1, mesh.dimension)
+    _, first, group = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True)
+    # On which side an element lies is the sign of the permutation that sorts its facet's corners.
+    swaps = sum(every[:, i] > every[:, j] for i, j in itertools.combinations(range(mesh.dimension), 2))
+    counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
+    order = np.argsort(first)
+    return every[first[order]], counts[order]

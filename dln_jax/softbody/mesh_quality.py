@@ -1,17 +1,19 @@
-"""What a mesh must be before anything is simulated on it; every message names the first element or vertex at fault."""
+"""What a mesh must be before anything is simulated on it; every message names the first element or vertex at fault.
 
-import itertools
+Refused is what has no motion, or not the one meant: a flat element has no strain, a vertex in no element no mass, and
+an element given twice counts twice. Elements may overlap, and any number may meet at a facet: their energies add up.
+"""
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.simplices import facets, regularity
+from dln_jax.softbody.simplices import regularity
 from dln_jax.types import InputError
 
 FLAT = 1e-12
 """An element this flat, as `regularity` measures it, is degenerate: its volume is rounding error."""
-WORDS = {2: ("triangle", "area", "edge"), 3: ("tetrahedron", "volume", "triangle")}
+WORDS = {2: ("triangle", "area"), 3: ("tetrahedron", "volume")}
 
 
 def as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
@@ -43,10 +45,9 @@ def as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
 
 
 def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> None:
-    """Raises `InputError` unless the elements form a mesh: valid indices, positive volumes, manifold, none dangling."""
+    """Raises `InputError` unless the elements form a mesh: valid indices, volumes, none twice, none dangling."""
     _require_indices(vertices, elements)
     _require_volumes(vertices, elements)
-    _require_manifold(elements)
     used = np.zeros(len(vertices), bool)
     used[elements] = True
     bad = np.flatnonzero(~used)
@@ -54,6 +55,15 @@ def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray
         raise InputError(
             f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
         )
+
+
+def oriented(
+    vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]
+) -> tuple[Int[np.ndarray, "m corners"], int]:
+    """Valid elements, all of positive volume, and how many were turned for it: by a swap of their last two corners."""
+    inverted = regularity(vertices, elements) < 0
+    turned = np.where(inverted[:, None], elements[:, [*range(elements.shape[1] - 2), -1, -2]], elements)
+    return turned, int(inverted.sum())
 
 
 def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
@@ -83,50 +93,14 @@ def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
 
 
 def _require_volumes(vertices: np.ndarray, elements: np.ndarray) -> None:
-    kind, measure, _ = WORDS[vertices.shape[1]]
+    kind, measure = WORDS[vertices.shape[1]]
     shape = regularity(vertices, elements)
     bad = np.flatnonzero(np.abs(shape) <= FLAT)
     if bad.size:
         raise InputError(
             f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
             f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
-            f"merge its corners or move one{_others(bad)}"
-        )
-    bad = np.flatnonzero(shape < 0)
-    if bad.size:
-        order = "counter-clockwise corners" if kind == "triangle" else "det[x1 - x0, x2 - x0, x3 - x0] > 0"
-        raise InputError(
-            f"element {bad[0]} is inverted: {kind} {elements[bad[0]].tolist()} has a negative {measure}; "
-            f"expected {order}; swap two of its corners{_others(bad)}"
-        )
-
-
-def _require_manifold(elements: np.ndarray) -> None:
-    """Each facet belongs to one element, or to two that lie on its two sides."""
-    corners = elements.shape[1]
-    kind = WORDS[corners - 1][2]
-    oriented = facets(elements).reshape(-1, corners - 1)
-    owners = np.repeat(np.arange(len(elements)), corners)
-    _, group, counts = np.unique(np.sort(oriented, axis=1), axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    bad = np.flatnonzero(counts[group] > 2)
-    if bad.size:
-        sharing = owners[group == group[bad[0]]].tolist()
-        raise InputError(
-            f"element {sharing[0]} is not part of a manifold: its {kind} {sorted(oriented[bad[0]].tolist())} "
-            f"is shared by elements {sharing}; expected at most 2"
-        )
-    # Which side a facet's outside is on: the sign of the permutation that sorts its corners.
-    swaps = sum(oriented[:, i] > oriented[:, j] for i, j in itertools.combinations(range(corners - 1), 2))
-    sided = np.column_stack([group, swaps % 2])
-    _, group, counts = np.unique(sided, axis=0, return_inverse=True, return_counts=True)
-    group = group.reshape(-1)
-    bad = np.flatnonzero(counts[group] > 1)
-    if bad.size:
-        one, other = owners[group == group[bad[0]]].tolist()
-        raise InputError(
-            f"element {one} overlaps element {other}: both lie on the same side of their common {kind} "
-            f"{sorted(oriented[bad[0]].tolist())}; expected one on either side; correct the corners of one"
+            f"leave it out, merge its corners or move one{_others(bad)}"
         )
 
 
