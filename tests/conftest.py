@@ -12,6 +12,9 @@ os.environ["XLA_FLAGS"] = " ".join(
     )
 )
 
+# As in the scripts: small factorisations on several threads burn the processor waiting for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import atexit
 import gc
 import shutil

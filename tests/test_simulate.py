@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -220,3 +223,12 @@ def test_the_script_refuses_wrong_meshes(tmp_path, capsys):
     np.savez(path, **good)
     assert "--cells is for the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_scripts_factorise_on_one_thread_unless_told(given, expected):
+    """Threads that wait for each other burn the processor; SciPy reads the variable when it is first imported."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    program = "import sys, scripts, os; print(os.environ['OPENBLAS_NUM_THREADS'], 'scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], env=environment | given, capture_output=True, text=True)
+    assert done.stdout.split() == [expected, "False"], done.stderr
