@@ -7,10 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.spatial import Delaunay
 
+from dln_jax.softbody.mesh_builders import beam, box
 from dln_jax.solvers.conjugate_gradients import conjugate_gradients
 from dln_jax.solvers.element_energies import (
     ElementEnergy,
+    Pattern,
     assemble,
     element_hessians,
     entries,
@@ -20,7 +23,7 @@ from dln_jax.solvers.element_energies import (
     square,
     value,
 )
-from dln_jax.solvers.linear_solvers import block_tridiagonal, by_size, dense, matrix_free
+from dln_jax.solvers.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
 from dln_jax.solvers.minimise import minimise
 from dln_jax.solvers.projection import project
 from dln_jax.types import InputError
@@ -66,6 +69,34 @@ ARGUMENTS = (50.0, 0.11, jnp.array([1.0, 0.1]))
 def sag():
     """Mean height, compiled: the scalar that the derivatives below are of."""
     return jax.jit(lambda *arguments: hanging_chain(*arguments)[0][:, 1].mean())
+
+
+# As measured: long bands are factorised, wide ones are not. Corners of the elements, dimension, the least work.
+CLOUD = np.random.default_rng(0).uniform(size=(1000, 3))
+CHOICES = {
+    "a few": (beam(4.0, 1.0, 8, 2).elements, 2, dense),
+    "plane": (beam(4.0, 1.0, 80, 20).elements, 2, block_tridiagonal),
+    "bar": (box((8.0, 1.0, 1.0), (48, 6, 6)).elements, 3, block_tridiagonal),
+    "block": (box((2.0, 1.0, 1.0), (12, 6, 6)).elements, 3, block_tridiagonal),
+    "unordered tetrahedra": (Delaunay(CLOUD).simplices, 3, matrix_free),
+    "chain": (np.stack([np.arange(4000), np.arange(1, 4001)], axis=1), 1, block_tridiagonal),
+}
+
+
+@pytest.mark.parametrize("case", CHOICES)
+def test_the_linear_solver_of_least_work_is_chosen(case):
+    indices, dimension, expected = CHOICES[case]
+    energies = (ElementEnergy(spring, indices),)
+    assert least_work(energies, pattern(energies, int(indices.max()) + 1, dimension)) is expected
+
+
+def test_blocks_that_would_fill_the_memory_are_not_stored():
+    """A star of many springs a spoke: its band is half of it in any order, and products are slow."""
+    n = 8000
+    none = np.zeros(0, int)
+    at = Pattern(n, 1, np.ones((n, 1), bool), np.arange(n), np.zeros(n, int), (), none, ())
+    spokes = ElementEnergy(spring, np.tile(np.stack([np.zeros(n - 1, int), np.arange(1, n)], axis=1), (40, 1)))
+    assert least_work((spokes,), at) is matrix_free
 
 
 @pytest.mark.parametrize("name", SOLVERS)

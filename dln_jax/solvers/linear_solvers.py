@@ -1,10 +1,11 @@
 """Symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-Three ways, chosen by size and structure before anything is traced:
+Three ways, chosen by their work, which size and structure tell before anything is traced:
 
 - dense Cholesky for small systems;
 - block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most;
-- conjugate gradients with a block-Jacobi preconditioner on the element Hessians, without any matrix, for the largest.
+- conjugate gradients with a block-Jacobi preconditioner on the element Hessians, without any matrix, where the band is
+  wide: bodies in space from some thousand unknowns on.
 
 A matrix that is not positive definite gives a solution that is not finite: nothing is shifted or clamped here.
 """
@@ -28,8 +29,19 @@ Blocks = Float[Array, "n b"]
 
 # Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160
-# Multiplications beyond which a factorisation takes longer than some hundred products with the matrix.
-_FACTORISATION_WORK = 4e9
+# Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
+# rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
+# unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
+# unknowns takes 6e-10 s m s², within 1.7. A search to 1e-2 takes 1.6 to 5 N^(1/d) products at nu = 0.3 and 7 to 16 at
+# nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
+# iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
+# matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
+_FACTORISATION_SECONDS = 1.3e-10
+_BLOCK_OVERHEAD = 150
+_PRODUCT_SECONDS = 6e-10
+_PRODUCTS = 15
+# Entries n b of the blocks, whose factor and index tables take some 40 bytes each, beyond which they are not stored.
+_MOST_ENTRIES = 3e7
 
 
 class LinearSolver(NamedTuple):
@@ -47,12 +59,27 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
 def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """The way that is fastest for the size and the band of the pattern."""
+    """The way that `least_work` names."""
+    return least_work(energies, at)(energies, at)
+
+
+def least_work(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolverFactory:
+    """`dense`, `block_tridiagonal` or `matrix_free`: the least work by estimates of a factorisation and of products.
+
+    The stiffness is not known beforehand; much stiffer or nearly incompressible bodies (nu > 0.49) gain by
+    `block_tridiagonal`, soft ones in small time steps by `matrix_free`.
+    """
     if at.unknowns <= _DENSE_UNKNOWNS:
-        return dense(energies, at)
-    if at.unknowns * float(_band(at, _ordering(at)) * at.width) ** 2 <= _FACTORISATION_WORK:
-        return block_tridiagonal(energies, at)
-    return matrix_free(energies, at)
+        return dense
+    size = _band(at, _ordering(at)) * at.width
+    stored = at.unknowns * size
+    factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
+    product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
+    # Vertices along an edge of the body, which information crosses by one a product.
+    across = at.blocks ** (1 / min(at.width, 3))
+    if stored <= _MOST_ENTRIES and factorisation <= _PRODUCTS * across * product:
+        return block_tridiagonal
+    return matrix_free
 
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
