@@ -40,7 +40,7 @@ _FACTORISATION_SECONDS = 1.3e-10
 _BLOCK_OVERHEAD = 150
 _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
-# Entries n b of the blocks, whose factor and index tables take some 40 bytes each, beyond which they are not stored.
+# Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
 _MOST_ENTRIES = 3e7
 
 
