@@ -123,6 +123,22 @@ def test_every_epoch_is_another_permutation_without_repetition(batch, whole):
         assert len(set(losses)) == len(losses)
 
 
+def test_the_order_of_many_samples_is_not_that_of_the_file():
+    """Two samples that meet in a batch of two are as often in the file's order as not."""
+    samples = 2**16
+    prepared = fit.make_fit(
+        lambda parameters, batch: jnp.where(batch[0] < batch[1], parameters, 0.0),
+        optax.sgd(1.0),  # each pair in order takes 1 from the parameter
+        jnp.arange(samples),
+        steps=samples // 2,
+        batch=2,
+        score=lambda parameters: (parameters, parameters),
+    )
+    state, _ = prepared.dispatch(prepared.init(jnp.zeros(()), 0), 1)
+    in_order = -float(state.parameters)
+    assert abs(in_order - samples / 4) < 5 * np.sqrt(samples / 8)  # standard deviations
+
+
 def test_torque_scale_never_divides_by_zero():
     data = generators.uniform(cart_pole(), samples=100)
     scale = torque_scale(data)
