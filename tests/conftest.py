@@ -1,26 +1,16 @@
 """Shared set-up: float64 everywhere, and programs compiled quickly rather than to run fast, and each only once."""
 
+import atexit
+import gc
 import os
-
-# Tests run each program a few times: compiling costs them more than running. Read when the first device is used.
-os.environ["XLA_FLAGS"] = " ".join(
-    (
-        os.environ.get("XLA_FLAGS", ""),
-        "--xla_backend_optimization_level=0",
-        "--xla_llvm_disable_expensive_passes=true",
-        "--xla_cpu_use_fusion_emitters=false",
-    )
-)
+import shutil
+import tempfile
 
 # As in the scripts: small factorisations on several threads burn the processor waiting for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import atexit
-import gc
-import shutil
-import tempfile
-
 import jax
+import pytest
 
 CACHE = "DLN_JAX_TEST_PROGRAMS"
 """Variable with the folder of compiled programs, which the test processes share: a run that is resumed has those of the
@@ -35,18 +25,38 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 # Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
 
+QUICKLY = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
+if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at what they do not know
+    QUICKLY.append("--xla_cpu_use_fusion_emitters=false")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
+
+
+def pytest_configure(config):
+    """Tests run each program a few times: compiling costs them more than running. Read when a device is first used."""
+    if not config.getoption("--optimised"):
+        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICKLY])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_program_has_options_of_its_own(pytestconfig):
+    """They would replace the tests' quicker ones."""
+    from dln_jax.learning import compilation  # not before the types of the library are checked
+
+    with pytest.MonkeyPatch.context() as patch:
+        if not pytestconfig.getoption("--optimised"):
+            patch.setattr(compilation, "_OPTIONS", {})
+        yield
+
+
 LONGEST = (
+    "test_compilation",
     *("test_softbody_report", "test_train_delan", "test_stability", "test_locomotion", "test_hnn_tasks", "test_pixels"),
     *("test_soft_body_identification", "test_train_models", "test_gauss_newton", "test_train_diffnet", "test_readme"),
-    *(
-        "test_minimise",
-        "test_soft_steps",
-        "test_soft_energies",
-        "test_simulate",
-        "test_export_c",
-        "test_delan",
-        "test_arm_table",
-    ),
+    *("test_minimise", "test_soft_steps", "test_soft_energies", "test_simulate", "test_export_c", "test_delan"),
+    "test_arm_table",
     *("test_mechanics", "test_n_body"),
 )
 

@@ -25,9 +25,6 @@ PLAIN = {
     "cubic": lambda x: x**3,
 }
 TANH = activations.tanh
-# Each program here is compiled for one call: a quick compilation is worth more than fast code (4 times, measured).
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-compiled = partial(jax.jit, compiler_options=QUICK)
 
 
 def plain_network(layers, x, function):
@@ -74,7 +71,7 @@ def test_equals_autodiff_of_a_plain_network(name, inputs, outputs, depth):
     layers, x = random_network((inputs, *(5, 4, 6, 3)[:depth], outputs))
     activation = activations.ALL[name]
 
-    @compiled
+    @jax.jit
     def all_ways(layers, x):
         return (
             value_and_jacobian(layers, x, activation=activation),
@@ -102,7 +99,7 @@ def test_either_sweep_is_exact_in_a_batch(sweep, monkeypatch):
     monkeypatch.setattr(differential_mlp, "cheaper_hessian", lambda sizes: sweep)
     layers, xs = random_network((3, 5, 4, 2), batch=(6,))
 
-    @compiled
+    @jax.jit
     @partial(jax.vmap, in_axes=(None, 0))
     def both(layers, x):
         one_pass = value_jacobian_and_hessian(layers, x, activation=TANH)
@@ -134,7 +131,7 @@ def test_parameter_gradients_equal_those_through_autodiff(name, sizes):
     ours = lambda layers: value_jacobian_and_hessian(layers, x, activation=activations.ALL[name])  # noqa: E731
     theirs = lambda layers: plain_derivatives(layers, x, PLAIN[name])  # noqa: E731
 
-    @compiled
+    @jax.jit
     def gradients(layers):
         _, along = jax.jvp(lambda layers: loss(layers, ours), (layers,), (direction,))
         return jax.grad(loss)(layers, ours), jax.grad(loss)(layers, theirs), along
@@ -150,8 +147,8 @@ def test_relu_has_no_curvature(sizes):
     layers, xs = random_network(sizes, batch=(20,))
     network = jax.vmap(partial(value_jacobian_and_hessian, activation=activations.relu), in_axes=(None, 0))
     plain = jax.vmap(partial(plain_derivatives, function=jax.nn.relu), in_axes=(None, 0))
-    result = compiled(network)(layers, xs)
-    assert_close(result, compiled(plain)(layers, xs))
+    result = jax.jit(network)(layers, xs)
+    assert_close(result, jax.jit(plain)(layers, xs))
     assert not result[2].any() and result[1].any()
 
 
@@ -174,7 +171,7 @@ def test_dtype_is_that_of_the_parameters():
 
 
 def flops(function, *arguments) -> float:
-    return compiled(function).lower(*arguments).compile().cost_analysis()["flops"]
+    return jax.jit(function).lower(*arguments).compile().cost_analysis()["flops"]
 
 
 def training_loss(derivatives, layers, xs):
@@ -210,17 +207,17 @@ def test_rules_choose_the_sweep_with_fewer_operations(sizes, monkeypatch):
 def test_ensemble_equals_a_loop_over_its_members():
     sizes, members, key = (2, 5, 4, 2), 4, jax.random.key(7)
     normal = jax.nn.initializers.normal(0.5)
-    init = compiled(partial(differential_mlp.init, sizes=sizes, bias=normal))
-    stacked = compiled(partial(ensembles.init, sizes=sizes, members=members, bias=normal))(key)
+    init = jax.jit(partial(differential_mlp.init, sizes=sizes, bias=normal))
+    stacked = jax.jit(partial(ensembles.init, sizes=sizes, members=members, bias=normal))(key)
     x = jnp.asarray([0.3, -0.8])
     network = partial(value_jacobian_and_hessian, activation=TANH)
-    single = compiled(network)
+    single = jax.jit(network)
     outputs = []
     for index, own in enumerate(jax.random.split(key, members)):
         member = jax.tree.map(lambda leaf, index=index: jnp.asarray(np.asarray(leaf)[index]), stacked)
         assert_close(member, init(own))
         outputs.append(jax.tree.map(np.asarray, single(member, x)))
-    statistics = compiled(partial(ensembles.mean_and_spread, network))(stacked, x)
+    statistics = jax.jit(partial(ensembles.mean_and_spread, network))(stacked, x)
     for order, of_members in enumerate(zip(*outputs, strict=True)):
         mean = sum(of_members) / members
         variance = sum((each - mean) ** 2 for each in of_members) / (members - 1)
@@ -236,7 +233,7 @@ def test_haiku_front_is_the_same_network():
         return results, value(second, x, activation=TANH)
 
     transformed, x = hk.transform(forward), jnp.asarray([0.3, -0.8])
-    parameters = compiled(transformed.init)(jax.random.key(0), x)
+    parameters = jax.jit(transformed.init)(jax.random.key(0), x)
     assert jax.tree.map(jnp.shape, parameters) == {
         "potential/layer_0": {"w": (2, 5), "b": (5,)},
         "potential/layer_1": {"w": (5, 1), "b": (1,)},
@@ -246,13 +243,13 @@ def test_haiku_front_is_the_same_network():
     assert parameters["potential/layer_0"]["b"].tolist() == [1.0] * 5
     assert {leaf.dtype for leaf in jax.tree.leaves(parameters)} == {jnp.dtype(jnp.float64)}
     layers = tuple((parameters[f"potential/layer_{i}"]["w"], parameters[f"potential/layer_{i}"]["b"]) for i in (0, 1))
-    results, _ = compiled(transformed.apply)(parameters, None, x)
-    assert_close(results, compiled(partial(value_jacobian_and_hessian, activation=TANH))(layers, x))
+    results, _ = jax.jit(transformed.apply)(parameters, None, x)
+    assert_close(results, jax.jit(partial(value_jacobian_and_hessian, activation=TANH))(layers, x))
 
 
 def test_initial_weights_follow_glorot():
     sizes = (3, 200, 100, 1)
-    layers = compiled(partial(differential_mlp.init, sizes=sizes))(jax.random.key(0))
+    layers = jax.jit(partial(differential_mlp.init, sizes=sizes))(jax.random.key(0))
     assert [weight.shape for weight, _ in layers] == list(pairwise(sizes))
     for weight, bias in jax.tree.map(np.asarray, layers):
         limit = np.sqrt(6 / sum(weight.shape))

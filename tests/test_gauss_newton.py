@@ -13,7 +13,6 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.learning import normal_equations as equations
 from dln_jax.learning.gauss_newton import (
-    QUICK_COMPILATION,
     Status,
     jacobian_bytes,
     make_levenberg_marquardt,
@@ -21,13 +20,11 @@ from dln_jax.learning.gauss_newton import (
 )
 from dln_jax.types import InputError
 
-QUICKEST = {**QUICK_COMPILATION, "xla_backend_optimization_level": 0}
-
 
 @functools.cache
 def make(residual, **settings):
     """Shared between tests, so that equal programs are compiled once."""
-    return make_levenberg_marquardt(residual, compiler_options=QUICKEST, **settings)
+    return make_levenberg_marquardt(residual, **settings)
 
 
 def uniform(seed, *shape):
@@ -238,7 +235,7 @@ def test_normal_equations(inputs, outputs):
     chunks = equations.split((x,), jnp.arange(11), 5)
     assert chunks.weights.tolist() == [[1] * 4, [1] * 4, [1] * 3 + [0]]
 
-    @functools.partial(jax.jit, compiler_options=QUICKEST)
+    @jax.jit
     def evaluate(parameters):
         values = equations.residuals(residual, parameters, chunks)
         sums = equations.normal_equations(residual, parameters, chunks, keep=True)

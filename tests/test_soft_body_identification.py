@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.learning import soft_body_identification
 from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
 from dln_jax.softbody.contact import plane_contact
 from dln_jax.softbody.elasticity import elastic
@@ -22,12 +21,6 @@ MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [
 TRUTH = {"youngs_modulus": 3e4, "poisson_ratio": 0.35, "friction": 0.4, "muscle": 900.0}
 GUESS = {"youngs_modulus": 6e4, "poisson_ratio": 0.2, "friction": 0.2, "muscle": 400.0}
 STEPS = 8
-
-
-@pytest.fixture(autouse=True)
-def compiled_as_other_tests_are(monkeypatch):
-    """Options for a program of its own would replace the tests' quicker ones."""
-    monkeypatch.setattr(soft_body_identification, "QUICK_COMPILATION", {})
 
 
 @pytest.fixture(scope="module")

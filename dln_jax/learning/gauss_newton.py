@@ -18,7 +18,6 @@ import numpy as np
 from jax import Array, lax
 
 from dln_jax.learning.levenberg_marquardt import (
-    QUICK_COMPILATION,
     LevenbergMarquardt,
     State,
     Status,
@@ -28,7 +27,6 @@ from dln_jax.learning.normal_equations import jacobian_bytes
 from dln_jax.types import InputError
 
 __all__ = [
-    "QUICK_COMPILATION",
     "LevenbergMarquardt",
     "Progress",
     "Result",

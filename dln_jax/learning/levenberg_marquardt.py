@@ -40,12 +40,6 @@ Arrays = tuple[Array, ...]
 Scaling = Literal["uniform", "diagonal"]
 
 
-QUICK_COMPILATION = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-"""Compiler options for CPU: 40 % off the compilation of a network's residuals, and no slower by more than 5 %.
-
-Measured with jaxlib 0.10.2. Options belong to a version of XLA: an unknown one is an error."""
-
-
 class Status(enum.IntEnum):
     """Why an optimisation ended, or that it has not."""
 
@@ -144,7 +138,7 @@ def make_levenberg_marquardt(
         gradient_tolerance: stop when no entry of |dF/dx| is larger.
         step_tolerance: stop when |step| <= step_tolerance (|x| + step_tolerance).
         improvement_tolerance: stop when an iteration lowers F by no more than this times F.
-        compiler_options: XLA's, for `jax.jit`; `QUICK_COMPILATION` is for short runs on a CPU.
+        compiler_options: XLA's, for `jax.jit`; `compilation.quick_compilation()` is for short runs.
 
     Raises:
         InputError: a scaling that does not exist, a probe outside (0, 1]; and, when the functions are called,

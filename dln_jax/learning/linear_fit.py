@@ -19,7 +19,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.levenberg_marquardt import QUICK_COMPILATION
+from dln_jax.learning.compilation import quick_compilation
 from dln_jax.learning.normal_equations import count
 from dln_jax.learning.residuals import torque_scale
 from dln_jax.models.model import Model, Parameters
@@ -86,7 +86,7 @@ def fit_linear(
         zero = np.zeros(count(like))
         # One program for both passes.
         one = functools.partial(_linearised, model)
-        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=QUICK_COMPILATION)
+        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
         def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
             for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, chunk_size):

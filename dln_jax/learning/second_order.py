@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.learning import gauss_newton
+from dln_jax.learning.compilation import quick_compilation
 from dln_jax.learning.normal_equations import count, jacobian_bytes
 from dln_jax.learning.runs import Checkpoint, Progress, Report, Stop, Training, plain, restore, silent, store
 from dln_jax.types import InputError
@@ -84,7 +85,7 @@ def train_second_order(
     optimiser = gauss_newton.make_levenberg_marquardt(
         sample_residual,
         improvement_tolerance=budget.improvement_tolerance,
-        compiler_options=gauss_newton.QUICK_COMPILATION if jax.default_backend() == "cpu" else None,
+        compiler_options=quick_compilation(),
     )
     init = jax.vmap(lambda each: optimiser.init(each)) if seeds else optimiser.init
     coarse = budget.coarse_steps > 0 and len(arrays[0]) >= 2 * budget.coarse_samples

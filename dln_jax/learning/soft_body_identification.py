@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from dln_jax.learning.levenberg_marquardt import QUICK_COMPILATION
+from dln_jax.learning.compilation import quick_compilation
 from dln_jax.softbody.rollout import rollout
 from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import Step, static_solve
@@ -113,7 +113,7 @@ def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int) -> Fi
     # Forward mode: a handful of parameters against thousands of residuals.
     solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
-    @functools.partial(jax.jit, compiler_options=QUICK_COMPILATION)
+    @functools.partial(jax.jit, compiler_options=quick_compilation())
     def solve(guess: Any) -> tuple[Any, Array, Array]:
         found = optimistix.least_squares(
             lambda theta, _: residual(theta), solver, guess, options={"jac": "fwd"}, max_steps=iterations, throw=False

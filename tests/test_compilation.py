@@ -1,0 +1,71 @@
+"""Options for quick compilation, and, as users compile them, programs that other tests compile without optimisation."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jaxlib import xla_client
+
+from dln_jax.learning import compilation
+
+ROOT = Path(__file__).parent.parent
+AS_USERS_COMPILE = (
+    "test_compilation.py::test_the_compiler_is_at_its_defaults_where_asked",
+    "test_activations.py::test_derivatives_equal_high_precision",
+    *(
+        f"test_mechanics.py::test_{name}[{scene}]"
+        for name in (
+            "generic_mechanics_equals_the_textbook",
+            "decomposition_equals_the_textbook_and_sums_to_the_total",
+            "structured_path_equals_generic_path",
+            "power_balance",
+        )
+        for scene in ("cart-pole", "double-pendulum-friction")
+    ),
+    *(
+        f"test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[{case}]"
+        for case in ("silu-sizes1", "gelu-sizes2")
+    ),
+    *(
+        f"test_stability.py::test_hard_cases_meet_their_bounds[{name}]"
+        for name in ("mass-conditions", "float32", "activations")
+    ),
+    "test_train_models.py::test_the_trigonometric_model_is_exact",
+)
+"""What fusion, fast approximations and reordering could break, cheap enough to compile with them."""
+
+
+def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
+    level = xla_client.CompileOptions().executable_build_options.debug_options.xla_backend_optimization_level
+    optimised = pytestconfig.getoption("--optimised")
+    assert level == (3 if optimised else 0) and bool(compilation._OPTIONS) == optimised
+    if optimised:
+        assert "XLA_FLAGS" not in os.environ and "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ
+
+
+def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
+    if pytestconfig.getoption("--optimised"):
+        pytest.skip("this is what all tests are now")
+    tests = [f"tests/{name}" for name in AS_USERS_COMPILE]
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", *tests]
+    result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.fixture
+def options(monkeypatch):
+    """One option that every XLA has, and one that none has."""
+    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_backend_optimization_level": 1, "xla_cpu_fly": True})
+    compilation._known.cache_clear()
+    yield compilation.quick_compilation()
+    compilation._known.cache_clear()
+
+
+def test_options_that_xla_does_not_know_are_left_out(options):
+    assert options == {"xla_backend_optimization_level": 1}
+    assert jax.jit(lambda x: x + 1, compiler_options=options)(jnp.ones(())) == 2
