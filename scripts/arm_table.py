@@ -85,7 +85,7 @@ def main(given: Arguments) -> None:
     if given.steps is not None:
         require_positive(steps=given.steps)
     written = letters(given.data)
-    sets = {"characters": split(written, test=CHARACTERS_TEST), "uniform": states(given.uniform)}
+    sets = {"characters": published_split(written), "uniform": states(given.uniform)}
     tests = partition_labels(written, given.splits) if given.splits else []
     parts = [split(written, test=labels) for labels in tests]
     folder = given.out if given.resume and given.out else new_folder(given.out, "arm_table")
@@ -148,6 +148,11 @@ def letters(path: Path | None) -> Trajectories:
     if data.degrees_of_freedom != 2:
         raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
     return data._replace(needs=two_link_arm().needs)
+
+
+def published_split(written: Trajectories) -> Split:
+    """Letters with the published ones as the test."""
+    return split(written, test=CHARACTERS_TEST)
 
 
 def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:

@@ -23,7 +23,7 @@ from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.evaluation.latency import one_step
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError
-from scripts.arm_table import letters
+from scripts.arm_table import letters, published_split
 from scripts.command_line import run
 
 NAME = "model"
@@ -47,7 +47,7 @@ def main(given: Arguments) -> None:
     """Times, and prints JSON."""
     if given.dispatch == "low-latency":
         enable_low_latency()
-    test = letters(None).test
+    test = published_split(letters(None)).test
     states = {
         "inverse": tuple(array[:STATES] for array in (test.q, test.qd, test.qdd)),
         "forward": tuple(array[:STATES] for array in (test.q, test.qd, test.tau)),

@@ -20,7 +20,7 @@ from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.train import Settings, train
 from dln_jax.types import InputError
 from scripts.arm_models import SIZES, needs_of
-from scripts.arm_table import letters
+from scripts.arm_table import letters, published_split
 
 WIDE = "structured-delan-64x64"
 SMALL = "structured-delan"
@@ -37,7 +37,7 @@ PROCESSES = 3
 
 def measure(quick: bool) -> tuple[list[Row], Figure]:
     """Trains every model of the arm, and times single calls in processes of their own."""
-    sets = letters(None)
+    sets = published_split(letters(None))
     with tempfile.TemporaryDirectory() as place:
         folders = [train_into(Path(place), name, sets, quick=quick) for name in names(quick)]
         test_errors = {folder.name: torque_mse(folder, sets) for folder in folders}

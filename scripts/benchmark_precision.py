@@ -14,7 +14,7 @@ from dln_jax.evaluation.report import Row
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.two_link_arm import two_link_arm
-from scripts.arm_table import letters
+from scripts.arm_table import letters, published_split
 
 BATCH = 1_000
 MEASURED = tuple(kind for kind in KINDS if kind != "black-box-hnn")
@@ -23,7 +23,7 @@ MEASURED = tuple(kind for kind in KINDS if kind != "black-box-hnn")
 
 def measure(quick: bool) -> tuple[list[Row], Figure]:
     """Largest difference of float32 from float64, relative to the largest value, and batches of 1,000 in both."""
-    sets = letters(None)
+    sets = published_split(letters(None))
     data = sets.train
     states = tuple(array[:BATCH] for array in (data.q, data.qd, data.qdd, data.tau))
     rows, shown = [], {}

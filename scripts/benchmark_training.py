@@ -23,7 +23,7 @@ from scripts.arm_models import (
     prepared,
     torque_mse,
 )
-from scripts.arm_table import letters
+from scripts.arm_table import letters, published_split
 
 ADAM_STEPS = 20_000
 QUICK = "structured-delan"
@@ -31,7 +31,7 @@ QUICK = "structured-delan"
 
 def measure(quick: bool) -> tuple[list[Row], Figure]:
     """One seed of each on the embedded letters; the arm's table has medians of several."""
-    sets = letters(None)
+    sets = published_split(letters(None))
     if quick:
         jobs = {
             "trigonometric/letters": lambda: linear_alone(sets),
@@ -60,7 +60,7 @@ def linear_alone(sets: Split) -> Measured:
     began = time.perf_counter()
     parameters = fit_linear(model, sets.train).parameters
     seconds = time.perf_counter() - began
-    numbers = {"torque_mse": torque_mse(model.apply(parameters), sets), "train_seconds": seconds}
+    numbers = {"torque_mse": torque_mse(model.apply(parameters), sets.test), "train_seconds": seconds}
     return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
 
 
@@ -69,5 +69,5 @@ def gauss_newton_alone(sets: Split, *, steps: int) -> Measured:
     model, settings = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
     training = train(model, sets, settings)
     seconds = training.compile_seconds + training.train_seconds
-    numbers = {"torque_mse": torque_mse(model.apply(training.parameters), sets), "train_seconds": seconds}
+    numbers = {"torque_mse": torque_mse(model.apply(training.parameters), sets.test), "train_seconds": seconds}
     return numbers, curve(QUICK, sets, training, numbers, 1)

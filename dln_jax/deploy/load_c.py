@@ -181,21 +181,6 @@ def _function(functions: dict[str, Any], n: int, m: int, numpy_type) -> CFunctio
     return CFunction(evaluate, evaluate_both)
 
 
-def _arrays(shape: tuple[int, ...], numpy_type, **given: Any) -> list[np.ndarray]:
-    """The arguments as arrays of this shape and type; InputError names the one that is none."""
-    arrays = []
-    for name, value in given.items():
-        try:
-            array = np.asarray(value)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name} makes no array; expected one vector of real numbers") from error
-        if array.dtype.kind not in "fiu":
-            raise InputError(f"{name} has type {array.dtype}; expected one vector of real numbers")
-        require_shape(name, array.shape, shape)
-        arrays.append(array.astype(numpy_type, copy=False))
-    return arrays
-
-
 def _bound(function, *buffers: np.ndarray, result=None) -> Callable[[], Any]:
     """The C function with its arguments fixed; it must be called while the buffers live."""
     pointers = [ctypes.c_void_p(buffer.ctypes.data) for buffer in buffers]
