@@ -1,17 +1,24 @@
 """Files of a run: written whole or not at all, read or refused in one line, and by one writer at a time."""
 
+import itertools
 import json
 import math
 import secrets
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from filelock import FileLock, Timeout
 
 from dln_jax.types import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CONFIG = "config.json"
+"""File in a run's folder that holds the arguments it was started with."""
 PARTIAL = ".partial"
 """Ending of a file that is being written; one that was left behind by a kill holds nothing of value."""
 LOCK = ".lock"
@@ -35,6 +42,8 @@ def writing(path: Path) -> Iterator[Path]:
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
+    except FileNotFoundError as error:
+        raise InputError(f"{path.parent}: no such folder; create it first") from error
     except OSError as error:
         raise InputError(f"{path}: cannot write there ({error.strerror or error}); choose another place") from error
 
@@ -50,6 +59,12 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
     write_bytes(path, json.dumps(finite(values), indent=2, allow_nan=False).encode() + b"\n")
 
 
+def write_figure(path: Path, figure: "Figure", **options: Any) -> None:
+    """Writes a figure as PNG, whole or not at all; options as `Figure.savefig`, errors as `writing`."""
+    with writing(path) as partial:
+        figure.savefig(partial, format="png", **options)
+
+
 def finite(values: Any) -> Any:
     """The same JSON values with `None` for numbers that are not finite."""
     if isinstance(values, Mapping):
@@ -59,13 +74,21 @@ def finite(values: Any) -> Any:
     return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file of this name; a name that the system cannot hold is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     """The JSON object in a file.
 
     Raises:
         InputError: the file is missing, cannot be read, or holds anything else; `remedy` says what to do then.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: no such file; {remedy}")
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -77,9 +100,52 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
     return values
 
 
+def matches(value: Any, hint: Any) -> bool:
+    """Whether a JSON value is one of a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
+    if get_origin(hint) is Literal:
+        return any(type(value) is type(each) and value == each for each in get_args(hint))
+    if options := get_args(hint):
+        return any(matches(value, option) for option in options)
+    if isinstance(value, int) and not isinstance(value, bool):
+        return hint in (int, float) and abs(value) < 2**63
+    if isinstance(value, float):
+        return hint is float and math.isfinite(value)
+    return isinstance(value, str) if hint is Path else type(value) is (NoneType if hint is None else hint)
+
+
+@contextmanager
+def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Iterator[Path]:
+    """Yields the folder of a run, locked: a new one, `out` or the first free number behind `runs/default`.
+
+    What ends in an `InputError` with nothing written but the arguments leaves no folder, so that the same command can
+    be given again.
+
+    Args:
+        out: the folder, which may exist if it is free.
+        default: name of the folder where `out` is `None`.
+        resume: the folder is that of an existing run, which is continued.
+
+    Raises:
+        InputError: the folder holds something already, cannot be created, or another process is writing there.
+    """
+    if resume and out is not None:
+        with locked(out):
+            yield out
+        return
+    folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
+    _require_free(folder)  # before a lock is put there, and again once nobody else can write
+    with locked(folder):
+        _require_free(folder)
+        try:
+            yield folder
+        except InputError:
+            _withdraw(folder, created)
+            raise
+
+
 def is_free(folder: Path) -> bool:
     """Whether a folder holds nothing of value: no files but a lock, and what a kill left half-written."""
-    return all(entry.name == LOCK or entry.name.endswith(PARTIAL) for entry in folder.iterdir())
+    return all(entry.name == LOCK or _is_partial(entry) for entry in folder.iterdir())
 
 
 @contextmanager
@@ -97,8 +163,60 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{folder}: cannot write there ({error.strerror}); choose another --out") from error
     try:
-        for left in folder.glob(f"*{PARTIAL}"):
-            left.unlink(missing_ok=True)
+        for left in folder.glob(f"*.{'[0-9a-f]' * 8}{PARTIAL}"):
+            with suppress(OSError):
+                left.unlink()
         yield
     finally:
         lock.release()
+
+
+def _is_partial(entry: Path) -> bool:
+    return entry.name.endswith(PARTIAL) and not entry.is_dir()
+
+
+def _next_number(parent: Path, name: str) -> tuple[Path, list[Path]]:
+    """Two processes never get one number: creating the folder takes it."""
+    created = _create(parent)
+    for number in itertools.count(1):
+        folder = parent / f"{name}-{number}"
+        try:
+            folder.mkdir()
+            return folder, [folder, *created]
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError(f"{folder}: cannot create the folder ({error.strerror}); choose another --out") from error
+    raise AssertionError
+
+
+def _create(folder: Path) -> list[Path]:
+    """Creates a folder with those above it, where they are missing; gives the new ones, the deepest first."""
+    try:
+        if folder.is_dir():
+            return []
+        missing = [each for each in (folder, *folder.parents) if not each.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        return missing
+    except OSError as error:
+        raise InputError(f"{folder}: cannot create the folder ({error.strerror}); choose another --out") from error
+
+
+def _require_free(folder: Path) -> None:
+    try:
+        free = is_free(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot read the folder ({error.strerror}); choose another --out") from error
+    if not free:
+        raise InputError(f"{folder} is not empty; choose another --out, or --resume the run in it")
+
+
+def _withdraw(folder: Path, created: list[Path]) -> None:
+    """Removes what holds nothing of value: the arguments of a run that came to nothing, and the folders made for it."""
+    if any(entry.name not in (CONFIG, LOCK) and not _is_partial(entry) for entry in folder.iterdir()):
+        return
+    with suppress(OSError):
+        (folder / CONFIG).unlink(missing_ok=True)
+        (folder / LOCK).unlink(missing_ok=True)
+        for each in created:
+            each.rmdir()

@@ -21,7 +21,7 @@ from dln_jax.data.splits import Split, partition_labels, select, split
 from dln_jax.deploy.kinds import KINDS
 from dln_jax.evaluation.figures import error_against_time
 from dln_jax.evaluation.report import Row, conditions, write_report
-from dln_jax.files import read_json, write_json
+from dln_jax.files import CONFIG, is_file, matches, read_json, run_folder, write_bytes, write_figure, write_json
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, require_positive
 from scripts.arm_models import (
@@ -34,12 +34,11 @@ from scripts.arm_models import (
     plant_rows,
 )
 from scripts.arm_published import COLUMNS, PUBLISHED, published
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
+from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
+from scripts.jobs import JOBS, REMEDY, numbers_of
 from scripts.report_table import print_report
 
-JOBS = "jobs.json"
-"""What has been measured so far, for --resume."""
 MODELS = (*PUBLISHED, "trigonometric")
 LAGRANGIAN = "structured-delan"
 STRUCTURED = (LAGRANGIAN, "structured-hnn")
@@ -87,11 +86,12 @@ def main(given: Arguments) -> None:
     written = letters(given.data)
     sets = {"characters": published_split(written), "uniform": states(given.uniform)}
     tests = partition_labels(written, given.splits) if given.splits else []
-    parts = [split(written, test=labels) for labels in tests]
-    folder = given.out if given.resume and given.out else new_folder(given.out, "arm_table")
-    write_json(folder / CONFIG, stored_arguments(given))
-    stored = folder / JOBS
-    found = stored_jobs(stored) if given.resume and stored.is_file() else {}
+    with run_folder(given.out, "arm_table", resume=given.resume) as folder:
+        measure_into(folder, given, sets, [split(written, test=labels) for labels in tests], console)
+
+
+def measure_into(folder: Path, given: Arguments, sets: dict[str, Split], parts: list[Split], console: Console) -> None:
+    """Measures what has not been measured yet, and writes and prints the table."""
     jobs = {}
     for dataset, data in sets.items():
         jobs[f"plant/{dataset}"] = lambda data=data: plant_rows(two_link_arm(), data)
@@ -114,12 +114,14 @@ def main(given: Arguments) -> None:
             jobs[f"{kind}/characters/adam"] = lambda kind=kind: measure_adam(
                 kind, sets["characters"], steps=given.adam_steps
             )
+    found = stored_results(folder, list(jobs)) if given.resume else {}
+    write_json(folder / CONFIG, stored_arguments(given))
     # What is most likely wanted comes first, so that an interrupted table has it.
     for number, case in enumerate(sorted(jobs, key=lambda case: not case.startswith(("plant", LAGRANGIAN))), start=1):
         if case not in found:
             numbers, curve = jobs[case]()
             found[case] = {"numbers": numbers, "curve": curve._asdict() if curve else None}
-            write_json(stored, found)
+            write_json(folder / JOBS, found)
         console.print(f"{number}/{len(jobs)}  {case:44s} {summary(found[case]['numbers'])}")
     numbers = {case: found[case]["numbers"] for case in jobs}
     numbers |= {f"{kind}/characters/splits": over_splits(kind, numbers, len(parts)) for kind in MODELS if parts}
@@ -130,16 +132,35 @@ def main(given: Arguments) -> None:
         selection="stopping by validation; sizes settled on seed 0 by validation, its test errors printed beside them",
         data="embedded letters" if given.data is None else given.data.name,
         statistics="medians over seeds; one program for all seeds of a model",
-        splits=[" ".join(labels) for labels in tests],
+        splits=[" ".join(part.test.label[np.unique(part.test.trajectory)]) for part in parts],
     )
     write_report(folder / "report.json", rows, facts)
     table = markdown(numbers)
-    (folder / "table.md").write_text(table)
+    write_bytes(folder / "table.md", table.encode())
     curves = {case: Curve(**result["curve"]) for case, result in found.items() if result["curve"]}
-    error_against_time({case: (c.seconds, c.errors) for case, c in curves.items()}).savefig(folder / "pareto.png")
+    write_figure(folder / "pareto.png", error_against_time({case: (c.seconds, c.errors) for case, c in curves.items()}))
     print_report([row for row in rows if row.bound is not None or row.reference is not None], facts)
     print(table)
     print(f"report: {folder / 'report.json'}, table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
+
+
+def stored_results(folder: Path, cases: list[str]) -> dict[str, Any]:
+    """Numbers and curve of each case that has been measured; `InputError` for a damaged file."""
+    path = folder / JOBS
+    stored = read_json(path, remedy=REMEDY) if is_file(path) else {}
+    known: dict[str, tuple[str, ...]] = {case: ("vpt_seconds",) if case.startswith("plant/") else () for case in cases}
+    for dataset, kind in ((dataset, kind) for dataset in COLUMNS for kind in MODELS):
+        known[f"{kind}/{dataset}"] = ("train_seconds", "parameters", "one_step_p50_us")
+    found = {}
+    for case, result in stored.items():
+        numbers, curve = (result.get(key) for key in ("numbers", "curve")) if isinstance(result, dict) else (None, None)
+        if curve is not None:
+            points = list(curve.values()) if isinstance(curve, dict) and set(curve) == set(Curve._fields) else [None]
+            if not all(isinstance(each, list) and all(matches(x, float | None) for x in each) for each in points):
+                raise InputError(f"{path}: the curve of {case!r:.60} is none; {REMEDY}")
+            curve = {key: [math.nan if x is None else x for x in each] for key, each in curve.items()}
+        found[case] = {"numbers": numbers_of(path, case, numbers, known), "curve": curve}
+    return found
 
 
 def letters(path: Path | None) -> Trajectories:
@@ -165,16 +186,6 @@ def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) ->
     present = np.random.default_rng(0).permutation(np.unique(data.trajectory))
     held_out = present[: min(validation, max(1, len(present) // 10))]
     return Split(select(data, np.setdiff1d(present, held_out)), select(data, held_out), uniform_tests())
-
-
-def stored_jobs(path: Path) -> dict[str, Any]:
-    """What has been measured; what was not finite, which JSON cannot say, is NaN."""
-    found = read_json(path, remedy="start again with another --out")
-    for result in found.values():
-        result["numbers"] = {key: math.nan if x is None else x for key, x in result["numbers"].items()}
-        if result["curve"]:
-            result["curve"]["errors"] = [math.nan if x is None else x for x in result["curve"]["errors"]]
-    return found
 
 
 def split_case(kind: str, number: int) -> str:

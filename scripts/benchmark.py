@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from dln_jax.evaluation.report import Row, conditions, markdown, write_report
+from dln_jax.files import run_folder, write_bytes, write_figure
 from scripts import (
     benchmark_integrators,
     benchmark_one_step,
@@ -28,7 +29,7 @@ from scripts import (
     benchmark_training,
 )
 from scripts.arguments import Unstated
-from scripts.command_line import new_folder, run
+from scripts.command_line import run
 from scripts.report_table import print_report
 
 Measure = Callable[[bool], tuple[list[Row], Figure]]
@@ -59,8 +60,13 @@ class Arguments:
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes; what is measured is kept even if a later subject is interrupted."""
+    with run_folder(given.out, "benchmark") as folder:
+        measure_into(folder, given)
+
+
+def measure_into(folder: Path, given: Arguments) -> None:
+    """Measures the subjects, prints their tables, and writes what each gives as soon as it does."""
     console = Console(highlight=False, soft_wrap=True)
-    folder = new_folder(given.out, "benchmark")
     subjects = MEASURES if given.subject == "all" else {given.subject: MEASURES[given.subject]}
     facts = functools.partial(
         conditions, dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=given.quick
@@ -71,8 +77,8 @@ def main(given: Arguments) -> None:
         rows, figure = measure(given.quick)
         rows = [row._replace(case=f"{name}/{row.case}") for row in rows]
         every += rows
-        figure.savefig(folder / f"{name}.png")
-        (folder / f"{name}.md").write_text(markdown(rows))
+        write_figure(folder / f"{name}.png", figure)
+        write_bytes(folder / f"{name}.md", markdown(rows).encode())
         write_report(folder / "report.json", every, facts())
         print_report([row for row in rows if row.bound is not None] or rows[:40], facts())
     print(f"report: {folder / 'report.json'}; tables and figures of {', '.join(subjects)} beside it")

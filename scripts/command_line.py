@@ -1,15 +1,16 @@
-"""What the command lines share: errors as one line, names for scenes, and folders for runs."""
+"""What the command lines share: errors as one line, names for scenes, and the arguments that a run was started with."""
 
 import dataclasses
-import json
 import os
+import reprlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import jax
 
+from dln_jax.files import CONFIG, is_file, matches, read_json
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
@@ -22,8 +23,8 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
 from scripts.arguments import choice, parse
 
-CONFIG = "config.json"
-"""Name of the file in a run's folder that holds the arguments it was started with."""
+CHOSEN = "chosen"
+"""Key in a run's config.json of what its arguments came to, beside these."""
 PLACES = ("out", "resume", "figures", "low_latency")
 """Arguments that do not decide the result."""
 
@@ -72,25 +73,6 @@ def scene_named(name: str) -> Scene:
     return SCENES[name]()
 
 
-def new_folder(path: Path | None, default: str) -> Path:
-    """Creates the folder for a run: the path given, or the first free number behind `runs/default`.
-
-    Raises:
-        InputError: the folder holds something already, or cannot be created.
-    """
-    if path is None:
-        number = 1
-        while (path := Path("runs") / f"{default}-{number}").exists():
-            number += 1
-    if path.is_dir() and any(path.iterdir()):
-        raise InputError(f"{path} is not empty; choose another --out, or --resume the run in it")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot create the folder ({error.strerror}); choose another --out") from error
-    return path
-
-
 def stored_arguments(given: Any) -> dict[str, Any]:
     """The arguments that decide the result, as JSON values."""
     values = dataclasses.asdict(given)
@@ -101,26 +83,51 @@ def with_stored_arguments(given: Arguments) -> Arguments:
     """The arguments that the run in --out was started with; what is given anew must not differ.
 
     Raises:
-        InputError: --out holds no run, or one of other arguments.
+        InputError: --out holds no run, one of other arguments, or one whose config.json is damaged.
     """
     folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
-    if folder is None or not (folder / CONFIG).is_file():
+    if folder is None or not is_file(folder / CONFIG):
         raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
-    stored = json.loads((folder / CONFIG).read_text())
     unset = stored_arguments(type(given)())
+    stored = checked_arguments(folder / CONFIG, type(given), unset)
     for key, value in stored_arguments(given).items():
-        if value not in (stored.get(key), unset[key]):
+        if value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
-            raise InputError(f"the run in {folder} was started with {key} = {stored.get(key)}; leave --{option} out")
-    kept = {key: value for key, value in stored.items() if key in unset}
-    if kept.get("data") is not None:
-        kept["data"] = Path(kept["data"])
-    return dataclasses.replace(cast(Any, given), **kept)
+            raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
+    hints = get_type_hints(type(given))
+    for key, value in stored.items():
+        if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
+            stored[key] = Path(value)
+    return dataclasses.replace(cast(Any, given), **stored)
+
+
+def checked_arguments(path: Path, arguments: type, expected: Collection[str]) -> dict[str, Any]:
+    """The stored arguments in a config.json, each of the type that a script's arguments state for it.
+
+    Raises:
+        InputError: the file is damaged, or a release with other arguments has written it.
+    """
+    remedy = "restore the file, or train again into another folder"
+    stored = read_json(path, remedy=remedy)
+    stored.pop(CHOSEN, None)
+    if absent := [key for key in expected if key not in stored]:
+        raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
+    hints = get_type_hints(arguments)
+    for key, value in stored.items():
+        if key not in expected:
+            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
+        if not matches(value, hints[key]):
+            wanted = str(getattr(hints[key], "__name__", hints[key])).replace("typing.", "").replace("pathlib.", "")
+            raise InputError(f"{path}: {key} is {reprlib.repr(value)}, expected {wanted}; {remedy}")
+    return stored
 
 
 def cache_folder() -> Path:
     """Folder for generated default data: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "dln_jax"
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot create the folder ({error.strerror}); set XDG_CACHE_HOME") from error
     return folder

@@ -1,8 +1,5 @@
 """The data that scripts use when they are given none: generated once, then read from the cache."""
 
-import os
-from pathlib import Path
-
 from dln_jax.data import generators, schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.scenes.scene import Scene
@@ -20,12 +17,5 @@ def default_data(scene: Scene) -> Trajectories:
     path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
     if not path.exists():
         data = generators.characters() if kind == "characters" else generators.uniform(scene)
-        _save_once(path, data)
+        schema.save(path, data, overwrite=True)  # two processes may generate at the same time: one rename wins
     return schema.load(path)
-
-
-def _save_once(path: Path, data: Trajectories) -> None:
-    """Two processes may generate at the same time: each writes its own file, and one rename wins."""
-    own = path.with_name(f"{path.stem}-{os.getpid()}.npz")
-    schema.save(own, data, overwrite=True)
-    own.replace(path)

@@ -16,13 +16,14 @@ from jax import Array
 
 from dln_jax.evaluation.latency import medians_in_turns
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import run_folder
 from dln_jax.mechanics import natural
 from dln_jax.models.delan import cholesky_factor
 from dln_jax.nn import differential_mlp as network
 from dln_jax.nn.activations import tanh
 from dln_jax.types import require_positive
 from scripts.arguments import Unstated
-from scripts.command_line import new_folder, run
+from scripts.command_line import run
 from scripts.report_table import print_report
 
 SIZES = (1, 2, 4, 7, 12)
@@ -44,7 +45,12 @@ class Arguments:
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_positive(repetitions=given.repetitions, width=given.width)
-    folder = new_folder(given.out, "delan_derivatives_report")
+    with run_folder(given.out, "delan_derivatives_report") as folder:
+        measure_into(folder, given)
+
+
+def measure_into(folder: Path, given: Arguments) -> None:
+    """Measures every size, and writes and prints the table."""
     rows = [row for d in SIZES for batch in BATCHES for row in ratio_rows(d, batch, given.width, given.repetitions)]
     facts = conditions(dtype="float32", seeds=[0], call_path="default jit, compilation apart, results waited for")
     write_report(folder / "report.json", rows, facts)

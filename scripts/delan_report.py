@@ -19,12 +19,13 @@ from dln_jax.deploy.load import compiled
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import run_folder
 from dln_jax.learning.train import Settings, train
 from dln_jax.scenes.scene import closed_form_forward_dynamics, closed_form_inverse_dynamics, dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import require_positive
 from scripts.arguments import Unstated
-from scripts.command_line import new_folder, run
+from scripts.command_line import run
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.progress import progress
 from scripts.report_table import print_report
@@ -71,7 +72,12 @@ def main(given: Arguments) -> None:
     data = default_data(two_link_arm()) if given.data is None else schema.load(given.data)
     data = data._replace(needs=two_link_arm().needs)
     sets = [split(data, test=given.test.split(","), seed=seed) for seed in range(given.seeds)]
-    folder = new_folder(given.out, "delan_report")
+    with run_folder(given.out, "delan_report") as folder:
+        measure_into(folder, given, sets)
+
+
+def measure_into(folder: Path, given: Arguments, sets: list[Split]) -> None:
+    """Measures every seed, and writes and prints the table."""
     name = "embedded-letters" if given.data is None else given.data.stem
     rows = textbook_rows(two_link_arm())
     for seed, its_sets in enumerate(sets):

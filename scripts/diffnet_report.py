@@ -18,11 +18,12 @@ from rich.console import Console
 
 from dln_jax.evaluation.latency import medians_in_turns
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import run_folder
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
 from dln_jax.types import require_positive
 from scripts.arguments import Unstated, choice, names_in
-from scripts.command_line import new_folder, run
+from scripts.command_line import run
 from scripts.report_table import report_table
 
 INPUTS = (1, 2, 4, 7)
@@ -54,7 +55,12 @@ def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_positive(width=given.width, depth=given.depth, batch=given.batch, repetitions=given.repetitions)
     names_in("--activation", given.activation, PLAIN)
-    folder = new_folder(given.out, "diffnet_report")
+    with run_folder(given.out, "diffnet_report") as folder:
+        measure_into(folder, given)
+
+
+def measure_into(folder: Path, given: Arguments) -> None:
+    """Times every number of inputs, and writes and prints the table."""
     rows = [row for inputs in INPUTS for row in rows_for(inputs, given)]
     network = f"{given.depth} layers of {given.width}, {given.activation}, batch {given.batch}"
     facts = conditions(dtype="float32", network=network, repetitions=given.repetitions)

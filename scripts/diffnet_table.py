@@ -1,7 +1,7 @@
 """All that the published table of differential networks has, trained by both optimisers: the work of --table."""
 
-import json
 import time
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -11,10 +11,11 @@ from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.evaluation.function_metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, train
 from dln_jax.nn.activations import activation
-from scripts.command_line import CONFIG, new_folder, stored_arguments
+from scripts.command_line import stored_arguments
+from scripts.jobs import JOBS, stored_jobs
 
 LOSSES = ("type1", "type2")
 ACTIVATIONS = ("relu", "softplus", "tanh", "cos")
@@ -36,8 +37,6 @@ TITLES = {
     "sin": ("1-D f", "1-D f'", "1-D f''"),
     "cos_sin": ("2-D f", "2-D gradient", "2-D Hessian"),
 }
-JOBS = "jobs.json"
-"""What has been measured so far, for --resume."""
 
 
 def write_table(console: Console, given: Any) -> None:
@@ -56,19 +55,21 @@ def write_table(console: Console, given: Any) -> None:
     ]
     for function, loss, name, optimizer in jobs:
         check(problems[function][0], settings(given, function, loss, name, optimizer))
-    folder = given.out if given.resume else new_folder(given.out, "train_diffnet")
+    with run_folder(given.out, "train_diffnet", resume=given.resume) as folder:
+        measure_into(folder, given, problems, jobs, console)
+
+
+def measure_into(folder: Path, given: Any, problems: dict[str, Any], jobs: list[Any], console: Console) -> None:
+    """Measures what has not been measured yet, and writes and prints the table."""
+    known = {"/".join(job): (*QUANTITIES, "width", "job_seconds") for job in jobs}
+    resumed = stored_jobs(folder, known) if given.resume else {}
+    found = {tuple(case.split("/")): numbers for case, numbers in resumed.items()}
     write_json(folder / CONFIG, stored_arguments(given))
-    stored = folder / JOBS
-    found = (
-        {tuple(key.split("/")): numbers for key, numbers in json.loads(stored.read_text()).items()}
-        if (given.resume and stored.is_file())
-        else {}
-    )
     for number, job in enumerate(jobs, start=1):
         data, test = problems[job[0]]
         if job not in found:
             found[job] = measure(functions.split(data, seed=given.seed), test, settings(given, *job))
-            write_json(stored, {"/".join(done): numbers for done, numbers in found.items()})
+            write_json(folder / JOBS, {"/".join(done): numbers for done, numbers in found.items()})
         mse = "  ".join(f"{found[job][quantity]:.1e}" for quantity in QUANTITIES)
         line = f"{mse}  width {found[job]['width']:.0f}  {found[job]['job_seconds']:.0f} s"
         console.print(f"{number}/{len(jobs)}  {'/'.join(job):36s} {line}")

@@ -16,6 +16,7 @@ from dln_jax.evaluation.definiteness import definiteness
 from dln_jax.evaluation.latency import Latency, one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.rollouts import rollout_metrics
+from dln_jax.files import write_figure
 from dln_jax.learning.residuals import Objective
 from dln_jax.learning.runs import Training, data_type
 from dln_jax.learning.train import Settings
@@ -133,14 +134,14 @@ def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
 def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[str, np.ndarray]) -> None:
     """Writes what there is to draw."""
     test = task.sets.test
-    figures.force_decomposition(test, predicted).savefig(folder / "decomposition.png")
+    write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted))
     if training.history and task.kind != "trigonometric":
         error = "torque MSE" if task.objective.selects_by == "torque" else "error (normalised)"
         best = int(np.max(training.best_step))
-        figures.training_curve(training.history, best_step=best, error=error).savefig(folder / "training.png")
+        write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, error=error))
     if task.scene is not None and task.scene.tip is not None:
         paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
-        paths.savefig(folder / "tip_paths.png")
+        write_figure(folder / "tip_paths.png", paths)
 
 
 def results_table(metrics: dict[str, float], task: Task) -> Table:

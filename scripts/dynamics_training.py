@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.data.splits import Split, split
 from dln_jax.deploy.kinds import build, describe, objective_of
 from dln_jax.deploy.load import save_model
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.residuals import TORQUE, Objective
 from dln_jax.learning.runs import Progress, Stop, Training
@@ -22,7 +22,7 @@ from dln_jax.learning.train import Settings, automatic_optimizer, check, train, 
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import CONFIG, new_folder, scene_named, stored_arguments, with_stored_arguments
+from scripts.command_line import scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
@@ -95,7 +95,12 @@ def run_training(given: Arguments, script: str, kinds: dict[str, str]) -> None:
     if given.resume:
         given = with_stored_arguments(given)
     task = prepare(given, kinds)
-    folder = given.out if given.resume and given.out else new_folder(given.out, script)
+    with run_folder(given.out, script, resume=given.resume) as folder:
+        train_into(folder, given, task, console)
+
+
+def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> None:
+    """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
     if task.kind == "trigonometric":

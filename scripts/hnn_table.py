@@ -6,8 +6,7 @@ Each is trained on the published data (those of seed 0) from several seeds; numb
 table, writes report.json and table.md, and draws each task's motions and energies.
 """
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,21 +14,20 @@ import numpy as np
 from rich.console import Console
 
 from dln_jax.evaluation.report import conditions, write_report
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_bytes, write_figure, write_json
 from dln_jax.types import InputError, require_positive
 from scripts import pixel_task as pixels
 from scripts.arguments import Unstated, choice, names_in
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
+from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import description_of, models_of, train
 from scripts.hnn_published import PIXELS, markdown, rows_of
 from scripts.hnn_tasks import REAL, problem_of
+from scripts.jobs import JOBS, stored_jobs
 from scripts.report_table import print_report
 
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published ones."""
-JOBS = "jobs.json"
-"""What has been measured so far, for --resume."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +57,16 @@ def main(given: Arguments) -> None:
     console = Console(highlight=False, soft_wrap=True)
     if given.resume:
         given = with_stored_arguments(given)
-        if given.real_pendulum is not None:
-            given = replace(given, real_pendulum=Path(given.real_pendulum))
     names = chosen_tasks(given)
-    folder = given.out if given.resume and given.out else new_folder(given.out, "hnn_table")
+    with run_folder(given.out, "hnn_table", resume=given.resume) as folder:
+        measure_into(folder, given, names, console)
+
+
+def measure_into(folder: Path, given: Arguments, names: list[str], console: Console) -> None:
+    """Measures what has not been measured yet, and writes and prints the table."""
+    known = {f"{name}/{kind}": () for name in names for kind in (pixels.KINDS if name == PIXELS else models_of(name))}
+    found = stored_jobs(folder, known) if given.resume else {}
     write_json(folder / CONFIG, stored_arguments(given))
-    stored = folder / JOBS
-    found: dict[str, dict[str, float]] = json.loads(stored.read_text()) if given.resume and stored.is_file() else {}
     if REAL not in names and REAL in given.tasks.split(","):
         console.print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
     for name in names:
@@ -75,7 +76,7 @@ def main(given: Arguments) -> None:
         for kind, numbers in measured.items():
             found[f"{name}/{kind}"] = numbers
             console.print(f"{name}/{kind:14s} {summary(numbers)}")
-        write_json(stored, found)
+        write_json(folder / JOBS, found)
     rows = [row for case, numbers in found.items() for row in rows_of(case, numbers)]
     facts = conditions(
         dtype="float64",
@@ -86,7 +87,7 @@ def main(given: Arguments) -> None:
     )
     write_report(folder / "report.json", rows, facts)
     table = markdown(found)
-    (folder / "table.md").write_text(table)
+    write_bytes(folder / "table.md", table.encode())
     print_report([row for row in rows if row.quantity in SHOWN], facts)
     print(table)
     print(f"report: {folder / 'report.json'}, table: {folder / 'table.md'}")
@@ -122,7 +123,7 @@ def phase_task(name: str, given: Arguments, folder: Path) -> dict[str, dict[str,
         ]
         found[kind], seen[kind] = medians([numbers for numbers, _ in runs]), runs[0][1]
     if given.figures:
-        figure_of(problem, seen).savefig(folder / f"{name}.png")
+        write_figure(folder / f"{name}.png", figure_of(problem, seen))
     return found
 
 

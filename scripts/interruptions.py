@@ -20,9 +20,10 @@ import numpy as np
 from rich.console import Console
 
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.files import run_folder
 from dln_jax.types import InputError, require_positive
 from scripts.arguments import Unstated, choice, names_in
-from scripts.command_line import new_folder, run
+from scripts.command_line import run
 from scripts.report_table import print_report
 
 RUNS = {
@@ -55,7 +56,12 @@ def main(given: Arguments) -> None:
     """Kills, resumes, compares, prints and writes."""
     require_positive(kills=given.kills)
     names = names_in("--runs", given.runs, RUNS)
-    folder = new_folder(given.out, "interruptions")
+    with run_folder(given.out, "interruptions") as folder:
+        measure_into(folder, given, names)
+
+
+def measure_into(folder: Path, given: Arguments, names: list[str]) -> None:
+    """Interrupts the runs, and writes and prints the counts."""
     console = Console(highlight=False, soft_wrap=True)
     random = np.random.default_rng(given.seed)
     rows = []

@@ -15,10 +15,10 @@ from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.evaluation import animations, figures
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.phase_figures import TRUTH
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Progress
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import CONFIG, new_folder, stored_arguments
+from scripts.command_line import stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
@@ -44,7 +44,14 @@ def run_task(given: "Arguments") -> None:
     size["degree"] = given.degree if given.model == POLYNOMIAL and given.degree > 1 else None
     description = description_of(problem, given.model, activation=given.activation, **size)
     build_phase(description)  # refuses what does not suit, before anything is written
-    folder = given.out if given.resume and given.out else new_folder(given.out, "train_hnn")
+    with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
+        train_into(folder, given, problem, description, console)
+
+
+def train_into(
+    folder: Path, given: "Arguments", problem: Problem, description: dict[str, Any], console: Console
+) -> None:
+    """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, {**stored_arguments(given), "chosen": description})
     announce(console, problem, description)
     with progress(total_steps(problem, description, given.steps)) as show:
@@ -148,13 +155,13 @@ def latency_of(folder: Path, problem: Problem) -> dict[str, float]:
 def draw(folder: Path, problem: Problem, kind: str, seen: Seen, history: list[Progress]) -> None:
     """Writes what there is to draw."""
     name = "baseline" if kind == KINDS["baseline"] else "hnn"
-    figure_of(problem, {name: seen}).savefig(folder / "motions.png")
+    write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
     truth = problem.truth[0]
     stride = max(1, len(truth.t) // GIF_FRAMES)
     animations.write_motion_gif(folder / "motions.gif", {TRUTH: truth, name: seen.motions}, stride=stride)
     if len(history) > 1:
         best = min(history, key=lambda at: at.validation).step
-        figures.training_curve(history, best_step=best, error="error (weighted)").savefig(folder / "training.png")
+        write_figure(folder / "training.png", figures.training_curve(history, best_step=best, error="error (weighted)"))
 
 
 UNITS = {

@@ -26,6 +26,7 @@ from dln_jax.evaluation.frame_metrics import (
 )
 from dln_jax.evaluation.phase_figures import TRUTH
 from dln_jax.evaluation.phase_metrics import summary
+from dln_jax.files import write_figure
 from dln_jax.learning.frame_matching import Settings, Weights, loss, match_frames, windows
 from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, silent
 from dln_jax.models.latent_phase import LatentModel
@@ -118,5 +119,5 @@ def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, 
         quiet = int(np.argsort(ranges)[len(ranges) // 4])
         injected = inject_energy(hnn.model, hnn.parameters, data.test.pairs[quiet, 0], factor=3.0)
         written.append(folder / "pixels-injection.png")
-        injection_figure(injected).savefig(written[-1])
+        write_figure(written[-1], injection_figure(injected))
     return written

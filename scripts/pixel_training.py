@@ -1,17 +1,19 @@
 """What `train_hnn --task pixels` does: from a command line to a trained model of pictures in a run folder."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 
+from dln_jax.data.pendulum_frames import FrameSplit
 from dln_jax.deploy.load_latent import save_latent
 from dln_jax.evaluation import figures
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Checkpoint, Progress, fingerprint
 from dln_jax.types import InputError, require_positive
 from scripts import pixel_task
-from scripts.command_line import CONFIG, new_folder, stored_arguments
+from scripts.command_line import stored_arguments
 from scripts.progress import progress
 
 if TYPE_CHECKING:
@@ -28,7 +30,12 @@ def run_pixels(given: "Arguments") -> None:
     check(given)
     kind = KINDS[given.model]
     data = pixel_task.pixel_data(given.trajectories)
-    folder = given.out if given.resume and given.out else new_folder(given.out, "train_hnn")
+    with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
+        train_into(folder, given, kind, data, console)
+
+
+def train_into(folder: Path, given: "Arguments", kind: str, data: FrameSplit, console: Console) -> None:
+    """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     console.print(f"pixels: {len(data.train.q)} films to train on, {len(data.validation.q)} to select by; {kind}, f32")
     steps = given.steps or pixel_task.RECIPE.steps
@@ -51,7 +58,7 @@ def run_pixels(given: "Arguments") -> None:
         pixel_task.draw_pixels({kind: seen}, data, folder)
         history = seen.history
         best = min(history, key=lambda at: at.validation).step
-        figures.training_curve(history, best_step=best, error="loss").savefig(folder / "training.png")
+        write_figure(folder / "training.png", figures.training_curve(history, best_step=best, error="loss"))
     for name, value in numbers.items():
         console.print(f"{name.replace('_', ' '):32s} {value:10.4g}")
     console.print(f"run folder: {folder}")

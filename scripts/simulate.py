@@ -25,7 +25,7 @@ from rich.console import Console
 
 from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.softbody.driven import Example, beginning, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.mesh import Mesh, make_mesh, overlaps
@@ -36,7 +36,7 @@ from dln_jax.softbody.strain_energies import corotated, neo_hookean, st_venant_k
 from dln_jax.solvers.minimise import Info
 from dln_jax.types import InputError, require_positive
 from scripts.arguments import Unstated
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments
+from scripts.command_line import run, stored_arguments
 from scripts.progress import progress
 from scripts.simulate_outputs import Motion, draw, results, results_table, warn
 
@@ -108,16 +108,21 @@ def main(given: Arguments) -> None:
     """Simulates, prints and writes."""
     names = list(EXAMPLES) if given.scene == ALL else [given.scene]
     prepared = [prepare(dataclasses.replace(given, scene=name)) for name in names]
-    folder = new_folder(given.out, "simulate")
+    with run_folder(given.out, "simulate") as folder:
+        simulate_into(folder, prepared)
+
+
+def simulate_into(folder: Path, prepared: list[Prepared]) -> None:
+    """Simulates one scene into the folder, or several, each into a folder of its own, with one picture of them."""
     console = Console(highlight=False, soft_wrap=True)
     pictures = []
     for each in prepared:
-        own = folder if len(names) == 1 else folder / each.given.scene
+        own = folder if len(prepared) == 1 else folder / each.given.scene
         own.mkdir(exist_ok=True)
         pictures.append(simulate(each, own, console))
-    if len(names) > 1 and given.figures:
+    if len(prepared) > 1 and prepared[0].given.figures:
         gallery = moments_figure([pictures[i] for i in GALLERY], columns=3, width=11.5)
-        gallery.savefig(folder / "soft-bodies.png", dpi=86)
+        write_figure(folder / "soft-bodies.png", gallery, dpi=86)
     console.print(f"run folder: {folder}")
 
 

@@ -13,6 +13,7 @@ from dln_jax.evaluation.report import Row
 from dln_jax.evaluation.soft_body_animations import write_soft_body_gif
 from dln_jax.evaluation.soft_body_energies import motion_energies
 from dln_jax.evaluation.soft_body_figures import Moments, energies_against_time, moments_figure
+from dln_jax.files import write_figure
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh import Mesh, volumes
 from dln_jax.softbody.simplices import simplex_volumes
@@ -103,8 +104,8 @@ def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: s
         return picture
     energies = motion_energies(example.scene, example.scene.params, jnp.asarray(x), jnp.asarray(v), control)
     figure = energies_against_time(t, energies, taken=what_takes(example), title=title)
-    figure.savefig(folder / "energy.png")
-    moments_figure([picture], columns=1).savefig(folder / "moments.png")
+    write_figure(folder / "energy.png", figure)
+    write_figure(folder / "moments.png", moments_figure([picture], columns=1))
     stride = max(round(1 / (FRAMES_PER_SECOND * dt)), math.ceil(shown / MOST_FRAMES), 1)
     mesh, positions = with_slope(example, x)
     write_soft_body_gif(

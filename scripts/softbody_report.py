@@ -15,10 +15,10 @@ from dln_jax.evaluation.case import Case
 from dln_jax.evaluation.report import conditions
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.evaluation.soft_cases.figures import FIGURES
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from scripts.arguments import Unstated, choice, names_in
 from scripts.case_report import write_and_print
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments
+from scripts.command_line import run, stored_arguments
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,12 @@ class Arguments:
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     subjects = names_in("--only", given.only, SUBJECTS)
-    folder = new_folder(given.out, "softbody")
+    with run_folder(given.out, "softbody") as folder:
+        measure_into(folder, given, subjects)
+
+
+def measure_into(folder: Path, given: Arguments, subjects: list[str]) -> None:
+    """Measures the subjects, and writes and prints their table."""
     write_json(folder / CONFIG, stored_arguments(given))
     console = Console(highlight=False, soft_wrap=True)
     wanted = [(subject, name) for subject in subjects for name in SUBJECTS[subject]]
@@ -48,7 +53,7 @@ def main(given: Arguments) -> None:
         found = measure(subject, name, quick=given.quick)
         cases += found.cases
         if given.figures and name in FIGURES:
-            FIGURES[name](found.curves).savefig(folder / f"{name}.png")
+            write_figure(folder / f"{name}.png", FIGURES[name](found.curves))
         passed = sum(case.passed for case in found.cases)
         seconds = time.perf_counter() - began
         console.print(

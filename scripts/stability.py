@@ -14,11 +14,11 @@ from rich.console import Console
 from dln_jax.evaluation.hard_cases import NAMES, Case, measure
 from dln_jax.evaluation.hard_cases.figures import FIGURES
 from dln_jax.evaluation.report import conditions
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.types import require_positive
 from scripts.arguments import Unstated, choice, names_in
 from scripts.case_report import write_and_print
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments
+from scripts.command_line import run, stored_arguments
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,12 @@ def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_positive(steps=given.steps)
     names = names_in("--only", given.only, NAMES)
-    folder = new_folder(given.out, "stability")
+    with run_folder(given.out, "stability") as folder:
+        measure_into(folder, given, names)
+
+
+def measure_into(folder: Path, given: Arguments, names: list[str]) -> None:
+    """Measures the cases, and writes and prints their table."""
     write_json(folder / CONFIG, stored_arguments(given))
     console = Console(highlight=False, soft_wrap=True)
     cases: list[Case] = []
@@ -48,7 +53,7 @@ def main(given: Arguments) -> None:
         found = measure(name, steps=given.steps)
         cases += found.cases
         if given.figures and name in FIGURES:
-            FIGURES[name](found.curves).savefig(folder / f"{name}.png")
+            write_figure(folder / f"{name}.png", FIGURES[name](found.curves))
         passed = sum(case.passed for case in found.cases)
         seconds = time.perf_counter() - began
         console.print(f"{number}/{len(names)}  {name:20s} {passed}/{len(found.cases)} pass  {seconds:.1f} s")

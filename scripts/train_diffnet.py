@@ -23,14 +23,14 @@ from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.evaluation import function_figures as figures
 from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, steps_of, train
 from dln_jax.learning.runs import Checkpoint, Training, fingerprint
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.nn.activations import activation
 from dln_jax.types import InputError
 from scripts import diffnet_table
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
+from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 
 NAMED = {
@@ -123,7 +123,12 @@ def main(given: Arguments) -> None:
         diffnet_table.write_table(console, given)
         return
     task = prepare(given)
-    folder = given.out if given.resume and given.out else new_folder(given.out, "train_diffnet")
+    with run_folder(given.out, "train_diffnet", resume=given.resume) as folder:
+        train_into(folder, given, task, console)
+
+
+def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> None:
+    """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
     settings, training = fit(task, folder, resume=given.resume, console=console)
@@ -258,7 +263,7 @@ def draw_figures(folder: Path, task: Task, shown: Prediction, training: Training
     if task.bound is not None and shown.spread is not None:
         drawn["ensemble"] = figures.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
     for name, figure in drawn.items():
-        figure.savefig(folder / f"{name}.png")
+        write_figure(folder / f"{name}.png", figure)
 
 
 def results_table(metrics: dict[str, float], task: Task) -> Table:

@@ -21,7 +21,7 @@ from rich.table import Table
 from dln_jax.deploy.load import save_model
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.evaluation.soft_body_animations import write_soft_body_gif
-from dln_jax.files import write_json
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.learning import Goal, Record
 from dln_jax.locomotion.methods import METHODS, STEPS, Method, Trained, settings_of, shown_walk, train
@@ -31,7 +31,7 @@ from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, FALLEN, UPRIGHT, Task
 from dln_jax.softbody.creature_terms import TIME_STEP
 from dln_jax.types import InputError, require_positive
 from scripts.arguments import Unstated, refuse_stated
-from scripts.command_line import CONFIG, new_folder, run, stored_arguments, with_stored_arguments
+from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 from scripts.report_table import print_report
 
@@ -90,7 +90,12 @@ def main(given: Arguments) -> None:
         clock_period=given.clock_period,
         upright=given.upright,
     )
-    folder = given.out if given.resume and given.out else new_folder(given.out, "train_locomotion")
+    with run_folder(given.out, "train_locomotion", resume=given.resume) as folder:
+        train_into(folder, given, task)
+
+
+def train_into(folder: Path, given: Arguments, task: Task) -> None:
+    """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     console = Console(highlight=False, soft_wrap=True)
     size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
@@ -184,7 +189,7 @@ def write_run(given: Arguments, task: Task, method: Method, trained: Trained, fo
     numbers = {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
     write_json(folder / "metrics.json", numbers)
     if given.figures:
-        comparison.learning_figure(records, method=method).savefig(folder / "learning.png")
+        write_figure(folder / "learning.png", comparison.learning_figure(records, method=method))
         write_gait(task, seen, folder / "gait.gif", f"{given.creature}, {method}: {best.distance:.2f} body lengths")
     return numbers
 
@@ -227,7 +232,7 @@ def compare(given: Arguments, task: Task, folder: Path, console: Console) -> Non
     write_json(folder / "metrics.json", flat)
     if given.figures:
         title = f"{given.creature}: farthest so far, {len(curves[METHODS[0]])} seeds (thin) and their median (thick)"
-        comparison.comparison_figure(curves, distance=GOAL, title=title).savefig(folder / "comparison.png")
+        write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
     print_report(rows, facts)
     if any(math.isinf(comparison.median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
         console.print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")

@@ -22,6 +22,7 @@ from scripts.command_line import run
 ROOT = Path(__file__).parent.parent
 TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64", "--no-low-latency")
 FILES = {
+    ".lock",
     "config.json",
     "metrics.json",
     "model.json",

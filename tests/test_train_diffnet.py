@@ -16,7 +16,7 @@ from dln_jax.types import InputError
 from scripts import diffnet_report, diffnet_table, train_diffnet
 
 TINY = ("--samples", "200", "--width", "4", "--steps", "4", "--epochs", "2", "--batch", "64")
-FILES = {"config.json", "metrics.json", "model.json", "model.safetensors"}
+FILES = {".lock", "config.json", "metrics.json", "model.json", "model.safetensors"}
 METRICS = {
     *("value_mse", "gradient_mse", "hessian_mse", "parameters", "validation_loss"),
     *("train_seconds", "compile_seconds", "one_step_p50_us", "one_step_p99_us"),

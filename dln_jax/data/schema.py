@@ -23,6 +23,7 @@ import numpy as np
 from dln_jax.data import archive
 from dln_jax.data.archive import numeric
 from dln_jax.data.derivatives import time_derivative
+from dln_jax.files import is_file, writing
 from dln_jax.types import InputError, Needs
 
 RATES = ("qd", "qdd")
@@ -106,10 +107,8 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
     path = Path(path)
     if path.suffix != ".npz":
         raise InputError(f"{path}: trajectories are stored as npz; let the name end in .npz")
-    if path.exists() and not overwrite:
+    if is_file(path) and not overwrite:
         raise InputError(f"{path} exists; choose another name or ask to overwrite it")
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent}: no such folder; create it first")
     arrays = {
         key: value
         for key, value in data._asdict().items()
@@ -117,10 +116,8 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
     }
     if data.needs is not None:
         arrays["needs"] = np.array(json.dumps(data.needs._asdict()))
-    partial = path.with_name(path.name + ".partial")
-    with open(partial, "wb") as file:
+    with writing(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **arrays)
-    partial.replace(path)
 
 
 def needs_from_json(stated: Any) -> Needs:

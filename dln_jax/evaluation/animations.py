@@ -5,17 +5,15 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.animation import PillowWriter
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dln_jax.evaluation.gifs import DPI, write_gif
 from dln_jax.evaluation.phase_figures import COLOURS, TRUTH, plane_paths
 from dln_jax.evaluation.phase_metrics import Motions
 from dln_jax.types import InputError, require_positive
-
-_DPI = 80
 
 
 def write_frame_gif(
@@ -111,18 +109,16 @@ def write_motion_gif(
 
 def _write(figure: Figure, path: Path, t, show, frames_per_second: float, stride: int = 1) -> None:
     clock = figure.suptitle("", fontsize=10, family="monospace")
-    writer = PillowWriter(fps=frames_per_second)  # type: ignore[arg-type]
-    with writer.saving(figure, str(path), _DPI):
-        for index in range(0, len(t), stride):
-            show(index)
-            clock.set_text(f"t = {t[index]:6.2f} s")
-            writer.grab_frame()
-            # Panels keep the places that the first frame gave them.
-            figure.set_layout_engine("none")
+
+    def show_with_time(index: int) -> None:
+        show(index)
+        clock.set_text(f"t = {t[index]:6.2f} s")
+
+    write_gif(path, figure, show_with_time, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
 
 
 def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=_DPI)
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=DPI)
     FigureCanvasAgg(figure)
     return figure
 

@@ -2,8 +2,6 @@
 
 import datetime
 import importlib.metadata
-import json
-import math
 import os
 import platform
 import sys
@@ -11,6 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+
+from dln_jax.files import write_json
 
 PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
 
@@ -56,7 +56,7 @@ def write_report(path: Path, rows: list[Row], facts: dict[str, Any]) -> None:
         {
             "case": row.case,
             "quantity": row.quantity,
-            "value": row.value if math.isfinite(row.value) else None,
+            "value": row.value,
             "unit": row.unit,
             "reference": row.reference,
             "bound": row.bound,
@@ -64,7 +64,7 @@ def write_report(path: Path, rows: list[Row], facts: dict[str, Any]) -> None:
         }
         for row in rows
     ]
-    path.write_text(json.dumps({"conditions": facts, "rows": listed}, indent=2) + "\n")
+    write_json(path, {"conditions": facts, "rows": listed})
 
 
 def markdown(rows: list[Row]) -> str:

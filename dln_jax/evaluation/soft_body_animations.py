@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
@@ -14,10 +13,10 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from dln_jax.evaluation.gifs import DPI, write_gif
 from dln_jax.softbody.mesh import Mesh, boundary
 from dln_jax.types import InputError, require_positive
 
-_DPI = 80
 _WIDTH = 8.0
 _BODY, _EDGE, _SKIN, _GROUND = (0.62, 0.75, 0.87), (0.46, 0.58, 0.71), (0.16, 0.26, 0.38), (0.35, 0.33, 0.30)
 _ACTUATION = LinearSegmentedColormap.from_list("actuation", ["#c1121f", "#e9806e", "#d9d2c9"])
@@ -60,14 +59,12 @@ def write_soft_body_gif(
     draw = _draw_plane if mesh.dimension == 2 else _draw_space
     figure, show = draw(mesh, np.asarray(positions), muscles, actuation, ground)
     heading = figure.suptitle("", fontsize=10, family="monospace")
-    writer = PillowWriter(fps=frames_per_second)  # type: ignore[arg-type]
-    with writer.saving(figure, str(path), _DPI):
-        for frame in range(0, len(t), stride):
-            show(frame)
-            heading.set_text(f"{title}  t = {t[frame]:5.2f} s".strip())
-            writer.grab_frame()
-            # The axes keep the place that the first frame gave them.
-            figure.set_layout_engine("none")
+
+    def show_with_time(frame: int) -> None:
+        show(frame)
+        heading.set_text(f"{title}  t = {t[frame]:5.2f} s".strip())
+
+    write_gif(path, figure, show_with_time, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
 
 
 def soft_body_frame(
@@ -156,7 +153,7 @@ def _axes(points: np.ndarray, ground: float | None) -> tuple[Figure, Axes]:
     margin = 0.06 * max(high - low)
     low, high = low - margin, high + margin
     height = np.clip(_WIDTH * (high[1] - low[1]) / (high[0] - low[0]), 0.9, 6.0)
-    figure = Figure(figsize=(_WIDTH, height + 1.3), layout="constrained", dpi=_DPI)
+    figure = Figure(figsize=(_WIDTH, height + 1.3), layout="constrained", dpi=DPI)
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x, m", ylabel="y, m")

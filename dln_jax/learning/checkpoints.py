@@ -6,18 +6,19 @@ Both files are written beside the old ones and then renamed, the manifest last: 
 
 import hashlib
 import importlib.metadata
-import json
+import reprlib
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import safetensors.numpy
-from safetensors import SafetensorError
 
+from dln_jax.files import is_file, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 SCHEMA_VERSION = 1
+REMEDY = "restore the file or train again"
 
 
 def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, number: int | None = None) -> None:
@@ -44,8 +45,8 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
         "versions": {package: importlib.metadata.version(package) for package in ("dln-jax", "jax", "dm-haiku")},
         **facts,
     }
-    _replace(directory / file_name, data)
-    _replace(directory / f"{name}.json", json.dumps(manifest, indent=2).encode() + b"\n")
+    write_bytes(directory / file_name, data)
+    write_json(directory / f"{name}.json", manifest)
     if number is not None:
         for old in directory.glob(f"{name}-*.safetensors"):
             if old.name != file_name:
@@ -59,15 +60,16 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         InputError: it is missing, no JSON object, or of another schema.
     """
     path = directory / f"{name}.json"
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")
-    try:
-        manifest = json.loads(path.read_text())
-        version, file_name = manifest["schema_version"], manifest["tensor_file"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a manifest ({error}); train again or restore the file") from error
-    if version != SCHEMA_VERSION or Path(file_name).name != file_name:
-        raise InputError(f"{path}: schema version {version!r}; this release reads version {SCHEMA_VERSION}")
+    manifest = read_json(path, remedy=REMEDY)
+    version, file_name = manifest.get("schema_version"), manifest.get("tensor_file")
+    if type(version) is not int or version != SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: schema version {reprlib.repr(version)}; this release reads version {SCHEMA_VERSION}; {REMEDY}"
+        )
+    if not isinstance(file_name, str) or Path(file_name).name != file_name:
+        raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
     return manifest
 
 
@@ -79,14 +81,17 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
     """
     manifest = load_manifest(directory, name)
     path = directory / manifest["tensor_file"]
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: missing, though {name}.json names it; restore it or train again")
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); restore it or train again") from error
     if hashlib.sha256(data).hexdigest() != manifest.get("sha256"):
         raise InputError(f"{path}: truncated or altered (its SHA-256 is not {name}.json's); restore or train again")
     try:
         tensors = safetensors.numpy.load(data)
-    except SafetensorError as error:
+    except Exception as error:  # the decoder's own errors, and NumPy's for types that it does not know
         raise InputError(f"{path}: not a safetensors file ({error}); restore it or train again") from error
     expected = _flatten(like)
     for key, array in expected.items():
@@ -106,9 +111,3 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
 def _flatten(tree: Any) -> dict[str, Any]:
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-
-
-def _replace(path: Path, data: bytes) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)

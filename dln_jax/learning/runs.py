@@ -2,7 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable
+import reprlib
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.files import finite, is_file, matches
 from dln_jax.learning import checkpoints
 from dln_jax.types import InputError
 
@@ -138,17 +140,39 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
         return None
     manifest = checkpoints.load_manifest(checkpoint.directory, checkpoint.name)
     for key, remedy in (("data", "give the data and test labels"), ("settings", "give the settings")):
-        if manifest.get(key) != checkpoint.identity.get(key):
+        if manifest.get(key) != finite(checkpoint.identity.get(key)):
             raise InputError(
                 f"{checkpoint.directory}: the run was started with other {key}; {remedy} it was started with"
             )
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
-    return state, [Progress(*map(_number, row)) for row in manifest["history"]]
+    path = checkpoint.directory / f"{checkpoint.name}.json"
+    rows = stored_rows(path, manifest, "history", (int, *[float | None] * 3, float))
+    return state, [Progress(*map(_number, row)) for row in rows]
+
+
+def stored_rows(path: Path, manifest: dict[str, Any], key: str, types: Sequence[Any]) -> list[list[Any]]:
+    """The rows under a key of a manifest, with one JSON value of each of these types; where several seeds trained
+    together, a list of them.
+
+    Raises:
+        InputError: the manifest has no such rows.
+    """
+    rows = manifest.get(key)
+    if not isinstance(rows, list):
+        raise InputError(f"{path}: {key} is {reprlib.repr(rows)}, expected a list; {checkpoints.REMEDY}")
+    for row in rows:
+        columns = [each if isinstance(each, list) else [each] for each in row] if isinstance(row, list) else []
+        right = len(columns) == len(types) and all(
+            all(matches(value, hint) for value in column) for column, hint in zip(columns, types, strict=True)
+        )
+        if not right or [np.shape(each) for each in row] != [np.shape(each) for each in rows[0]]:
+            raise InputError(f"{path}: {key} holds {reprlib.repr(row)}, expected numbers; {checkpoints.REMEDY}")
+    return rows
 
 
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
     """Whether a run in this folder got as far as its first checkpoint."""
-    return (directory / f"{name}.json").is_file()
+    return is_file(directory / f"{name}.json")
 
 
 def _json(value: Any) -> Any:

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from dln_jax.files import finite as finite_values
 from dln_jax.learning import checkpoints
 from dln_jax.learning.compilation import quick_compilation
-from dln_jax.learning.runs import has_checkpoint
+from dln_jax.learning.runs import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
 from dln_jax.types import InputError
@@ -172,9 +173,10 @@ def reached(records: list[Record], goal: Goal) -> bool:
 
 def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -> tuple[Any, list[Record]]:
     manifest = checkpoints.load_manifest(directory, name)
-    if manifest.get("settings") != identity["settings"]:
+    if manifest.get("settings") != finite_values(identity["settings"]):
         raise InputError(f"{directory}: the run was started with other settings; give those it was started with")
-    records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in manifest["records"]]
+    rows = stored_rows(directory / f"{name}.json", manifest, "records", (int, float, float | None, int))
+    records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in rows]
     return checkpoints.load_tree(directory, name, like), records
 
 
