@@ -1,6 +1,7 @@
 """What the command lines share: errors as one line, names for scenes, and the arguments that a run was started with."""
 
 import dataclasses
+import math
 import os
 import reprlib
 import sys
@@ -10,6 +11,7 @@ from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import jax
 
+from dln_jax.data.schema import needs_from_text
 from dln_jax.files import CONFIG, is_file, matches, read_json
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
@@ -20,7 +22,7 @@ from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.types import InputError
+from dln_jax.types import InputError, Needs
 from scripts.arguments import choice, parse
 
 CHOSEN = "chosen"
@@ -52,7 +54,9 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
     module = sys.modules[main.__module__]
     name = module.__spec__.name if module.__spec__ else module.__name__
     try:
-        main(parse(arguments, prog=f"python -m {name}", description=module.__doc__))
+        given = parse(arguments, prog=f"python -m {name}", description=module.__doc__)
+        require_storable(given)
+        main(given)
         sys.stdout.flush()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -66,11 +70,26 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
         raise SystemExit(130) from None
 
 
+def require_storable(given: Any) -> None:
+    """Raises `InputError` for a number that is not finite: a run's config.json could not hold it."""
+    for name, value in dataclasses.asdict(given).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"--{name.replace('_', '-')} is {value}; expected a finite number, or leave it out")
+
+
 def scene_named(name: str) -> Scene:
     """The scene of a name; `InputError` lists the names."""
     if name not in SCENES:
         raise InputError(f"scene '{name}' is unknown; choose from {', '.join(SCENES)}")
     return SCENES[name]()
+
+
+def needs_from_option(text: str) -> Needs:
+    """The needs that --needs states; `InputError` for what states none."""
+    try:
+        return needs_from_text(text)
+    except InputError as error:
+        raise InputError(f"--{error}; see --help for an example") from None
 
 
 def stored_arguments(given: Any) -> dict[str, Any]:

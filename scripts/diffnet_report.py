@@ -21,7 +21,7 @@ from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.files import run_folder
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
-from dln_jax.types import require_positive
+from dln_jax.types import require_network, require_positive
 from scripts.arguments import Unstated, choice, names_in
 from scripts.command_line import run
 from scripts.report_table import report_table
@@ -53,7 +53,8 @@ class Arguments:
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
-    require_positive(width=given.width, depth=given.depth, batch=given.batch, repetitions=given.repetitions)
+    require_network(width=given.width, depth=given.depth)
+    require_positive(batch=given.batch, repetitions=given.repetitions)
     names_in("--activation", given.activation, PLAIN)
     with run_folder(given.out, "diffnet_report") as folder:
         measure_into(folder, given)

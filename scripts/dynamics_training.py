@@ -1,6 +1,5 @@
 """What train_delan and train_hnn share: from a command line to a trained model of dynamics in a run folder."""
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from dln_jax.data import schema
-from dln_jax.data.schema import Trajectories, needs_from_json
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, split
 from dln_jax.deploy.kinds import build, describe, objective_of
 from dln_jax.deploy.load import save_model
@@ -22,7 +21,7 @@ from dln_jax.learning.train import Settings, automatic_optimizer, check, train, 
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import scene_named, stored_arguments, with_stored_arguments
+from scripts.command_line import needs_from_option, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
@@ -190,10 +189,7 @@ def default_width(kind: str, optimizer: str) -> int:
 def stated_needs(given: Arguments, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
     """What the plant needs, and who says so: the command line, the scene, the file, or an assumption."""
     if given.needs is not None:
-        try:
-            return needs_from_json(json.loads(given.needs)), "--needs"
-        except json.JSONDecodeError as error:
-            raise InputError(f"--needs is not JSON ({error}); see --help for an example") from error
+        return needs_from_option(given.needs), "--needs"
     if scene is not None:
         return scene.needs, f"scene {scene.name}"
     if data.needs is not None:

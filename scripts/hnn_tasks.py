@@ -16,7 +16,7 @@ from dln_jax.data import schema
 from dln_jax.data.hamiltonian_tasks import PROTOCOLS
 from dln_jax.data.phase_samples import Part, reference_motion
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import PER_SAMPLE, select
+from dln_jax.data.splits import PER_SAMPLE, require_no_copies, select
 from dln_jax.evaluation.phase_metrics import Motions
 from dln_jax.learning.trajectory_matching import stretches
 from dln_jax.types import Hamiltonian, InputError, Needs
@@ -125,6 +125,7 @@ def measured(name: str, data: Trajectories, file: str, needs: Needs | None) -> P
     else:
         chosen = present[5::6] if len(present) >= 6 else present[-1:]
         fitted = select(data, np.setdiff1d(present, chosen))
+        require_no_copies(fitted, select(data, chosen))
         tests = [select(data, chosen[[place]]) for place in range(min(len(chosen), STARTS))]
     length = min(len(test.t) for test in tests)
     truth = tuple(motion_of(samples_of(test, slice(0, length))) for test in tests)

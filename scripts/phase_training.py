@@ -1,6 +1,5 @@
 """What `train_hnn --task` does: from a command line to a trained model of a phase space in a run folder."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +8,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax.data.schema import needs_from_json
 from dln_jax.deploy.load import load_phase_field, save_model
 from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.evaluation import animations, figures
@@ -17,8 +15,8 @@ from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.phase_figures import TRUTH
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Progress
-from dln_jax.types import InputError, Needs, require_positive
-from scripts.command_line import stored_arguments
+from dln_jax.types import InputError, require_positive
+from scripts.command_line import needs_from_option, stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
@@ -37,9 +35,8 @@ def run_task(given: "Arguments") -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
     check(given)
-    problem = problem_of(
-        given.task or "", trajectories=given.trajectories, data=given.data, needs=stated_needs(given.needs)
-    )
+    needs = None if given.needs is None else needs_from_option(given.needs)
+    problem = problem_of(given.task or "", trajectories=given.trajectories, data=given.data, needs=needs)
     size: dict[str, Any] = {"width": given.width, "depth": given.depth if given.depth != 2 else None}
     size["degree"] = given.degree if given.model == POLYNOMIAL and given.degree > 1 else None
     description = description_of(problem, given.model, activation=given.activation, **size)
@@ -96,16 +93,6 @@ def check(given: "Arguments") -> None:
         raise InputError("a task trains one seed at a time; scripts.hnn_table measures several")
     if given.optimizer == "adam" and given.model == POLYNOMIAL:
         raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
-
-
-def stated_needs(needs: str | None) -> Needs | None:
-    """The needs on the command line."""
-    if needs is None:
-        return None
-    try:
-        return needs_from_json(json.loads(needs))
-    except json.JSONDecodeError as error:
-        raise InputError(f"--needs is not JSON ({error}); see --help for an example") from error
 
 
 def total_steps(problem: Problem, description: dict[str, Any], steps: int | None) -> int:

@@ -13,7 +13,6 @@ import dataclasses
 import inspect
 import math
 import time
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
@@ -23,12 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from dln_jax.data import meshes
 from dln_jax.evaluation.report import conditions, write_report
 from dln_jax.evaluation.soft_body_figures import Moments, moments_figure
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.softbody.driven import Example, beginning, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
-from dln_jax.softbody.mesh import Mesh, make_mesh, overlaps
+from dln_jax.softbody.mesh import overlaps
 from dln_jax.softbody.rollout import rollout
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import Integrator, Step
@@ -188,7 +188,10 @@ def example_of(given: Arguments) -> Example:
     if given.mesh is not None:
         if beside := [name for name in ("cells", "dimension") if name in choices]:
             raise InputError(f"--{beside[0]} is for the scene's own mesh; leave it or --mesh out")
-        choices["mesh"], held = read_mesh(given.mesh)
+        try:
+            choices["mesh"], held = meshes.load(given.mesh)
+        except InputError as error:
+            raise InputError(f"--mesh {error}") from None
         if held is not None and "held" in known:
             choices["held"] = held
     if given.seed < 0:
@@ -199,30 +202,6 @@ def example_of(given: Arguments) -> Example:
     precision = PRECISIONS[given.precision]
     params = in_precision(example.scene.params, precision)
     return example._replace(scene=example.scene._replace(params=params), state=in_precision(example.state, precision))
-
-
-def read_mesh(path: Path) -> tuple[Mesh, np.ndarray | None]:
-    """The mesh of a file and its held vertices, if it names any."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else "it is not an .npz of plain arrays"
-        raise InputError(f"--mesh {path}: {reason}; expected `vertices` [n, dim] and `elements` [m, dim + 1]") from None
-    for name in ("vertices", "elements"):
-        if name not in arrays:
-            held = ", ".join(arrays) or "nothing"
-            raise InputError(f"--mesh {path}: '{name}' is missing (the file holds {held}); save it under this name")
-    held = arrays.get("held")
-    try:
-        mesh = make_mesh(arrays["vertices"], arrays["elements"])
-    except InputError as error:
-        raise InputError(f"--mesh {path}: {error}") from None
-    if held is not None and (held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0):
-        raise InputError(
-            f"--mesh {path}: held is {held.dtype} of shape {list(held.shape)}; expected integers [k], k >= 1: vertices"
-        )
-    return mesh, held
 
 
 def in_precision(tree: Any, precision: Any) -> Any:

@@ -58,7 +58,7 @@ REFUSED = [
     (changed(needs=np.array('{"joints": ["revolute"]}')), "states 1 joints, but q has 2"),
     (changed(needs=np.array('{"joints": ["revolute", "revolute"], "wind": true}')), "expected JSON with the fields"),
     (changed(needs=np.array('{"joints": ["revolute", "revolute"], "gravity": 1}')), "gravity is 1"),
-    (changed(needs=np.array('{"joints": ["revolute", "revolute"], "actuation": [[1]]}')), "actuation has shape"),
+    (changed(needs=np.array('{"joints": ["revolute", "revolute"], "actuation": [[1]]}')), "actuation is"),
 ]
 
 

@@ -208,18 +208,18 @@ def test_the_script_refuses_wrong_meshes(tmp_path, capsys):
     path = tmp_path / "mesh.npz"
     good = {"vertices": mesh.vertices, "elements": mesh.elements}
     wrong = {
-        "'elements' is missing (the file holds vertices)": {"vertices": mesh.vertices},
+        "'elements' is missing (found: vertices)": {"vertices": mesh.vertices},
         "elements has shape [2, 2]; expected [m, 3]": {**good, "elements": mesh.elements[:, :2]},
         "element 1 is a duplicate": {**good, "elements": mesh.elements[[0, 0]]},
         "held is float64 of shape [1]": {**good, "held": np.array([0.5])},
         "held names vertex 9": {**good, "held": np.array([9])},
-        "not an .npz of plain arrays": {**good, "held": np.array([{}], dtype=object)},
+        "without pickled objects": {**good, "held": np.array([{}], dtype=object)},
     }
     for said, arrays in wrong.items():
         np.savez(path, **arrays)
         assert said in refused(capsys, simulate, "--mesh", path, "--out", tmp_path / "run"), said
     path.write_text("no archive")
-    assert "not an .npz" in refused(capsys, simulate, "--mesh", path, "--out", tmp_path / "run")
+    assert "not a readable npz" in refused(capsys, simulate, "--mesh", path, "--out", tmp_path / "run")
     np.savez(path, **good)
     assert "--cells is for the scene's own mesh" in refused(capsys, simulate, "--mesh", path, "--cells", "2")
     assert not (tmp_path / "run").exists()

@@ -1,39 +1,88 @@
-"""Reading npz archives of plain numbers and strings: nothing is unpickled, and every refusal names its key."""
+"""Reading npz archives of plain numbers and strings: nothing is unpickled, and every refusal names its key.
 
+A file is read only as far as it is needed: the arrays that somebody reads, each no larger than its archive says and
+than its header states, all of them together at most `MOST_BYTES`.
+"""
+
+import math
+import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from dln_jax.files import is_file
 from dln_jax.types import InputError
 
 Data = TypeVar("Data")
 
+MOST_BYTES = 4 * 2**30
+"""Of the arrays of one file: a small archive may expand a thousandfold."""
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Of the versions in which NumPy writes numbers and strings."""
 
-def load(path: str | Path, from_arrays: Callable[[dict[str, Any]], Data]) -> Data:
-    """Reads all arrays of a file and hands them to `from_arrays`, which checks them.
+
+def load(path: str | Path, from_arrays: Callable[[dict[str, Any]], Data], keys: Sequence[str]) -> Data:
+    """Reads the arrays of these keys, where the file has them, and hands them to `from_arrays`, which checks them.
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, or `from_arrays` refuses its arrays (the
-            message then starts with the path).
+        InputError: the file is missing, is no npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
+            `from_arrays` refuses its arrays (the message then starts with the path).
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the path of an npz file")
+    if not is_file(path):
+        raise InputError(f"{path!s:.200}: no such file; give the path of an npz file")
+    unread: list[str] = []
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(
-            f"{path}: not a readable npz file without pickled objects ({type(error).__name__}); "
-            "write it with numpy.savez and plain numeric or string arrays"
-        ) from error
-    try:
+        arrays, unread = _read(path, keys)
         return from_arrays(arrays)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        beside = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""
+        raise InputError(f"{path}: {error}{beside}") from None
+
+
+def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """The arrays of these keys, and the names of the others."""
+    arrays, room, key = {}, MOST_BYTES, None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            for key in (key for key in keys if f"{key}.npy" in archive.namelist()):
+                member = archive.getinfo(f"{key}.npy")
+                with archive.open(member) as file:
+                    arrays[key] = _array(file, member.file_size, room)
+                room -= arrays[key].nbytes
+    except InputError as error:
+        raise InputError(f"{key} {error}") from None
+    except Exception as error:  # zipfile, its decoders and NumPy's parser of headers raise whatever they come across
+        where = "" if key is None else f" in '{key}'"
+        raise InputError(
+            f"not a readable npz file without pickled objects ({type(error).__name__}{where}); "
+            "write it with numpy.savez and plain numeric or string arrays"
+        ) from error
+    return arrays, [name for name in names if name not in keys]
+
+
+def _array(file: Any, size: int, room: int) -> np.ndarray:
+    """One array of an archive, whose entry has `size` bytes; at most `room` of them are read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about headers that Python 2 wrote
+        shape, by_columns, dtype = HEADERS[np.lib.format.read_magic(file)](file)
+    expected = math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or dtype.names or not dtype.itemsize or min(shape, default=0) < 0:
+        raise InputError(f"has type {str(dtype)[:60]}; expected plain numbers or strings, without pickled objects")
+    if expected != size - file.tell():
+        raise InputError(f"has {size - file.tell()} bytes for shape {str(shape)[:60]} of {dtype}; write the file again")
+    if expected > room:
+        raise InputError(
+            f"has shape {str(shape)[:60]}: with it the file holds more than {MOST_BYTES >> 30} GiB; split the data"
+        )
+    data = file.read(expected)
+    if len(data) != expected or file.read(1):
+        raise InputError(f"ends after {len(data)} of {expected} bytes; write the file again")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
 
 
 def numeric(
@@ -46,7 +95,10 @@ def numeric(
     """
     if key not in arrays:
         raise InputError(f"key '{key}' is missing (found: {', '.join(sorted(arrays)) or 'nothing'}); add it")
-    array = np.asarray(arrays[key])
+    try:
+        array = np.asarray(arrays[key])
+    except ValueError as error:
+        raise InputError(f"{key} is ragged; expected one array of real numbers") from error
     if array.dtype.kind not in "fiu":
         raise InputError(f"{key} has type {array.dtype}; expected real numbers")
     if shape is not None and array.shape != shape:

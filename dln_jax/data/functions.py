@@ -19,6 +19,8 @@ from dln_jax.data import archive
 from dln_jax.data.archive import numeric
 from dln_jax.types import InputError, require_positive
 
+KEYS = ("x", "y", "dy", "d2y")
+
 
 class FunctionSamples(NamedTuple):
     """Samples of one function of n inputs and m outputs, float64; shapes as in the module's table."""
@@ -56,7 +58,7 @@ def load(path: str | Path) -> FunctionSamples:
     Raises:
         InputError: the file is missing, is no npz, holds pickled objects, or its arrays do not fit the table above.
     """
-    return archive.load(path, from_arrays)
+    return archive.load(path, from_arrays, KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
@@ -80,11 +82,13 @@ def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
 def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0) -> SampleSplit:
     """Draws validation samples by the seed; at least one, and at least one is left to train on.
 
-    For samples that are independent of each other. Raises InputError for a share outside (0, 1).
+    For samples that are independent of each other. Raises InputError for a share outside (0, 1), or a single sample.
     """
     if not 0 < validation_share < 1:
         raise InputError(f"validation share is {validation_share}; expected a number between 0 and 1")
     samples = len(data.x)
+    if samples < 2:
+        raise InputError(f"there is {samples} sample to train on and to validate by; expected at least 2: add samples")
     count = min(max(1, round(validation_share * samples)), samples - 1)
     order = np.random.default_rng((seed, samples)).permutation(samples)
     return SampleSplit(train=select(data, np.sort(order[count:])), validation=select(data, np.sort(order[:count])))
@@ -137,8 +141,8 @@ def _exact_cosine_sine(x: np.ndarray) -> FunctionSamples:
 
 def _noisy_samples(exact, n: int, samples: int, noise: float, bound: float, seed: int) -> FunctionSamples:
     require_positive(samples=samples, bound=bound)
-    if not noise >= 0:
-        raise InputError(f"noise is {noise}; expected a standard deviation, zero or positive")
+    if not (0 <= noise < np.inf and bound < np.inf):
+        raise InputError(f"noise is {noise} and the bound {bound}; expected finite numbers, the noise zero or positive")
     random = np.random.default_rng(seed)
     clean = exact(random.uniform(-bound, bound, (samples, n)))
     noisy = [array + noise * random.normal(size=array.shape) for array in clean]

@@ -45,6 +45,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
     the tip's path through the inverse kinematics and the closed-form equations of motion.
     """
     require_positive(dt=dt)
+    _require_finite(dt=dt)
     paths = [letter_path(letter) for letter in letters]
     times = [np.arange(0.0, path.duration, dt) for path in paths]
 
@@ -89,13 +90,15 @@ def uniform(
     Bounds are in rad or m, 1/s, 1/s² and N m or N. A fully actuated scene draws accelerations; an under-actuated one
     draws controls, from which the accelerations follow.
     """
-    require_positive(
-        samples=samples,
-        position_bound=position_bound,
-        rate_bound=rate_bound,
-        acceleration_bound=acceleration_bound,
-        control_bound=control_bound,
-    )
+    bounds = {
+        "position_bound": position_bound,
+        "rate_bound": rate_bound,
+        "acceleration_bound": acceleration_bound,
+        "control_bound": control_bound,
+    }
+    require_positive(samples=samples, **bounds)
+    _require_finite(**bounds)
+    _require_seed(seed)
     d = scene.needs.degrees_of_freedom
     random = np.random.default_rng(seed)
     q, qd = (random.uniform(-bound, bound, (samples, d)) for bound in (position_bound, rate_bound))
@@ -129,6 +132,8 @@ def free_swing(
         InputError: the integration does not finish.
     """
     require_positive(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
+    _require_finite(dt=dt)
+    _require_seed(seed)
     d = scene.needs.degrees_of_freedom
     if starts is None:
         starts = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, (trajectories, d))
@@ -191,6 +196,17 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
         tau_gravity=np.asarray(parts.gravity),
         needs=scene.needs,
     )
+
+
+def _require_finite(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not np.isfinite(value):
+            raise InputError(f"{name} is {value}; expected a finite number")
+
+
+def _require_seed(seed: int) -> None:
+    if seed < 0:
+        raise InputError(f"seed is {seed}; expected 0 or a positive integer")
 
 
 def _batched(function, scene: Scene):

@@ -9,25 +9,32 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau` | [N, d] | N m or N | zero if absent |
 | `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
-| `trajectory` | [N] int | | index of the trajectory that a sample belongs to |
-| `label` | [K] str | | a name for each trajectory; indices if absent |
+| `trajectory` | [N] int | | index of the trajectory that a sample belongs to; any number >= 0 without `label` |
+| `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
 import json
+import reprlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
 from dln_jax.data import archive
 from dln_jax.data.archive import numeric
 from dln_jax.data.derivatives import time_derivative
-from dln_jax.files import is_file, writing
-from dln_jax.types import InputError, Needs
+from dln_jax.files import is_file, matches, writing
+from dln_jax.types import InputError, JointKind, Needs
 
+JOINTS = get_args(JointKind)
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
+KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "needs")
+
+
+LARGEST_INDEX = 2**53
+"""Up to which float64 tells whole numbers apart."""
 
 
 class Trajectories(NamedTuple):
@@ -61,7 +68,7 @@ def load(path: str | Path) -> Trajectories:
     Raises:
         InputError: the file is missing, is no npz, holds pickled objects, or breaks the schema.
     """
-    return archive.load(path, from_arrays)
+    return archive.load(path, from_arrays, KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> Trajectories:
@@ -120,6 +127,16 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         np.savez_compressed(file, **arrays)
 
 
+def needs_from_text(text: str) -> Needs:
+    """`Needs` from their JSON; errors as `needs_from_json`, and text that is no JSON."""
+    try:
+        stated = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        reason = str(error).splitlines()[0][:80]
+        raise InputError(f"needs is not JSON ({reason}); expected the fields {', '.join(Needs._fields)}") from error
+    return needs_from_json(stated)
+
+
 def needs_from_json(stated: Any) -> Needs:
     """`Needs` from the plain values of its JSON.
 
@@ -128,29 +145,39 @@ def needs_from_json(stated: Any) -> Needs:
     """
     advice = f"expected JSON with the fields {', '.join(Needs._fields)}"
     if not isinstance(stated, dict) or not set(stated) <= set(Needs._fields) or "joints" not in stated:
-        raise InputError(f"needs: {advice}, got {stated!r:.80}")
+        raise InputError(f"needs: {advice}, got {reprlib.repr(stated)}")
     joints = stated["joints"]
-    if not isinstance(joints, list | tuple) or not joints or not set(joints) <= {"revolute", "prismatic"}:
-        raise InputError(f"needs: joints are {joints!r:.80}; expected a list of 'revolute' and 'prismatic'")
+    if not isinstance(joints, list | tuple) or not joints or not all(each in JOINTS for each in joints):
+        raise InputError(f"needs: joints are {reprlib.repr(joints)}; expected a list of 'revolute' and 'prismatic'")
     for key in ("gravity", "friction"):
         if not isinstance(stated.get(key, False), bool):
-            raise InputError(f"needs: {key} is {stated[key]!r:.80}; expected true or false")
+            raise InputError(f"needs: {key} is {reprlib.repr(stated[key])}; expected true or false")
     actuation = stated.get("actuation")
     if actuation is not None:
-        matrix = np.array(actuation, dtype=object)
-        if matrix.ndim != 2 or len(matrix) != len(joints):
-            raise InputError(f"needs: actuation has shape {matrix.shape}; expected [{len(joints)}, u], or null")
-        actuation = tuple(tuple(float(entry) for entry in row) for row in actuation)
+        rows = actuation if isinstance(actuation, list | tuple) else ()
+        lengths = {len(row) if isinstance(row, list | tuple) else 0 for row in rows}
+        if len(rows) != len(joints) or len(lengths) != 1 or not all(lengths):
+            shape = f"[{len(joints)}, u] with u >= 1, rows of one length"
+            raise InputError(f"needs: actuation is {reprlib.repr(actuation)}; expected {shape}, or null")
+        if not all(matches(entry, float) for row in rows for entry in row):
+            raise InputError(f"needs: actuation is {reprlib.repr(actuation)}; expected finite numbers")
+        actuation = tuple(tuple(float(entry) for entry in row) for row in rows)
     return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation})
 
 
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
     trajectory = numeric(arrays, "trajectory", (samples,))
-    if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0:
+    if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
         raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
     trajectory = trajectory.astype(np.int64)
+    if "label" not in arrays:
+        present, trajectory = np.unique(trajectory, return_inverse=True)
+        return trajectory.reshape(-1), present.astype(str)
     count = int(trajectory.max()) + 1
-    label = np.asarray(arrays.get("label", [str(index) for index in range(count)]))
+    try:
+        label = np.asarray(arrays["label"])
+    except ValueError as error:
+        raise InputError("label is ragged; expected one string per trajectory") from error
     if label.dtype.kind not in "US" or label.ndim != 1:
         raise InputError(f"label has type {label.dtype} and shape {label.shape}; expected one string per trajectory")
     if len(label) < count:
@@ -175,11 +202,7 @@ def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.nd
 def _stated_needs(arrays: dict[str, Any], d: int) -> Needs | None:
     if "needs" not in arrays:
         return None
-    try:
-        stated = json.loads(str(arrays["needs"]))
-    except json.JSONDecodeError as error:
-        raise InputError(f"needs is not JSON ({error}); expected the fields {', '.join(Needs._fields)}") from error
-    needs = needs_from_json(stated)
+    needs = needs_from_text(str(arrays["needs"]))
     if needs.degrees_of_freedom != d:
         raise InputError(f"needs states {needs.degrees_of_freedom} joints, but q has {d} columns; make them agree")
     return needs

@@ -1,5 +1,6 @@
 """Splits by trajectory, never by sample: neighbouring samples of one trajectory are almost copies."""
 
+import hashlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -49,7 +50,8 @@ def split(
     seed from the rest, so that no choice made by validation has seen the test.
 
     Raises:
-        InputError: an unknown label, or fewer than one trajectory left for training.
+        InputError: an unknown label, fewer than one trajectory left for training, or a test trajectory that is also
+            among the rest.
     """
     present = np.unique(data.trajectory)
     test_indices = present[5::6] if test is None else label_indices(data, test)
@@ -61,6 +63,7 @@ def split(
             f"{len(present)} trajectories, {len(test_indices)} of them for the test, leave {len(rest)} for training "
             "and validation; at least 3 in all are needed: record more, or cut long ones and index the parts"
         )
+    require_no_copies(select(data, rest), select(data, test_indices))
     count = min(max(1, round(validation_share * len(rest))), len(rest) - 1)
     validation = np.random.default_rng(seed).choice(rest, size=count, replace=False)
     return Split(
@@ -83,6 +86,27 @@ def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[l
         raise InputError(f"{len(labels)} trajectories cannot be cut into {parts} tests; ask for 2 to {len(labels)}")
     permuted = np.random.default_rng(seed).permutation(labels)
     return [part.tolist() for part in np.array_split(permuted, parts)]
+
+
+def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
+    """Raises `InputError` if a trajectory of the test is a copy of one that is trained on: the test would be none.
+
+    States that do not change, such as single samples, may be alike without being copies.
+    """
+
+    def contents(data: Trajectories) -> dict[bytes, int]:
+        states = np.hstack([data.q, data.qd, data.qdd, data.tau])
+        first = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
+        motions = zip(data.trajectory[first], np.split(states, first[1:]), strict=True)
+        return {hashlib.sha256(part.tobytes()).digest(): index for index, part in motions if np.ptp(part, axis=0).any()}
+
+    known = contents(seen)
+    for content, index in contents(test).items():
+        if content in known:
+            raise InputError(
+                f"test trajectory '{test.label[index]}' is a copy of '{seen.label[known[content]]}', which is trained "
+                "on; remove one of them"
+            )
 
 
 def merged(sets: Split) -> Trajectories:

@@ -3,10 +3,13 @@
 A description is plain JSON values: `kind`, `needs`, `precision` (f32 or f64), and the keywords of the kind's factory.
 """
 
+import reprlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from dln_jax.data.schema import Trajectories, needs_from_json
+from dln_jax.files import matches
+from dln_jax.learning.checkpoints import REMEDY
 from dln_jax.learning.residuals import BOTH_WAYS, CANONICAL, TORQUE, Objective
 from dln_jax.learning.runs import data_type
 from dln_jax.models.black_box import make_black_box_lagrangian
@@ -16,7 +19,7 @@ from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structur
 from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import activation
-from dln_jax.types import InputError, Needs
+from dln_jax.types import InputError, Needs, require_network
 
 SomeKind = TypeVar("SomeKind")
 SomeModel = TypeVar("SomeModel")
@@ -72,6 +75,15 @@ def build(description: dict[str, Any]) -> Model:
     return build_by(description, KINDS, lambda kind, *given, **keywords: kind.make(*given, **keywords))
 
 
+PLAIN = ("needs", "features")
+"""Keys of a description that are no numbers, names or switches; whoever reads them checks them."""
+STATED: dict[str, type] = {
+    **dict.fromkeys(("precision", "activation"), str),
+    **dict.fromkeys(("width", "depth", "degree", "dimension", "friction_width", "iterations"), int),
+    **dict.fromkeys(("shared_trunk", "alike"), bool),
+}
+"""Types of the other keys; those that are not here are numbers. Scales and degrees are one for all coordinates, or one
+each."""
 WITHOUT_ACTIVATION = ("trigonometric", "polynomial-hamiltonian")
 """Kinds that are no networks."""
 
@@ -84,8 +96,16 @@ def build_by(description: dict[str, Any], kinds: Mapping[str, SomeKind], make: C
     """
     keywords = dict(description)
     kind = keywords.pop("kind", None)
-    if kind not in kinds:
-        raise InputError(f"model kind is {kind!r}; this release knows {', '.join(kinds)}")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise InputError(f"model kind is {reprlib.repr(kind)}; this release knows {', '.join(kinds)}")
+    for key, value in keywords.items():
+        several = isinstance(value, list | tuple) and (key.endswith("_scale") or key == "degree")
+        numbers = value if several else [value]
+        if key not in PLAIN and not all(matches(each, STATED.get(key, float)) for each in numbers):
+            wanted = STATED.get(key, float).__name__
+            raise InputError(f"model description: {key} is {reprlib.repr(value)}, expected {wanted}; {REMEDY}")
+    if "width" in keywords or "depth" in keywords:
+        require_network(width=keywords.get("width", 1), depth=keywords.get("depth", 1))
     try:
         needs, dtype = needs_from_json(keywords.pop("needs")), data_type(keywords.pop("precision"))
         if kind not in WITHOUT_ACTIVATION:
@@ -93,5 +113,7 @@ def build_by(description: dict[str, Any], kinds: Mapping[str, SomeKind], make: C
         # JSON knows no tuples, and a model's keywords are hashable.
         keywords = {key: tuple(value) if isinstance(value, list) else value for key, value in keywords.items()}
         return make(kinds[kind], needs, dtype=dtype, **keywords)
-    except (KeyError, TypeError) as error:
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"model description: {error}; a release that is newer or older may have written it") from error

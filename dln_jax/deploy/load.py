@@ -81,6 +81,9 @@ def _stored(directory: Path, build: Callable[[dict[str, Any]], Any]) -> tuple[An
         raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
-    model = build(description)
+    try:
+        model = build(description)
+    except InputError as error:
+        raise InputError(f"{directory / MODEL}.json: {error}") from None
     like = jax.eval_shape(model.init, jax.random.key(0))
     return model, load_tree(directory, MODEL, like), data_type(description["precision"])

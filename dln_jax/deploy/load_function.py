@@ -1,5 +1,6 @@
 """A trained differential network as one jitted function."""
 
+import reprlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,13 +10,14 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.deploy.load import MODEL
-from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
+from dln_jax.files import matches
+from dln_jax.learning.checkpoints import REMEDY, load_manifest, load_tree, save_tree
 from dln_jax.learning.runs import data_type, require_double_precision
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import activation
 from dln_jax.nn.differential_mlp import Layers
-from dln_jax.types import InputError, VectorLike
+from dln_jax.types import MOST_LAYERS, InputError, VectorLike
 
 KIND = "differential-mlp"
 KEYS = {"kind", "sizes", "activation", "members", "precision"}
@@ -51,6 +53,20 @@ def save_function(directory: Path, layers: Layers, *, activation: str, precision
     save_tree(directory, MODEL, layers, {"model": description})
 
 
+def check_description(directory: Path, description: dict[str, Any]) -> None:
+    """Raises `InputError` unless the description in a folder's model.json is one that `save_function` writes."""
+    path = directory / f"{MODEL}.json"
+    if missing := KEYS - set(description):
+        raise InputError(f"{path}: lacks {', '.join(sorted(missing))}; {REMEDY}")
+    for key, hint in (("activation", str), ("precision", str), ("members", int)):
+        if not matches(description[key], hint):
+            raise InputError(f"{path}: {key} is {reprlib.repr(description[key])}, expected {hint.__name__}; {REMEDY}")
+    sizes, members = description["sizes"], description["members"]
+    right = isinstance(sizes, list) and 2 <= len(sizes) <= MOST_LAYERS + 2
+    if not right or not all(matches(size, int) and size > 0 for size in (*sizes, members)):
+        raise InputError(f"{path}: sizes are {reprlib.repr(sizes)} of {members} members, expected numbers; {REMEDY}")
+
+
 def load_function(directory: str | Path) -> LoadedFunction:
     """The differential network of a trained run.
 
@@ -62,10 +78,7 @@ def load_function(directory: str | Path) -> LoadedFunction:
     description = load_manifest(directory, MODEL).get("model")
     if not isinstance(description, dict) or description.get("kind") != KIND:
         raise InputError(f"{directory / MODEL}.json: describes no {KIND}; give the folder of a train_diffnet run")
-    if missing := KEYS - set(description):
-        raise InputError(
-            f"{directory / MODEL}.json: lacks {', '.join(sorted(missing))}; train again or restore the file"
-        )
+    check_description(directory, description)
     if description["precision"] == "f64":
         require_double_precision(str(directory))
     dtype, function = data_type(description["precision"]), activation(description["activation"])

@@ -1,5 +1,6 @@
 """A trained model of pictures as jitted functions: its autoencoder, and what moves in the latent plane."""
 
+import reprlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.deploy.load import MODEL, compiled
-from dln_jax.learning.checkpoints import load_manifest, load_tree, save_tree
+from dln_jax.files import matches
+from dln_jax.learning.checkpoints import REMEDY, load_manifest, load_tree, save_tree
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
 from dln_jax.models.model import Parameters
@@ -16,6 +18,8 @@ from dln_jax.models.principal_components import Components
 from dln_jax.types import InputError
 
 KIND = "latent-phase"
+MOST_NUMBERS = 10**8
+"""Of the components of a picture."""
 
 
 class PictureModels(NamedTuple):
@@ -51,6 +55,11 @@ def load_latent(directory: str | Path) -> LatentPhase:
     facts = load_manifest(directory, MODEL).get("model")
     if not isinstance(facts, dict) or facts.get("kind") != KIND:
         raise InputError(f"{directory / MODEL}.json: describes no {KIND}; give the folder of a run of --task pixels")
+    for key in ("pixels", "components"):
+        if not matches(facts.get(key), int) or facts[key] < 1:
+            raise InputError(f"{directory / MODEL}.json: {key} is {reprlib.repr(facts.get(key))}; {REMEDY}")
+    if not isinstance(facts.get("field"), str) or facts["components"] * facts["pixels"] > MOST_NUMBERS:
+        raise InputError(f"{directory / MODEL}.json: describes no field, or one of too many pixels; {REMEDY}")
     empty = Components(np.zeros(facts["pixels"]), np.zeros((facts["components"], facts["pixels"])), 1.0, 0.0)
     like = {
         "parameters": jax.eval_shape(build_latent(facts["field"], empty).of_pictures.init, jax.random.key(0)),

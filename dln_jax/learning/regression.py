@@ -27,7 +27,7 @@ from dln_jax.learning.second_order import COARSE_SAMPLES, Budget, require_float6
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, Scalar, require_network, require_positive
 
 LOSSES = ("type1", "type2")
 OPTIMIZERS = ("adam", "gauss-newton")
@@ -87,6 +87,7 @@ def check(data: FunctionSamples, settings: Settings) -> None:
         raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
     if settings.optimizer == "gauss-newton":
         require_float64(settings.precision)
+    require_network(width=settings.width, depth=settings.depth)
     activation(settings.activation)
     data_type(settings.precision)
     _needed(data, settings)

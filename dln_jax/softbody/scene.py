@@ -83,7 +83,7 @@ def make_scene(
         held: indices of vertices that are not solved for.
 
     Raises:
-        InputError: two terms of one name, an index or a mass out of range.
+        InputError: two terms of one name, an index or a mass out of range, or no vertex that is free.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
@@ -100,6 +100,8 @@ def make_scene(
     held = np.asarray(held, int).reshape(-1)
     if len(outside := held[(held < 0) | (held >= n)]):
         raise InputError(f"held names vertex {outside[0]}; expected 0..{n - 1}")
+    if len(np.unique(held)) == n:
+        raise InputError(f"held names all {n} vertices; expected at least one that is free to move")
     masses = lumped_masses(mesh, density) if masses is None else np.broadcast_to(np.asarray(masses, float), n)
     if len(bad := np.flatnonzero(~(np.isfinite(masses) & (masses > 0)))):
         raise InputError(f"the mass of vertex {bad[0]} is {masses[bad[0]]} kg; expected a positive number")

@@ -1,0 +1,46 @@
+"""Mesh files: an npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], vertices."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from dln_jax.data import archive
+from dln_jax.softbody.mesh import Mesh, make_mesh
+from dln_jax.types import InputError
+
+KEYS = ("vertices", "elements", "held")
+
+
+class StoredMesh(NamedTuple):
+    """What a file has."""
+
+    mesh: Mesh
+    held: Int[np.ndarray, " k"] | None
+    """Vertices that are held; `None` where the file names none."""
+
+
+def load(path: str | Path) -> StoredMesh:
+    """Reads and checks a file; never unpickles.
+
+    Raises:
+        InputError: the file is missing or no npz, or its arrays are no mesh, or hold all or none of its vertices.
+    """
+    return archive.load(path, from_arrays, KEYS)
+
+
+def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
+    """Checks arrays against the table above; errors as `load`."""
+    for name in ("vertices", "elements"):
+        if name not in arrays:
+            found = ", ".join(arrays) or "nothing"
+            raise InputError(f"'{name}' is missing (found: {found}); expected `vertices` and `elements`")
+    mesh, held = make_mesh(arrays["vertices"], arrays["elements"]), arrays.get("held")
+    if held is None:
+        return StoredMesh(mesh, None)
+    if held.ndim != 1 or held.dtype.kind not in "iu" or held.size == 0:
+        raise InputError(
+            f"held is {held.dtype} of shape {list(held.shape)}; expected integers [k], k >= 1: indices of vertices"
+        )
+    return StoredMesh(mesh, held)
