@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from test_train_delan import command, refused
+from commands import command, refused
 
 from dln_jax.data import generators, schema
 from dln_jax.scenes.pendulum import pendulum

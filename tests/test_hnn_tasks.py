@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from commands import command, refused
 from safetensors.numpy import load_file
 from test_field_matching import quick_motion
-from test_train_delan import command, refused
 
 from dln_jax.data import phase_samples, schema
 from dln_jax.deploy.load import load_phase_field

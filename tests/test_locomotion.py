@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import refused
 from gymnasium.utils.env_checker import check_env
-from test_train_delan import refused
 
 from dln_jax.evaluation.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion import comparison

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import command, refused
 from PIL import Image
-from test_train_delan import command, refused
 
 from dln_jax.data import pendulum_frames
 from dln_jax.data.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import command, refused
 from rich.console import Console
-from test_train_delan import command, refused
 
 from dln_jax.evaluation.soft_body_energies import motion_energies
 from dln_jax.evaluation.soft_body_figures import Moments, energies_against_time, moments_figure

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from test_train_delan import command, refused
+from commands import command, refused
 
 from dln_jax.evaluation.soft_cases import SUBJECTS, measure
 from dln_jax.types import InputError

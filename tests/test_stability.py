@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from test_train_delan import command, refused
+from commands import command, refused
 
 from dln_jax.evaluation.hard_cases import NAMES, Case, measure
 from dln_jax.evaluation.misfit import velocity_misfit

@@ -12,12 +12,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import command, refused
 
 from dln_jax import load_run
 from dln_jax.data import generators, schema
 from dln_jax.scenes.cart_pole import cart_pole
 from scripts import make_data, train_delan
-from scripts.command_line import run
 
 ROOT = Path(__file__).parent.parent
 TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64", "--no-low-latency")
@@ -36,27 +36,6 @@ METRICS = {
     *(f"{name}_mse" for name in ("torque", "inertial", "coriolis", "gravity", "power", "forward")),
     *("parameters", "compile_seconds", "train_seconds", "one_step_p50_us", "one_step_p99_us"),
 }
-
-
-def command(script, *arguments):
-    """Runs a script as the shell would, in this process."""
-    previous = sys.argv
-    sys.argv = [script.__name__, *map(str, arguments)]
-    try:
-        run(script.main, script.Arguments)
-    finally:
-        sys.argv = previous
-
-
-def refused(capsys, script, *arguments):
-    """The one line that a user gets who made a mistake."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as exit_:
-        command(script, *arguments)
-    line = capsys.readouterr().err
-    assert exit_.value.code == 2
-    assert line.startswith("error: ") and line.count("\n") == 1 and "Traceback" not in line
-    return line
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train_delan import command, refused
+from commands import command, refused
 
 from dln_jax import load_run
 from dln_jax.data import generators, schema

@@ -97,7 +97,7 @@ def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
     def contents(data: Trajectories) -> dict[bytes, int]:
         states = np.hstack([data.q, data.qd, data.qdd, data.tau])
         first = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
-        motions = zip(data.trajectory[first], np.split(states, first[1:]), strict=True)
+        motions = zip(data.trajectory[first].tolist(), np.split(states, first[1:]), strict=True)
         return {hashlib.sha256(part.tobytes()).digest(): index for index, part in motions if np.ptp(part, axis=0).any()}
 
     known = contents(seen)

@@ -82,8 +82,7 @@ STATED: dict[str, type] = {
     **dict.fromkeys(("width", "depth", "degree", "dimension", "friction_width", "iterations"), int),
     **dict.fromkeys(("shared_trunk", "alike"), bool),
 }
-"""Types of the other keys; those that are not here are numbers. Scales and degrees are one for all coordinates, or one
-each."""
+"""Types of the other keys; those that are not here are numbers. Scales and degrees: one for all, or one each."""
 WITHOUT_ACTIVATION = ("trigonometric", "polynomial-hamiltonian")
 """Kinds that are no networks."""
 

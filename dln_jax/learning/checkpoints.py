@@ -70,6 +70,9 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         )
     if not isinstance(file_name, str) or Path(file_name).name != file_name:
         raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
+    model = manifest.get("model", {"kind": ""})
+    if not isinstance(model, dict) or not isinstance(model.get("kind"), str):
+        raise InputError(f"{path}: describes no model, but {reprlib.repr(model)}; {REMEDY}")
     return manifest
 
 
