@@ -67,6 +67,17 @@ def require_network(*, width: int, depth: int) -> None:
         raise InputError(f"depth is {depth}; expected at most {MOST_LAYERS} hidden layers")
 
 
+LARGEST_SEED = 2**32 - 1
+"""Of one that NumPy and JAX take, in 32 bits too."""
+
+
+def require_seed(seed: int, seeds: int = 1) -> None:
+    """Raises `InputError` unless `seed` and the `seeds` - 1 after it are whole numbers from 0 to 2³² - 1."""
+    if not 0 <= seed <= LARGEST_SEED - (seeds - 1):
+        counted = f" and {seeds - 1} after it" if seeds > 1 else ""
+        raise InputError(f"seed is {seed}{counted}; expected whole numbers from 0 to {LARGEST_SEED}")
+
+
 class Needs(NamedTuple):
     """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
 

@@ -64,7 +64,7 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
     """
     options = {"optimizer": "adam", "steps": 50} if quick else {}
     trained = train(problem, description_of(problem, "hnn"), seed=0, **options)
-    energy = build_phase(trained.description).apply(trained.fits[-1].parameters).energy
+    energy = build_phase(trained.description).apply(trained.result.parameters).energy
     assert energy is not None
     return energy
 

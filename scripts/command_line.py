@@ -29,6 +29,8 @@ CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
 PLACES = ("out", "resume", "figures", "low_latency")
 """Arguments that do not decide the result."""
+CHANGEABLE = ("seconds",)
+"""Arguments that may be given anew to --resume."""
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "two-link-arm": two_link_arm,
@@ -110,10 +112,11 @@ def with_stored_arguments(given: Arguments) -> Arguments:
     unset = stored_arguments(type(given)())
     stored = checked_arguments(folder / CONFIG, type(given), unset)
     for key, value in stored_arguments(given).items():
-        if value not in (stored[key], unset[key]):
+        if key not in CHANGEABLE and value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
             raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
     hints = get_type_hints(type(given))
+    stored |= {key: getattr(given, key) for key in CHANGEABLE if getattr(given, key, None) is not None}
     for key, value in stored.items():
         if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
             stored[key] = Path(value)

@@ -136,9 +136,10 @@ def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[s
     test = task.sets.test
     write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted))
     if training.history and task.kind != "trigonometric":
-        error = "torque MSE" if task.objective.selects_by == "torque" else "error (normalised)"
+        torque = task.objective.selects_by == "torque"
+        units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
-        write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, error=error))
+        write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, **units))
     if task.scene is not None and task.scene.tip is not None:
         paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
         write_figure(folder / "tip_paths.png", paths)

@@ -1,6 +1,5 @@
 """What train_delan and train_hnn share: from a command line to a trained model of dynamics in a run folder."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,17 +16,20 @@ from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.residuals import TORQUE, Objective
 from dln_jax.learning.runs import Progress, Stop, Training
-from dln_jax.learning.train import Settings, automatic_optimizer, check, train, validation_errors
+from dln_jax.learning.train import Settings, automatic_optimizer, check, check_start, train, validation_errors
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.types import InputError, Needs, require_positive, require_seed
 from scripts.command_line import needs_from_option, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
 from scripts.low_latency_calls import low_latency_metrics
+from scripts.options import refuse_given, resolved
 from scripts.progress import progress
 
+OF_NETWORKS = ("width", "depth", "activation")
+OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
 
 
@@ -51,31 +53,32 @@ class Arguments:
     gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
     width: int | None = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
-    depth: int = 2
-    """Hidden layers."""
-    activation: str = "tanh"
-    """Of the hidden layers: tanh, softplus, silu, gelu, sin or cos."""
-    degree: int = 1
-    """trigonometric: degree of the polynomials in each joint."""
+    depth: int | None = None
+    """Hidden layers (default: 2)."""
+    activation: str | None = None
+    """Of the hidden layers: tanh, softplus, silu, gelu, sin or cos (default: tanh)."""
+    degree: int | None = None
+    """trigonometric: degree of the polynomials in each joint (default: 1)."""
     steps: int | None = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
     seconds: float | None = None
-    """gauss-newton: seconds after which to stop, compilation included (default: no limit)."""
-    batch: int = 512
-    """adam: samples per step."""
-    learning_rate: float = 5e-3
-    """adam: peak of the warm-up and cosine schedule."""
-    weight_decay: float = 1e-5
-    """adam: decoupled weight decay."""
-    patience: int = 10_000
-    """adam: steps without a better validation error after which training stops."""
+    """Seconds of training after which to stop and keep the best so far, compilation included (default: no limit). At
+    least a few iterations are done. With --resume they count anew, and another number may be given."""
+    batch: int | None = None
+    """adam: samples per step (default: 512)."""
+    learning_rate: float | None = None
+    """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
+    weight_decay: float | None = None
+    """adam: decoupled weight decay (default: 0.00001)."""
+    patience: int | None = None
+    """adam: steps without a better validation error after which training stops (default: 10000)."""
     precision: Literal["f32", "f64"] | None = None
     """Floating-point type of the model and its training (default: f64; f32 for adam)."""
     target: float | None = None
     """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
     from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
     seed: int = 0
-    """Of the initial parameters, the shuffling and the validation split."""
+    """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
     out: Path | None = None
@@ -108,6 +111,8 @@ def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> 
         task, training = grow_to_target(task, given.target, folder, console, resume=given.resume)
     else:
         training = fit(task, given, folder)
+    if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
+        raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
     chosen, best = best_seed(training, given.seeds)
     save_model(folder, task.description, chosen)
     metrics = evaluate(folder, task, training, seeds=given.seeds, draw=given.figures)
@@ -145,6 +150,8 @@ def prepare(given: Arguments, kinds: dict[str, str]) -> Task:
     objective = objective_of(kind, sets.train)
     description, settings, reason = model_and_settings(given, kind, sets, needs, objective)
     check(sets, settings, objective)
+    if kind != "trigonometric":
+        check_start(build(description), sets, settings, objective)
     return Task(name, kind, sets, scene, needs, origin, description, objective, settings, reason)
 
 
@@ -152,31 +159,47 @@ def model_and_settings(
     given: Arguments, kind: str, sets: Split, needs: Needs, objective: Objective
 ) -> tuple[dict[str, Any], Settings, str]:
     """Description of the model, how to train it, and why by that optimiser."""
-    require_positive(depth=given.depth, seeds=given.seeds)
-    if given.target is not None and (kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1):
-        raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
-    if given.target is not None:
-        require_positive(target=given.target)
-    width = given.width if given.width is not None else default_width(kind, given.optimizer)
-    require_positive(width=width)
+    check_options(given, kind)
     precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
-    network = {"width": width, "depth": given.depth, "activation": given.activation}
-    keywords = {"degree": given.degree} if kind == "trigonometric" else network
+    if kind == "trigonometric":
+        keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
+        description = describe(kind, sets.train, needs, precision=precision, **keywords)
+        return description, Settings(precision=precision, seed=given.seed), ""
+    keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
+    require_positive(width=keywords["width"], depth=keywords["depth"])
     description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    model = build(description)
     optimizer, reason = given.optimizer, ""
     if optimizer == "auto":
-        optimizer, reason = automatic_optimizer(build(description), sets, objective)
+        optimizer, reason = automatic_optimizer(model, sets, objective)
         precision = given.precision or ("f32" if optimizer == "adam" else "f64")
         description["precision"] = precision
-    given_as_is = {field: getattr(given, field) for field in Settings._fields if hasattr(given, field)}
-    stated = {
-        "optimizer": optimizer,
-        "precision": precision,
-        "steps": given.steps if given.steps is not None else DEFAULT_STEPS[optimizer],
-        "target": given.target or 0.0,
-        "seconds": given.seconds if given.seconds is not None else math.inf,
-    }
-    return description, Settings(**{**given_as_is, **stated}), reason
+    if optimizer == "gauss-newton":
+        chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
+        refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
+    defaults = {name: Settings._field_defaults[name] for name in (*OF_ADAM, "seconds", "target")}
+    numbers = resolved(given, {**defaults, "steps": DEFAULT_STEPS[optimizer]})
+    return description, Settings(optimizer=optimizer, precision=precision, seed=given.seed, **numbers), reason
+
+
+def check_options(given: Arguments, kind: str) -> None:
+    """Refuses options that the model does not read."""
+    require_positive(seeds=given.seeds)
+    require_seed(given.seed, given.seeds)
+    if kind == "trigonometric":
+        if given.seeds > 1:
+            raise InputError(f"--seeds is {given.seeds}, but one least-squares problem has no seeds; leave it out")
+        names = (*OF_NETWORKS, *OF_ADAM, "steps", "seconds", "target")
+        refuse_given(given, names, "for networks; the trigonometric model is one least-squares problem")
+        if given.optimizer != "auto":
+            raise InputError("the trigonometric model is one least-squares problem; leave --optimizer out")
+        return
+    refuse_given(given, ["degree"], "for the trigonometric model")
+    if given.target is not None:
+        if kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1:
+            raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
+        refuse_given(given, ["width", "depth"], "what --target grows")
+        require_positive(target=given.target)
 
 
 def default_width(kind: str, optimizer: str) -> int:
@@ -252,7 +275,7 @@ def warn(console: Console, task: Task, training: Training, folder: Path) -> None
     if training.stop.reason == "no improvement":
         console.print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
     if training.stop.reason == "time":
-        console.print(f"stopped after --seconds, at step {training.stop.step}")
+        console.print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
     if training.stop.reason == "not finite":
         remedy = (
             "lower --learning-rate or use --precision f64" if task.settings.optimizer == "adam" else "check the data"

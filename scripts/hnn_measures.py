@@ -24,15 +24,15 @@ class Seen(NamedTuple):
 
 def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen]:
     """Errors and times of one run, and what it predicts."""
-    model, parameters = build_phase(trained.description), trained.fits[-1].parameters
+    model, parameters = build_phase(trained.description), trained.result.parameters
     predicted = [predict(model, parameters, true.q[:, 0], true.p[:, 0], true.t) for true in problem.truth]
     numbers = motion_errors(predicted, problem.truth, problem.energy, published_energy=problem.published_energy)
     if problem.train is not None and problem.test is not None:
         numbers["train_loss"] = field_errors(model, parameters, problem.train)["loss"]
         tested = field_errors(model, parameters, problem.test)
         numbers |= {"test_loss": tested["loss"], "clean_field_mse": tested["clean_field_mse"]}
-    numbers["train_seconds"] = sum(fit.train_seconds for fit in trained.fits)
-    numbers["compile_seconds"] = sum(fit.compile_seconds for fit in trained.fits)
+    numbers["train_seconds"] = sum(fit.train_seconds for fit in trained.fits.values())
+    numbers["compile_seconds"] = sum(fit.compile_seconds for fit in trained.fits.values())
     numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
     return numbers, Seen(predicted[0], functools.partial(field_rates, model, parameters))
 

@@ -6,6 +6,8 @@ alone. Measurements have no rates, only finite differences for a first fit: the 
 """
 
 import json
+import math
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,10 +16,11 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import PER_SAMPLE
 from dln_jax.deploy.phase_kinds import build_phase, describe_phase
-from dln_jax.learning import trajectory_matching
+from dln_jax.learning import field_matching, trajectory_matching
 from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
 from dln_jax.learning.growth import grow
-from dln_jax.learning.runs import Checkpoint, Report, Training, fingerprint, silent
+from dln_jax.learning.magnitudes import spread
+from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, fingerprint, one_after_the_other, silent
 from dln_jax.learning.second_order import Budget
 from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories
 from dln_jax.types import InputError
@@ -37,6 +40,10 @@ KINDS = {
     "baseline": "phase-network",
 }
 DEGREES = range(2, 7)
+RATES, MOTIONS = "rates", "motions"
+"""The stages of a training."""
+LEARNING_RATE = 5e-3
+"""Of Adam."""
 VALIDATION_SHARE = 0.15
 """Of the trajectories for training."""
 
@@ -56,7 +63,7 @@ class Recipe(NamedTuple):
     """Iterations of Gauss-Newton on rates."""
     samples: int
     seconds: float
-    """At most, of either fit, compilation included."""
+    """At most, of both fits together, compilation included: the limit that `hnn_table` states, and nothing else has."""
     trajectory_steps: int = 0
     """Iterations of Gauss-Newton on trajectories, afterwards."""
     window: int = 0
@@ -94,8 +101,22 @@ class Trained(NamedTuple):
 
     description: dict[str, Any]
     """For `dln_jax.deploy.phase_kinds.build_phase`."""
-    fits: list[Training]
-    """One after the other; the last one's parameters are the result."""
+    fits: dict[str, Training]
+    """By stage, one after the other; the last one's parameters are the result."""
+    stopped: str = ""
+    """Why a stage was left out, or ended before its time; empty where all went well."""
+    diverged: bool = False
+    """Whether that is a loss that stopped being finite."""
+
+    @property
+    def result(self) -> Training:
+        """The last fit."""
+        return list(self.fits.values())[-1]
+
+    @property
+    def history(self) -> list[Progress]:
+        """Of all stages; their steps are counted on."""
+        return one_after_the_other(fit.history for fit in self.fits.values())
 
 
 def models_of(task: str) -> tuple[str, ...]:
@@ -132,6 +153,49 @@ def polynomial_degree(problem: Problem) -> int:
     return grow(DEGREES, fit)[0].candidate
 
 
+def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
+    """The stages of a training that take steps, and how many each."""
+    recipe = RECIPES[problem.name]
+    rates = {} if description["kind"] == KINDS[POLYNOMIAL] else {RATES: steps or recipe.steps}
+    return {**rates, **({MOTIONS: steps or recipe.trajectory_steps} if recipe.trajectory_steps else {})}
+
+
+def settings_of(
+    problem: Problem,
+    description: dict[str, Any],
+    *,
+    seed: int,
+    optimizer: str = "gauss-newton",
+    steps: int | None = None,
+    learning_rate: float = LEARNING_RATE,
+    seconds: float = math.inf,
+) -> Settings:
+    """How the rates are fitted; `check` and `train` take it."""
+    recipe = RECIPES[problem.name]
+    return Settings(
+        optimizer=optimizer,
+        precision=description["precision"],
+        steps=steps or recipe.steps,
+        samples=recipe.samples,
+        seconds=seconds,
+        learning_rate=learning_rate,
+        validation_share=VALIDATION_SHARE,
+        seed=seed,
+    )
+
+
+def check(problem: Problem, description: dict[str, Any], settings: Settings) -> None:
+    """Raises `InputError` for all that `train` would refuse."""
+    recipe = RECIPES[problem.name]
+    field_matching.check(problem.fitted, settings)
+    field_matching.check_start(build_phase(description), problem.fitted, settings)
+    if recipe.trajectory_steps:
+        parts = hold_out(problem.fitted, VALIDATION_SHARE, settings.seed)
+        weights = recipe.weights or deviations(parts[0])
+        windows, validation = (cut_windows(part, recipe.window) for part in parts)
+        trajectory_matching.check(windows, validation, weights)
+
+
 def train(
     problem: Problem,
     description: dict[str, Any],
@@ -139,22 +203,27 @@ def train(
     seed: int,
     optimizer: str = "gauss-newton",
     steps: int | None = None,
-    learning_rate: float = 5e-3,
+    learning_rate: float = LEARNING_RATE,
+    seconds: float = math.inf,
     directory: Path | None = None,
     resume: bool = False,
     report: Report = silent,
 ) -> Trained:
-    """Fits a model to rates, and then to trajectories where the recipe says so."""
+    """Fits a model to rates, and then to trajectories where the recipe says so.
+
+    `seconds` are those of both, compilation included. Where they are over after the rates, or the fit of motions is not
+    finite from its start, the fit of rates is the result.
+    """
+    began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build_phase(description)
-    settings = Settings(
-        optimizer=optimizer,
-        precision=description["precision"],
-        steps=steps or recipe.steps,
-        samples=recipe.samples,
-        seconds=recipe.seconds,
-        learning_rate=learning_rate,
-        validation_share=VALIDATION_SHARE,
+    settings = settings_of(
+        problem,
+        description,
         seed=seed,
+        optimizer=optimizer,
+        steps=steps,
+        learning_rate=learning_rate,
+        seconds=seconds,
     )
     # As JSON reads it back, lists for tuples, so that a resumed run is recognised.
     stated = json.loads(json.dumps({**settings._asdict(), "model": description, "seconds": None}))
@@ -166,32 +235,57 @@ def train(
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     if description["kind"] == KINDS[POLYNOMIAL]:
-        fits = [match_linear(model, parts[0], validation=parts[1])[0]]
+        rates = match_linear(model, parts[0], validation=parts[1])[0]
     else:
-        fits = [match_field(model, problem.fitted, settings, checkpoint=checkpoint("rates"), report=report)]
-    if recipe.trajectory_steps:
-        windows = (cut_windows(part, recipe.window) for part in parts)
-        first_order = trajectory_matching.Adam(learning_rate=learning_rate, seed=seed)
-        fits.append(
-            match_trajectories(
-                model,
-                fits[-1].parameters,
-                *windows,
-                weights=recipe.weights or deviations(parts[0]),
-                budget=Budget(steps or recipe.trajectory_steps, seconds=recipe.seconds),
-                adam=first_order if optimizer == "adam" else None,
-                substeps=recipe.substeps,
-                checkpoint=checkpoint("trajectories"),
-                report=report,
-            )
-        )
-    return Trained(description, fits)
+        at_rates = _of_stage(RATES, report)
+        rates = match_field(model, problem.fitted, settings, checkpoint=checkpoint("rates"), report=at_rates)
+    fits = {RATES: _named(RATES, rates)}
+    left = seconds - (time.perf_counter() - began)
+    if not recipe.trajectory_steps or rates.stop.reason == "not finite":
+        return Trained(description, fits, _ending(RATES, rates), rates.stop.reason == "not finite")
+    if rates.stop.reason == "time" or left <= 0:
+        return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
+    windows = (cut_windows(part, recipe.window) for part in parts)
+    first_order = trajectory_matching.Adam(learning_rate=learning_rate, seed=seed)
+    motions = match_trajectories(
+        model,
+        rates.parameters,
+        *windows,
+        weights=recipe.weights or deviations(parts[0]),
+        budget=Budget(steps or recipe.trajectory_steps, seconds=left),
+        adam=first_order if optimizer == "adam" else None,
+        substeps=recipe.substeps,
+        checkpoint=checkpoint("trajectories"),
+        report=_of_stage(MOTIONS, report),
+    )
+    if motions.stop.step and np.isfinite(motions.validation):
+        fits[MOTIONS] = _named(MOTIONS, motions)
+    return Trained(description, fits, _ending(MOTIONS, motions), motions.stop.reason == "not finite")
+
+
+def _of_stage(stage: str, report: Report) -> Report:
+    return lambda at: report(at._replace(stage=stage))
+
+
+def _named(stage: str, training: Training) -> Training:
+    return training._replace(history=[at._replace(stage=stage) for at in training.history])
+
+
+def _ending(stage: str, training: Training) -> str:
+    """What is to be said of how a fit ended."""
+    at = f"after step {training.stop.step} of the fit of {stage}"
+    if training.stop.reason == "time":
+        return f"out of time {at}: kept is the best so far"
+    if training.stop.reason == "not finite":
+        return f"the loss stopped being finite {at}; lower --learning-rate or look for very large numbers in the data"
+    return ""
 
 
 def deviations(data: Trajectories) -> Weights:
     """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
     assert data.p is not None
-    spread = [np.where(array.std(axis=0) > 0, array.std(axis=0), 1.0) for array in (data.q, data.p)]
+    sizes = [spread(name, array) for name, array in (("q", data.q), ("p", data.p))]
+    sizes = [np.where(size > 0, size, 1.0) for size in sizes]
     if "qd" in data.estimated and np.array_equal(data.p, data.qd):
-        spread[1] = ANCHOR * spread[1]
-    return Weights(state=tuple(float(size) for size in np.concatenate(spread)))
+        sizes[1] = ANCHOR * sizes[1]
+    return Weights(state=tuple(float(size) for size in np.concatenate(sizes)))

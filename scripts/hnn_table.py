@@ -20,7 +20,7 @@ from scripts import pixel_task as pixels
 from scripts.arguments import Unstated, choice, names_in
 from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
-from scripts.hnn_models import description_of, models_of, train
+from scripts.hnn_models import RECIPES, description_of, models_of, train
 from scripts.hnn_published import PIXELS, markdown, rows_of
 from scripts.hnn_tasks import REAL, problem_of
 from scripts.jobs import JOBS, stored_jobs
@@ -83,6 +83,8 @@ def measure_into(folder: Path, given: Arguments, names: list[str], console: Cons
         seeds=list(range(given.seeds)),
         selection="parameters by validation trajectories alone; sizes and budgets are the same for all seeds",
         data="published protocols, seed 0",
+        limits="seconds of a training, compilation included: "
+        + ", ".join(f"{name} {RECIPES[name].seconds:g}" for name in names if name != PIXELS),
         statistics="medians over seeds; compilation is apart from train_seconds",
     )
     write_report(folder / "report.json", rows, facts)
@@ -118,7 +120,10 @@ def phase_task(name: str, given: Arguments, folder: Path) -> dict[str, dict[str,
         description = description_of(problem, kind)
         # Each seed pays for its own compilation, as a user does.
         runs = [
-            measured_once(problem, train(problem, description, seed=seed, steps=given.steps))
+            measured_once(
+                problem,
+                train(problem, description, seed=seed, steps=given.steps, seconds=RECIPES[name].seconds),
+            )
             for seed in range(given.seeds)
         ]
         found[kind], seen[kind] = medians([numbers for numbers, _ in runs]), runs[0][1]

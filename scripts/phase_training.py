@@ -1,6 +1,8 @@
 """What `train_hnn --task` does: from a command line to a trained model of a phase space in a run folder."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from dln_jax.data.hamiltonian_tasks import PROTOCOLS
 from dln_jax.deploy.load import load_phase_field, save_model
 from dln_jax.deploy.phase_kinds import build_phase
 from dln_jax.evaluation import animations, figures
@@ -15,105 +18,142 @@ from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.phase_figures import TRUTH
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Progress
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, require_positive, require_seed
 from scripts.command_line import needs_from_option, stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
-from scripts.hnn_models import KINDS, POLYNOMIAL, RECIPES, description_of, train
+from scripts.hnn_models import (
+    KINDS,
+    LEARNING_RATE,
+    MOTIONS,
+    POLYNOMIAL,
+    RATES,
+    Trained,
+    check,
+    description_of,
+    settings_of,
+    stages_of,
+    train,
+)
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
 from scripts.low_latency_calls import low_latency_metrics
+from scripts.options import refuse_given, resolved
 from scripts.progress import progress
 
 if TYPE_CHECKING:
     from scripts.train_hnn import Arguments
 
 GIF_FRAMES = 80
-UNSUITABLE = ("test", "scene", "target")
+LOSSES = {
+    RATES: "rates: mean square error of (qd, pd)",
+    MOTIONS: "motions: mean square error of (q, p) over its weight",
+}
+"""What each stage makes small."""
+OF_TORQUES = ("test", "scene", "target", "batch", "weight_decay", "patience")
 """Options of models of torques, which a task decides itself."""
 
 
 def run_task(given: "Arguments") -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
-    check(given)
+    check_options(given)
     needs = None if given.needs is None else needs_from_option(given.needs)
     problem = problem_of(given.task or "", trajectories=given.trajectories, data=given.data, needs=needs)
-    size: dict[str, Any] = {"width": given.width, "depth": given.depth if given.depth != 2 else None}
-    size["degree"] = given.degree if given.model == POLYNOMIAL and given.degree > 1 else None
-    description = description_of(problem, given.model, activation=given.activation, **size)
-    build_phase(description)  # refuses what does not suit, before anything is written
+    size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
+    description = description_of(problem, given.model, **size)
+    check_suited(given, problem, description)
+    options: dict[str, Any] = {
+        "seed": given.seed,
+        "optimizer": "adam" if given.optimizer == "adam" else "gauss-newton",
+        "steps": given.steps,
+        **resolved(given, {"learning_rate": LEARNING_RATE, "seconds": math.inf}),
+    }
+    check(problem, description, settings_of(problem, description, **options))
     with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
-        train_into(folder, given, problem, description, console)
+        train_into(folder, given, problem, description, options, console)
 
 
 def train_into(
-    folder: Path, given: "Arguments", problem: Problem, description: dict[str, Any], console: Console
+    folder: Path,
+    given: "Arguments",
+    problem: Problem,
+    description: dict[str, Any],
+    options: dict[str, Any],
+    console: Console,
 ) -> None:
     """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, {**stored_arguments(given), "chosen": description})
     announce(console, problem, description)
-    with progress(total_steps(problem, description, given.steps)) as show:
-        trained = train(
-            problem,
-            description,
-            seed=given.seed,
-            optimizer="adam" if given.optimizer == "adam" else "gauss-newton",
-            steps=given.steps,
-            learning_rate=given.learning_rate,
-            directory=folder,
-            resume=given.resume,
-            report=shown_by(show),
-        )
-    if not np.isfinite(trained.fits[-1].validation):
-        raise InputError(f"the loss is not finite; {folder} holds no model: lower --learning-rate or check the data")
-    save_model(folder, description, trained.fits[-1].parameters)
+    with stage_progress(stages_of(problem, description, given.steps)) as report:
+        trained = train(problem, description, **options, directory=folder, resume=given.resume, report=report)
+    if not np.isfinite(trained.result.validation):
+        raise InputError(f"{trained.stopped}; {folder} holds no model")
+    save_model(folder, description, trained.result.parameters)
     numbers, seen = measured_once(problem, trained)
-    metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.fits[-1].validation)}
+    metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.result.validation)}
     if given.low_latency:
         truth = problem.truth[0]
         metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
     write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
     if given.figures:
-        draw(folder, problem, description["kind"], seen, trained.fits[-1].history)
+        draw(folder, problem, description["kind"], seen, trained)
     console.print(results_table(metrics, problem))
     console.print(f"run folder: {folder}")
+    if trained.diverged:
+        raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
+    if trained.stopped:
+        console.print(trained.stopped)
 
 
-def check(given: "Arguments") -> None:
-    """Refuses what a task does not take, before anything is written."""
-    require_positive(**{name: getattr(given, name) for name in ("depth", "learning_rate")})
-    for name in ("width", "steps", "trajectories"):
+def check_options(given: "Arguments") -> None:
+    """Refuses what no task takes, before anything is written."""
+    require_seed(given.seed)
+    for name in ("width", "depth", "degree", "steps", "trajectories", "seconds"):
         if getattr(given, name) is not None:
             require_positive(**{name: getattr(given, name)})
-    for name in UNSUITABLE:
-        if getattr(given, name) is not None:
-            raise InputError(f"--{name} is for models of torques; leave it out with --task")
+    refuse_given(given, OF_TORQUES, "for models of torques, not for --task")
     if given.precision == "f32":
         raise InputError("tasks are fitted in f64; leave --precision out")
     if given.seeds != 1:
         raise InputError("a task trains one seed at a time; scripts.hnn_table measures several")
-    if given.optimizer == "adam" and given.model == POLYNOMIAL:
-        raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
+    if given.optimizer != "adam":
+        refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
+    if given.model != POLYNOMIAL:
+        refuse_given(given, ["degree"], "for the polynomial model")
 
 
-def total_steps(problem: Problem, description: dict[str, Any], steps: int | None) -> int:
-    """Iterations of all fits."""
-    recipe = RECIPES[problem.name]
-    rates = 0 if description["kind"] == KINDS[POLYNOMIAL] else steps or recipe.steps
-    return max(rates + (steps or recipe.trajectory_steps if recipe.trajectory_steps else 0), 1)
+def check_suited(given: "Arguments", problem: Problem, description: dict[str, Any]) -> None:
+    """Refuses what this task or its model does not take, before anything is written."""
+    build_phase(description)
+    if problem.name in PROTOCOLS:
+        refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
+    else:
+        refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
+    if problem.name == REAL:
+        refuse_given(given, ["needs"], "what the task decides itself")
+    if description["kind"] == KINDS[POLYNOMIAL]:
+        linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
+        refuse_given(given, ["width", "depth", "activation"], linear)
+        if MOTIONS not in stages_of(problem, description):
+            refuse_given(given, ["steps", "seconds"], linear)
+        if given.optimizer == "adam":
+            raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
 
 
-def shown_by(show: Callable[[int, str], None]) -> Callable[[Progress], None]:
-    """Progress of several fits, one after the other, as one count."""
-    before, last = 0, 0
+@contextmanager
+def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None]]:
+    """Yields `report(at)`: the stages, one after the other, each with a count of its own."""
+    with ExitStack() as shown:
+        current = next(iter(stages), "")
+        show = shown.enter_context(progress(stages[current])) if stages else None
 
-    def report(at: Progress) -> None:
-        nonlocal before, last
-        if at.step < last:
-            before += last
-        last = at.step
-        show(before + at.step, f"loss {at.loss:.2e}  validation {at.validation:.2e}")
+        def report(at: Progress) -> None:
+            nonlocal current, show
+            if show is None or at.stage != current:
+                shown.close()
+                current, show = at.stage, shown.enter_context(progress(stages[at.stage]))
+            show(at.step, f"{at.stage}: loss {at.loss:.2e}  validation {at.validation:.2e}")
 
-    return report
+        yield report
 
 
 def announce(console: Console, problem: Problem, description: dict[str, Any]) -> None:
@@ -139,16 +179,19 @@ def latency_of(folder: Path, problem: Problem) -> dict[str, float]:
     return {"one_step_p50_us": found.p50_us, "one_step_p99_us": found.p99_us}
 
 
-def draw(folder: Path, problem: Problem, kind: str, seen: Seen, history: list[Progress]) -> None:
+def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained) -> None:
     """Writes what there is to draw."""
     name = "baseline" if kind == KINDS["baseline"] else "hnn"
     write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
     truth = problem.truth[0]
     stride = max(1, len(truth.t) // GIF_FRAMES)
     animations.write_motion_gif(folder / "motions.gif", {TRUTH: truth, name: seen.motions}, stride=stride)
+    history = trained.history
     if len(history) > 1:
-        best = min(history, key=lambda at: at.validation).step
-        write_figure(folder / "training.png", figures.training_curve(history, best_step=best, error="error (weighted)"))
+        best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
+        named = [at._replace(stage=LOSSES[at.stage]) for at in history]
+        words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
+        write_figure(folder / "training.png", figures.training_curve(named, best_step=best, **words))
 
 
 UNITS = {

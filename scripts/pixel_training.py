@@ -11,7 +11,7 @@ from dln_jax.deploy.load_latent import save_latent
 from dln_jax.evaluation import figures
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Checkpoint, Progress, fingerprint
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, require_positive, require_seed
 from scripts import pixel_task
 from scripts.command_line import stored_arguments
 from scripts.progress import progress
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scripts.train_hnn import Arguments
 
 KINDS = {"auto": "hnn", "black-box": "hnn", "baseline": "baseline"}
-TAKEN = ("model", "task", "trajectories", "steps", "seed", "out", "resume", "figures", "learning_rate")
+TAKEN = ("model", "task", "trajectories", "steps", "seed", "out", "resume", "figures")
 """Options that the task reads."""
 
 
@@ -58,7 +58,8 @@ def train_into(folder: Path, given: "Arguments", kind: str, data: FrameSplit, co
         pixel_task.draw_pixels({kind: seen}, data, folder)
         history = seen.history
         best = min(history, key=lambda at: at.validation).step
-        write_figure(folder / "training.png", figures.training_curve(history, best_step=best, error="loss"))
+        words = {"error": "loss", "loss": "training loss", "unit": "loss"}
+        write_figure(folder / "training.png", figures.training_curve(history, best_step=best, **words))
     for name, value in numbers.items():
         console.print(f"{name.replace('_', ' '):32s} {value:10.4g}")
     console.print(f"run folder: {folder}")
@@ -72,6 +73,7 @@ def check(given: "Arguments") -> None:
     for name, value in vars(given).items():
         if name not in TAKEN and value != getattr(unset, name):
             raise InputError(f"--{name.replace('_', '-')} is not for pixels, whose networks are settled; leave it out")
+    require_seed(given.seed)
     for name in ("steps", "trajectories"):
         if getattr(given, name) is not None:
             require_positive(**{name: getattr(given, name)})

@@ -18,6 +18,7 @@ from typing import Literal
 from scripts import dynamics_training, phase_training, pixel_training
 from scripts.command_line import run, with_stored_arguments
 from scripts.hnn_published import PIXELS
+from scripts.options import refuse_given
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 
@@ -39,6 +40,7 @@ def main(given: Arguments) -> None:
     if given.resume:
         given = with_stored_arguments(given)
     if given.task is None:
+        refuse_given(given, ["trajectories"], "for a --task")
         dynamics_training.run_training(given, "train_hnn", KINDS)
     elif given.task == PIXELS:
         pixel_training.run_pixels(given)

@@ -175,6 +175,11 @@ def positions(workplace):
     np.savez("positions.npz", t=np.concatenate(parts), q=np.concatenate(q)[:, None], trajectory=index)
     forced = {"q": np.cos(t)[:, None], "tau": np.ones((40, 1))}
     np.savez("forced.npz", t=t, trajectory=np.zeros(40), **forced)
+    marked = np.where(np.arange(120)[:, None] == 9, 1e308, np.cos(np.arange(120.0))[:, None])
+    same = {"t": np.tile(t, 3), "trajectory": np.repeat(range(3), 40)}
+    np.savez("marked.npz", q=marked, qd=marked, qdd=marked, **same)
+    alone = np.random.default_rng(0).normal(size=(12, 1))
+    np.savez("points.npz", q=alone, qd=alone, qdd=alone, t=np.zeros(12), trajectory=np.arange(12))
     return workplace / "positions.npz"
 
 
@@ -209,12 +214,40 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ((*OWN, "--model", "pairwise"), "positions of bodies"),
         ((*OWN, "--precision", "f32"), "leave --precision out"),
         ((*OWN, "--seeds", "3"), "hnn_table measures several"),
-        ((*OWN, "--target", "1e-6"), "leave it out with --task"),
+        ((*OWN, "--target", "1e-6"), "--target is for models of torques"),
         ((*OWN, "--steps", "0"), "steps is 0"),
         ((*OWN[:4], "--needs", "{"), "--needs is not JSON"),
         ((*OWN[:4], "--needs", '{"joints": ["revolute", "revolute"]}'), "have 2 joints"),
         (("--model", "baseline"), "expected one of auto, structured, black-box"),
+        (("--trajectories", "5"), "--trajectories is for a --task"),
+        ((*OWN, "--seed", "-1"), "seed is -1"),
+        ((*OWN, "--seconds", "nan"), "seconds is nan"),
+        ((*OWN, "--batch", "-1"), "--batch is for models of torques"),
+        ((*OWN, "--patience", "4"), "--patience is for models of torques"),
+        ((*OWN, "--weight-decay", "nan"), "--weight-decay is for models of torques"),
+        ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
+        ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "learning_rate is nan"),
+        ((*OWN, "--degree", "3"), "--degree is for the polynomial model"),
+        ((*OWN, "--model", "polynomial", "--width", "3"), "--width is for networks"),
+        ((*OWN, "--trajectories", "3"), "--trajectories is for generated data"),
+        (("--task", "spring", "--needs", '{"joints": ["prismatic"]}'), "--needs is what the task 'spring' decides"),
+        (("--task", "measured", "--data", "marked.npz"), "q has numbers of up to 1.0e+308"),
+        (("--task", "measured", "--data", "points.npz"), "no trajectory has two samples"),
     ]
     for number, (options, message) in enumerate(cases):
         assert message in refused(capsys, train_hnn, *options, "--out", f"none-{number}")
         assert not (positions.parent / f"none-{number}").exists()
+
+
+def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch):
+    """A recipe's time is that of the table; out of time, the fit of rates is the result, in a folder like any other."""
+    slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
+    monkeypatch.setattr(hnn_models, "RECIPES", slow)
+    options = (*OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out")
+    command(train_hnn, *options, "patient")
+    out = capsys.readouterr().out
+    assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out and "out of time" not in out
+    command(train_hnn, *options, "hurried", "--seconds", "1e-6")
+    assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
+    assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
+    assert load_phase_field(positions.parent / "hurried").energy is not None

@@ -154,6 +154,20 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
     assert np.isfinite(tau).all()
 
 
+@pytest.mark.parametrize("optimizer", ["adam", "gauss-newton"])
+def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys, optimizer):
+    options = ("--optimizer", optimizer, "--width", "3", "--depth", "1", "--no-figures", "--scene", "pendulum")
+    folder = workplace / f"late-{optimizer}"
+    command(train_delan, *options, "--steps", "400", "--seconds", "1e-6", "--out", folder)
+    assert "out of time at step" in capsys.readouterr().out
+    early = json.loads((folder / "metrics.json").read_text())
+    assert 0 < early["best_step"] == early["steps"] < 400
+    command(train_delan, "--out", folder, "--resume", "--no-figures", "--seconds", "2e-6")
+    later = json.loads((folder / "metrics.json").read_text())
+    assert later["steps"] == 2 * early["steps"]
+    assert json.loads((folder / "config.json").read_text())["seconds"] == 2e-6
+
+
 def arrays(**changes):
     data = {
         "t": np.tile(np.arange(4.0), 5),
@@ -163,6 +177,9 @@ def arrays(**changes):
     }
     return {key: value for key, value in data.items() if value is not None}
 
+
+MARKED = np.where(np.arange(40).reshape(20, 2) == 7, 1e308, np.random.default_rng(1).normal(size=(20, 2)))
+"""A mark for a missing value among numbers of size one."""
 
 MISTAKES = {
     "missing file": (None, [], "no such file"),
@@ -179,6 +196,25 @@ MISTAKES = {
     "activation": (arrays(), ["--activation", "sigmoidal"], "tanh"),
     "steps": (arrays(), ["--steps", "0"], "steps is 0"),
     "width": (arrays(), ["--width", "-1"], "width is -1"),
+    "label without samples": (arrays(label=[*"abcdef"]), ["--test", "f"], "'f' has no samples"),
+    "negative seed": (arrays(), ["--seed", "-1"], "seed is -1"),
+    "large seed": (arrays(), ["--seed", "4294967295", "--seeds", "2"], "seed is 4294967295 and 1 after it"),
+    "activation of adam": (arrays(), ["--activation", "sigmoidal", "--optimizer", "adam"], "tanh"),
+    "mark for a missing torque": (arrays(tau=MARKED), [], "tau has numbers of up to 1.0e+308"),
+    "mark beyond single precision": (arrays(tau=1e-280 * MARKED), ["--optimizer", "adam"], "overflow in float32"),
+    "mark for a missing rate": (arrays(qd=1e-188 * MARKED), [], "the loss is not finite before training"),
+    "tiny torque": (arrays(tau=np.full((20, 2), 1e-170)), [], "squares vanish"),
+    "degree": (arrays(), ["--degree", "2"], "--degree is for the trigonometric model"),
+    "batch": (arrays(), ["--batch", "64"], "--batch is for adam, but auto chose gauss-newton"),
+    "patience": (arrays(), ["--patience", "3", "--optimizer", "gauss-newton"], "--patience is for adam"),
+    "batch of adam": (arrays(), ["--batch", "-1", "--optimizer", "adam"], "batch is -1"),
+    "rate": (arrays(), ["--learning-rate", "nan", "--optimizer", "adam"], "learning_rate is nan"),
+    "decay": (arrays(), ["--weight-decay", "inf", "--optimizer", "adam"], "weight_decay is inf"),
+    "seconds": (arrays(), ["--seconds", "nan"], "seconds is nan"),
+    "width of a linear model": (arrays(), ["--model", "trigonometric", "--width", "4"], "--width is for networks"),
+    "optimizer of a linear model": (arrays(), ["--model", "trigonometric", "--optimizer", "adam"], "least-squares"),
+    "seeds of a linear model": (arrays(), ["--model", "trigonometric", "--seeds", "2"], "has no seeds"),
+    "width of a target": (arrays(), ["--target", "1", "--width", "4"], "--width is what --target grows"),
 }
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_seed
 
 PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 
@@ -50,13 +50,17 @@ def split(
     seed from the rest, so that no choice made by validation has seen the test.
 
     Raises:
-        InputError: an unknown label, fewer than one trajectory left for training, or a test trajectory that is also
-            among the rest.
+        InputError: an unknown label or one without samples, fewer than one trajectory left for training, a test
+            trajectory that is also among the rest, or a seed out of range.
     """
+    require_seed(seed)
     present = np.unique(data.trajectory)
     test_indices = present[5::6] if test is None else label_indices(data, test)
     if test is None and len(present) < 6:
         test_indices = present[-1:]
+    empty = np.setdiff1d(test_indices, present)
+    if len(empty):
+        raise InputError(f"trajectory '{data.label[empty[0]]}' has no samples to test by; choose other test labels")
     rest = np.setdiff1d(present, test_indices)
     if len(rest) < 2 or len(test_indices) == 0:
         raise InputError(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.files import matches
 from dln_jax.learning.checkpoints import REMEDY
+from dln_jax.learning.magnitudes import spread
 from dln_jax.learning.residuals import BOTH_WAYS, CANONICAL, TORQUE, Objective
 from dln_jax.learning.runs import data_type
 from dln_jax.models.black_box import make_black_box_lagrangian
@@ -56,12 +57,16 @@ def objective_of(kind: str, data: Trajectories) -> Objective:
 
 
 def describe(kind: str, data: Trajectories, needs: Needs, *, precision: str, **keywords: Any) -> dict[str, Any]:
-    """The description of a model for these training data: typical sizes are theirs, to three digits."""
+    """The description of a model for these training data: typical sizes are theirs, to three digits.
+
+    Raises:
+        InputError: numbers so large or small that their squares are infinite or zero.
+    """
     scales = {}
     for name, key in KINDS[kind].scales.items():
         array = getattr(data, key)
         if array is not None:
-            deviation = array.std(axis=0)
+            deviation = spread(key, array)
             scales[name] = [float(f"{size:.3g}") if size > 0 else 1.0 for size in deviation]
     return {"kind": kind, "needs": needs._asdict(), "precision": precision, **keywords, **scales}
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.deploy.kinds import build_by
+from dln_jax.learning.magnitudes import spread
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
@@ -56,7 +57,8 @@ def describe_phase(
     """The description of a model for these training data: typical sizes are theirs, to three digits.
 
     Raises:
-        InputError: an unknown kind, or no momenta in the data where their size is needed.
+        InputError: an unknown kind, no momenta in the data where their size is needed, or numbers whose squares are
+            infinite or zero.
     """
     if kind not in PHASE_KINDS:
         raise InputError(f"model kind is {kind!r}; this release knows {', '.join(PHASE_KINDS)}")
@@ -65,7 +67,8 @@ def describe_phase(
     for name in PHASE_KINDS[kind].scales:
         if any(array is None for array in arrays[name]):
             raise InputError("the data have no momenta p and their rates pd; add them, or set p = qd per unit of mass")
-        size = float(np.concatenate([np.ravel(array) for array in arrays[name] if array is not None]).std())
+        numbers = np.concatenate([np.ravel(array) for array in arrays[name] if array is not None])[:, None]
+        size = float(spread("p" if name == "momentum_scale" else "qd or pd", numbers)[0])
         scales[name] = float(f"{size:.3g}") if size > 0 else 1.0
     return {"kind": kind, "needs": needs._asdict(), "precision": precision, **keywords, **scales}
 

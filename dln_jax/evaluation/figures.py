@@ -1,5 +1,6 @@
 """Figures of a trained model; each function returns a Matplotlib figure and touches no global state."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -57,24 +58,54 @@ def force_decomposition(
     return figure
 
 
-def training_curve(history: Sequence[Progress], *, best_step: int, error: str = "torque MSE") -> Figure:
+LEAST_SHARE = 0.2
+"""Of the steps, from which a stage's name is written above it, else upright."""
+
+
+def training_curve(
+    history: Sequence[Progress],
+    *,
+    best_step: int,
+    error: str = "torque MSE",
+    loss: str = "training loss (normalised)",
+    unit: str = "loss, or MSE in (N m)²",
+) -> Figure:
     """Training loss, validation error and test error against steps; the test error decided nothing.
 
-    Of several seeds the medians. `error` names what validation and test measure.
+    Of several seeds the medians. `error` and `loss` name what is measured, `unit` the axis. Stages are set apart by
+    lines and have their names; their curves are not connected, for what they measure may differ.
     """
     figure = _figure(7.0, 4.2)
     axis = figure.subplots()
-    steps = [progress.step for progress in history]
-    curves = (("loss", TRUTH, "training loss (normalised)"), ("validation", MODEL, f"validation {error}"))
-    for field, colour, label in (*curves, ("monitor", TEST, f"test {error}")):
-        values = [np.median(getattr(progress, field)) for progress in history]
-        if not np.isnan(values).all():  # no test is monitored
-            axis.semilogy(steps, values, color=colour, label=label)
+    stages = [list(ats) for _, ats in itertools.groupby(history, key=lambda at: at.stage)]
+    for number, stage in enumerate(stages):
+        steps = [at.step for at in stage]
+        curves = (("loss", "-", TRUTH, loss), ("validation", "--", MODEL, f"validation {error}"))
+        for field, style, colour, label in (*curves, ("monitor", "-", TEST, f"test {error}")):
+            values = [np.median(getattr(at, field)) for at in stage]
+            if not np.isnan(values).all():  # no test is monitored
+                marker = "." if len(stage) < 40 else ""
+                named = {"label": label} if number == 0 else {}
+                axis.semilogy(steps, values, style, marker=marker, markersize=4, color=colour, **named)
     axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
+    last = history[-1].step
+    axis.set_xlim(0, max(1.02 * last, 1))
+    starts = [0, *(stage[-1].step for stage in stages[:-1])]
+    lengths = np.diff([*starts, last])
+    upright = bool(np.any(lengths < LEAST_SHARE * last))
+    for start, length, stage in zip(starts, lengths, stages, strict=True):
+        if start:
+            axis.axvline(start, color="0.4", linewidth=0.8)
+        if upright:
+            place, style = (start, 0.98), {"rotation": 90.0, "ha": "left", "va": "top"}
+        else:
+            place, style = (start + length / 2, 1.02), {"rotation": 0.0, "ha": "center", "va": "bottom"}
+        name = axis.text(*place, stage[0].stage, transform=axis.get_xaxis_transform(), fontsize=8, color="0.3")
+        name.update(style)
     axis.set_xlabel("optimiser step")
-    axis.set_ylabel("loss, or MSE in (N m)²" if error == "torque MSE" else "loss")
+    axis.set_ylabel(unit)
     axis.grid(True, alpha=0.25)
-    axis.legend(frameon=False)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 

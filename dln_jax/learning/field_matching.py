@@ -24,14 +24,17 @@ from jaxtyping import Float
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.optimisers import adamw
-from dln_jax.learning.runs import Checkpoint, Progress, Report, Stop, Training, data_type, silent
+from dln_jax.learning.magnitudes import on_device, require_finite_start
+from dln_jax.learning.optimisers import adamw, check_adamw
+from dln_jax.learning.runs import Checkpoint, Progress, Report, Stop, Training, data_type, require_start, silent
 from dln_jax.learning.second_order import Budget, require_float64, train_second_order
 from dln_jax.models.model import Parameters
 from dln_jax.models.phase_field import PhaseModel
 from dln_jax.solvers import least_squares
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
+FIELD = ("q", "p", "qd", "pd")
+"""Arrays that a fit reads."""
 OPTIMIZERS = ("adam", "gauss-newton")
 
 
@@ -47,7 +50,7 @@ class Settings(NamedTuple):
     samples: int = 10_000
     """Samples to fit, drawn from the training trajectories where those have more."""
     seconds: float = math.inf
-    """After which Gauss-Newton stops, compilation included."""
+    """After which to stop, compilation included; looked at between dispatches, of which there is one at least."""
     batch: int = 512
     """Of Adam, like the learning rate."""
     learning_rate: float = 5e-3
@@ -61,8 +64,9 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
     """Training and validation trajectories, at least one of each.
 
     Raises:
-        InputError: fewer than two trajectories, or a share outside (0, 1).
+        InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
     """
+    require_seed(seed)
     present = np.unique(data.trajectory)
     if len(present) < 2:
         raise InputError(f"there are {len(present)} trajectories for training; expected at least 2, one to validate by")
@@ -85,6 +89,25 @@ def loss(model: PhaseModel, parameters: Parameters, arrays: tuple[Array, ...]) -
     return jnp.mean(jnp.sum(each**2, axis=1))
 
 
+def check(data: Trajectories, settings: Settings) -> None:
+    """Raises `InputError` for settings out of range, and for data that no field can be fitted to."""
+    require_positive(**{name: getattr(settings, name) for name in ("steps", "samples", "seconds", "batch")})
+    check_adamw(learning_rate=settings.learning_rate)
+    if settings.optimizer not in OPTIMIZERS:
+        raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
+    dtype = data_type(settings.precision)
+    if settings.optimizer == "gauss-newton":
+        require_float64(settings.precision)
+    for part in hold_out(data, settings.validation_share, settings.seed):
+        samples(part, settings, dtype)
+
+
+def check_start(model: PhaseModel, data: Trajectories, settings: Settings) -> None:
+    """Raises `InputError` if the loss is not finite where training starts; takes a compilation."""
+    arrays = samples(data, settings._replace(samples=len(data.t)), data_type(settings.precision))
+    require_finite_start(functools.partial(loss, model), model.init, settings.seed, arrays)
+
+
 def match_field(
     model: PhaseModel,
     data: Trajectories,
@@ -103,17 +126,10 @@ def match_field(
         report: called after every dispatch.
 
     Raises:
-        InputError: settings out of range, no p or pd in the data, too few trajectories, or a checkpoint that does not
-            fit.
+        InputError: what `check` finds, a loss that is not finite to begin with, or a checkpoint that does not fit.
     """
-    require_positive(
-        **{name: getattr(settings, name) for name in ("steps", "samples", "seconds", "batch", "learning_rate")}
-    )
-    if settings.optimizer not in OPTIMIZERS:
-        raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
+    check(data, settings)
     dtype = data_type(settings.precision)
-    if settings.optimizer == "gauss-newton":
-        require_float64(settings.precision)
     train, validation = hold_out(data, settings.validation_share, settings.seed)
     fitted, held_out = (samples(part, settings, dtype) for part in (train, validation))
 
@@ -122,7 +138,7 @@ def match_field(
 
     parameters = jax.jit(model.init)(jax.random.key(settings.seed))
     if settings.optimizer == "gauss-newton":
-        return train_second_order(
+        trained = train_second_order(
             functools.partial(residual, model),
             parameters,
             fitted,
@@ -131,7 +147,8 @@ def match_field(
             checkpoint=checkpoint,
             report=report,
         )
-    return train_first_order(
+        return require_start(trained)
+    trained = train_first_order(
         functools.partial(loss, model),
         adamw(steps=settings.steps, learning_rate=settings.learning_rate),
         parameters,
@@ -141,9 +158,11 @@ def match_field(
         steps=settings.steps,
         batch=min(settings.batch, len(fitted[0])),
         patience=settings.steps,
+        seconds=settings.seconds,
         checkpoint=checkpoint,
         report=report,
     )
+    return require_start(trained)
 
 
 def match_linear(
@@ -154,18 +173,18 @@ def match_linear(
     In float64; the errors are of each sample, and those of the fitted samples without a validation.
 
     Raises:
-        InputError: no p or pd in the data, or numbers that are not finite.
+        InputError: no p or pd in the data, or numbers that are not finite or whose squares are not.
     """
     began = time.perf_counter()
     with jax.enable_x64(True):
         zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
         columns = jax.jit(jax.jacrev(lambda c, *sample: residual(model, c, *sample)))
-        arrays = tuple(map(jnp.asarray, _arrays(data)))
+        arrays = _in_float64(data)
         design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))
         target = -np.asarray(jax.jit(jax.vmap(functools.partial(residual, model, zero)))(*arrays))
         found = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
         seconds = time.perf_counter() - began
-        judged = arrays if validation is None else tuple(map(jnp.asarray, _arrays(validation)))
+        judged = arrays if validation is None else _in_float64(validation)
         errors = jax.vmap(functools.partial(residual, model, jnp.asarray(found.x)))(*judged)
         squares = np.sum(np.asarray(errors) ** 2, axis=1)
     fitted = found.residual**2 / len(arrays[0])
@@ -176,7 +195,11 @@ def match_linear(
 def samples(data: Trajectories, settings: Settings, dtype: Any) -> tuple[Array, ...]:
     """q, p, qd, pd of at most `settings.samples` samples in random order."""
     chosen = np.random.default_rng(settings.seed).permutation(len(data.t))[: settings.samples]
-    return tuple(jnp.asarray(array[chosen], dtype) for array in _arrays(data))
+    return tuple(on_device(name, array[chosen], dtype) for name, array in zip(FIELD, _arrays(data), strict=True))
+
+
+def _in_float64(data: Trajectories) -> tuple[Array, ...]:
+    return tuple(on_device(name, array, jnp.float64) for name, array in zip(FIELD, _arrays(data), strict=True))
 
 
 def _arrays(data: Trajectories) -> tuple[np.ndarray, ...]:

@@ -1,5 +1,6 @@
 """Training by a first-order optimiser, from parameters to the best of them, resumable at any dispatch."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +25,7 @@ def train_first_order(
     batch: int,
     patience: int,
     steps_per_dispatch: int = 200,
+    seconds: float = math.inf,
     checkpoint: Checkpoint | None = None,
     report: Report = silent,
 ) -> Training:
@@ -40,6 +42,8 @@ def train_first_order(
         batch: samples of a step.
         patience: steps without a better score after which training stops.
         steps_per_dispatch: steps between two scores.
+        seconds: after which to stop, compilation included and since the call, also of a resumed run; looked at between
+            dispatches, of which there is one at least. The learning rate falls as it would have without it.
         checkpoint: where to store the run after every dispatch, and whether to continue one.
         report: called after every dispatch.
 
@@ -71,5 +75,7 @@ def train_first_order(
         report(history[-1])
         elsewhere += time.perf_counter() - began
 
-    state, stop = fit.run(prepared._replace(dispatch=compiled), state, patience=patience, on_dispatch=on_dispatch)
+    left = seconds - compile_seconds
+    compiled_fit = prepared._replace(dispatch=compiled)
+    state, stop = fit.run(compiled_fit, state, patience=patience, on_dispatch=on_dispatch, seconds=left)
     return Training(state.best_parameters, history, stop, plain(state.best_step), compile_seconds)

@@ -4,6 +4,8 @@ One dispatch runs whole epochs in one loop on the device: each epoch draws a per
 number, so that a run that continues from a stored state takes exactly the steps of an unbroken one.
 """
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -187,6 +189,7 @@ def run(
     *,
     patience: int,
     on_dispatch: Callable[[FitState, Record], None],
+    seconds: float = math.inf,
 ) -> tuple[FitState, Stop]:
     """Runs a fit to its end from any state of it.
 
@@ -195,12 +198,17 @@ def run(
         state: from its `init`, or a stored one.
         patience: steps without a better validation value after which to stop.
         on_dispatch: called after every dispatch, to report and to store; the state is valid only during the call.
+        seconds: after which to stop; looked at between dispatches, of which there is one at least.
     """
+    began, dispatched = time.perf_counter(), False
     while (epoch := int(np.max(state.epoch))) < fit.epochs:
         if np.all(np.asarray(state.failed_step) >= 0):
             return state, Stop("not finite", int(np.max(state.failed_step)))
         if np.all(np.asarray(state.step - state.best_step) >= patience):
             return state, Stop("no improvement", int(np.max(state.step)))
+        if dispatched and time.perf_counter() - began >= seconds:
+            return state, Stop("time", int(np.max(state.step)))
+        dispatched = True
         state, values = fit.dispatch(state, min(fit.epochs_per_dispatch, fit.epochs - epoch))
         if np.all(np.asarray(state.failed_step) >= 0):
             continue

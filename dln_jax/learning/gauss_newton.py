@@ -115,7 +115,7 @@ def minimise(
         state: from its `init`, or of an earlier dispatch.
         arrays: data, samples on axis 0.
         iterations: to be done in total, those that led to `state` included.
-        seconds: after which to stop, in s; looked at between dispatches.
+        seconds: after which to stop, in s; looked at between dispatches, of which there is one at least.
         target: validation at which to stop; of several seeds the worst counts.
         dispatch: iterations in one compiled call.
         validation: parameters of ONE seed -> scalar, jitted here and evaluated after each dispatch; the parameters with
@@ -143,11 +143,12 @@ def minimise(
     if on_compiled is not None:
         on_compiled(compile_seconds)
 
-    reached = False
+    reached = dispatched = False
     while remaining := _remaining(state, iterations):
         reached = bool(np.all(np.asarray(state.best_validation) <= target))
-        if reached or clock() - start >= seconds:
+        if reached or (dispatched and clock() - start >= seconds):
             break
+        dispatched = True
         state = jax.block_until_ready(optimiser.run(state, arrays, min(dispatch, remaining)))
         values = scores = None
         if evaluate is not None:

@@ -1,6 +1,18 @@
 """First-order optimisers."""
 
+import math
+
 import optax
+
+from dln_jax.types import InputError, require_positive
+
+
+def check_adamw(*, learning_rate: float, weight_decay: float = 0.0) -> None:
+    """Raises `InputError` unless the rate is positive, the decay is not negative, and both are finite."""
+    require_positive(learning_rate=learning_rate)
+    for name, value in (("learning_rate", learning_rate), ("weight_decay", weight_decay)):
+        if not 0 <= value < math.inf:
+            raise InputError(f"{name} is {value}; expected a finite number, zero or positive")
 
 
 def adamw(

@@ -22,12 +22,14 @@ from jaxtyping import Float
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.learning.first_order import train_first_order
 from dln_jax.learning.growth import Trial, grow
-from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, data_type, silent
+from dln_jax.learning.magnitudes import on_device
+from dln_jax.learning.optimisers import check_adamw
+from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, data_type, require_start, silent
 from dln_jax.learning.second_order import COARSE_SAMPLES, Budget, require_float64, train_second_order
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
-from dln_jax.types import InputError, Scalar, require_network, require_positive
+from dln_jax.types import InputError, Scalar, require_network, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
 OPTIMIZERS = ("adam", "gauss-newton")
@@ -81,27 +83,30 @@ class Targets(NamedTuple):
 
 def check(data: FunctionSamples, settings: Settings) -> None:
     """Raises `InputError` if the settings are out of range, or the data lack a derivative that the loss reads."""
-    numbers = ("width", "depth", "members", "epochs", "batch", "learning_rate", "steps")
+    numbers = ("width", "depth", "members", "epochs", "batch", "steps")
     require_positive(**{name: getattr(settings, name) for name in numbers})
+    check_adamw(learning_rate=settings.learning_rate, weight_decay=settings.weight_decay)
+    require_seed(settings.seed)
+    if settings.coarse_steps < 0:
+        raise InputError(f"coarse_steps is {settings.coarse_steps}; expected a number of iterations, or 0 for none")
     if settings.optimizer not in OPTIMIZERS:
         raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
     if settings.optimizer == "gauss-newton":
         require_float64(settings.precision)
     require_network(width=settings.width, depth=settings.depth)
     activation(settings.activation)
-    data_type(settings.precision)
-    _needed(data, settings)
+    targets(data, settings)
 
 
 def targets(data: FunctionSamples, settings: Settings) -> Targets:
     """The arrays that the loss reads, on the device.
 
     Raises:
-        InputError: an unknown loss or derivative, or a derivative that the data lack.
+        InputError: an unknown loss or derivative, a derivative that the data lack, or numbers whose squares overflow.
     """
     dtype = data_type(settings.precision)
     needed = _needed(data, settings)
-    return Targets(**{key: jnp.asarray(getattr(data, key), dtype) for key in needed})
+    return Targets(**{key: on_device(key, getattr(data, key), dtype) for key in needed})
 
 
 def residual(layers: Layers, sample: Targets, *, activation: Activation) -> Float[Array, "r"]:
@@ -137,7 +142,7 @@ def train(
         report: called after every dispatch, with means over the members.
 
     Raises:
-        InputError: what `check` finds, or a checkpoint that does not fit.
+        InputError: what `check` finds, a loss that is not finite to begin with, or a checkpoint that does not fit.
     """
     check(sets.train, settings)
     sizes = (sets.train.inputs, *(settings.width,) * settings.depth, sets.train.outputs)
@@ -146,7 +151,7 @@ def train(
     )
     ours, theirs = (targets(data, settings) for data in sets)
     start = _by_adam if settings.optimizer == "adam" else _by_gauss_newton
-    return start(layers, ours, theirs, settings, checkpoint, report)
+    return require_start(start(layers, ours, theirs, settings, checkpoint, report))
 
 
 def steps_of(sets: SampleSplit, settings: Settings) -> int:

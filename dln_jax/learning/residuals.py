@@ -10,6 +10,7 @@ from jax import Array, vmap
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.learning.magnitudes import on_device, spread
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, Scalar, Vector
 
@@ -33,13 +34,14 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     A channel that does not vary (a joint without a motor) is measured in the root mean square of those that do.
 
     Raises:
-        InputError: no channel varies, so that the data cannot tell any Lagrangian from its multiples.
+        InputError: no channel varies, so that the data cannot tell any Lagrangian from its multiples; or numbers are
+            so large or small that their squares are infinite or zero.
     """
     message = (
         "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
         "add trajectories that are driven by known, varying torques"
     )
-    return _scale(data.tau, message)
+    return _scale("tau", data.tau, message)
 
 
 TORQUE = Objective(
@@ -54,7 +56,7 @@ TORQUE = Objective(
 def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
     torque_scale(data)
     still = "is constant in every training sample: nothing moves, and no Hamiltonian can be told from another"
-    return jnp.concatenate([_scale(data.qd, f"qd {still}"), _scale(data.qdd, f"qdd {still}")])
+    return jnp.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
 def _canonical_residual(dynamics: Dynamics, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
@@ -78,7 +80,7 @@ wrong by 8e-6 (N m)² in mean square, while q, qd, qdd and tau are consistent to
 
 def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
     still = "qdd is constant in every training sample; add trajectories that accelerate"
-    return jnp.concatenate([torque_scale(data), _scale(data.qdd, still)])
+    return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
 BOTH_WAYS = Objective(
@@ -93,11 +95,15 @@ BOTH_WAYS = Objective(
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """The arrays that an objective reads, on the device."""
+    """The arrays that an objective reads, on the device.
+
+    Raises:
+        InputError: one is missing, or its squares overflow in that precision.
+    """
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
         raise InputError(f"the data have no {', '.join(missing)}, which this model is fitted to; add it to the file")
-    return tuple(jnp.asarray(getattr(data, key), dtype) for key in objective.keys)
+    return tuple(on_device(key, getattr(data, key), dtype) for key in objective.keys)
 
 
 def residuals(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
@@ -110,9 +116,9 @@ def mean_loss(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...]
     return jnp.mean(jnp.sum((residuals(objective, dynamics, batch) / scale) ** 2, axis=-1))
 
 
-def _scale(array: np.ndarray, message: str) -> Float[Array, " d"]:
+def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
     """Standard deviation of each column; the typical one for a column that does not vary."""
-    deviation = array.std(axis=0)
+    deviation = spread(name, array)
     # Rounding leaves a constant channel with a deviation of some 1e-17 of the numbers it was computed from.
     varies = deviation > 1e-12 * abs(array).max()
     if not varies.any():

@@ -18,6 +18,9 @@ from dln_jax.types import InputError
 CHECKPOINT = "checkpoint"
 """Name of the file pair in a run's folder from which it can continue."""
 
+NO_START = "the loss is not finite before training; look for very large numbers in the data"
+"""What is refused where a training cannot begin."""
+
 
 class Progress(NamedTuple):
     """State of a run after a dispatch; numbers, or an array [seeds] where several train together."""
@@ -29,6 +32,8 @@ class Progress(NamedTuple):
     """The test error, shown and never used for a choice; NaN where nothing is monitored."""
     seconds: float
     """Training time so far, compilation and interruptions apart."""
+    stage: str = ""
+    """What is trained at the moment, where a training has several stages."""
 
 
 class Stop(NamedTuple):
@@ -80,6 +85,22 @@ Report = Callable[[Progress], None]
 
 def silent(progress: Progress) -> None:
     """Reports nothing."""
+
+
+def require_start(training: Training) -> Training:
+    """The training; raises `InputError` where its loss was not finite to begin with, so that nothing was learned."""
+    if training.stop == Stop("not finite", 0):
+        raise InputError(NO_START)
+    return training
+
+
+def one_after_the_other(histories: Iterable[list[Progress]]) -> list[Progress]:
+    """The histories of several trainings as one, whose steps and seconds go on."""
+    joined: list[Progress] = []
+    for history in histories:
+        step, seconds = (joined[-1].step, joined[-1].seconds) if joined else (0, 0.0)
+        joined += [at._replace(step=step + at.step, seconds=seconds + at.seconds) for at in history]
+    return joined
 
 
 def data_type(precision: str) -> Any:
@@ -177,6 +198,8 @@ def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
 
 def _json(value: Any) -> Any:
     """NaN and infinity are no JSON."""
+    if isinstance(value, str):
+        return value
     if np.ndim(value):
         return [_json(each) for each in value]
     value = plain(value)

@@ -48,7 +48,8 @@ class Budget(NamedTuple):
     improvement_tolerance: float = 0.0
     """Relative decrease of the loss in an iteration at which a phase ends."""
     seconds: float = math.inf
-    """After which to stop, compilation included."""
+    """After which to stop, compilation included and since the call, also of a resumed run; looked at between
+    dispatches, of which there is one at least, so that no run ends with the parameters that it started from."""
     target: float = -math.inf
     """Validation at which to stop."""
 
@@ -112,13 +113,16 @@ def train_second_order(
         report(history[-1])
         elsewhere += time.perf_counter() - storing_from
 
+    def left() -> float:
+        return budget.seconds - (time.perf_counter() - began)
+
     def run(optimised: gauss_newton.State) -> gauss_newton.Result:
         return gauss_newton.minimise(
             optimiser,
             optimised,
             arrays if phase else tuple(array[: budget.coarse_samples] for array in arrays),
             iterations=budget.steps if phase else budget.coarse_steps,
-            seconds=budget.seconds - (time.perf_counter() - began),
+            seconds=left(),
             target=budget.target,
             dispatch=dispatch,
             validation=lambda each: jnp.stack(score(each)),
@@ -128,6 +132,8 @@ def train_second_order(
 
     result = run(state[0])
     ended = (gauss_newton.Status.TIME, gauss_newton.Status.TARGET)
+    if not phase and left() <= 0:
+        result = result._replace(status=np.full_like(result.status, gauss_newton.Status.TIME))
     if not phase and not np.isin(result.status, ended).all():
         phase, before = 1, before + int(np.max(result.statistics.iterations))
         best = result.state.best_parameters, result.state.best_validation

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.data.functions import FunctionSamples
+from dln_jax.learning.magnitudes import spread
 from dln_jax.nn.differential_mlp import Layers
 
 
@@ -32,8 +33,13 @@ def own_units(data: FunctionSamples) -> Units:
 
 
 def standard_units(data: FunctionSamples) -> Units:
-    """Mean and standard deviation of each column; a column that does not vary has size 1."""
-    sizes = [np.where(array.std(axis=0) > 0, array.std(axis=0), 1.0) for array in (data.x, data.y)]
+    """Mean and standard deviation of each column; a column that does not vary has size 1.
+
+    Raises:
+        InputError: numbers of x or y so large or small that their squares are infinite or zero.
+    """
+    deviations = (spread(name, array) for name, array in (("x", data.x), ("y", data.y)))
+    sizes = [np.where(deviation > 0, deviation, 1.0) for deviation in deviations]
     return Units(data.x.mean(axis=0), sizes[0], data.y.mean(axis=0), sizes[1])
 
 

@@ -15,12 +15,22 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.learning import residuals
 from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.optimisers import adamw
+from dln_jax.learning.magnitudes import require_finite_start
+from dln_jax.learning.optimisers import adamw, check_adamw
 from dln_jax.learning.residuals import TORQUE, Objective
-from dln_jax.learning.runs import CHECKPOINT, Checkpoint, Report, Training, data_type, fingerprint, silent
+from dln_jax.learning.runs import (
+    CHECKPOINT,
+    Checkpoint,
+    Report,
+    Training,
+    data_type,
+    fingerprint,
+    require_start,
+    silent,
+)
 from dln_jax.learning.second_order import Budget, choose_optimizer, require_float64, train_second_order
 from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError, require_positive, require_seed
 
 OPTIMIZERS = ("adam", "gauss-newton")
 
@@ -40,7 +50,8 @@ class Settings(NamedTuple):
     patience: int = 10_000
     """Steps without a better validation error after which training stops."""
     seconds: float = math.inf
-    """After which Gauss-Newton stops, compilation included."""
+    """After which training stops, compilation included and since the call, also of a resumed run; looked at between
+    dispatches, of which there is one at least."""
     target: float = 0.0
     """Validation error at which Gauss-Newton stops."""
     precision: str = "f32"
@@ -50,14 +61,29 @@ class Settings(NamedTuple):
 
 def check(sets: Split, settings: Settings, objective: Objective = TORQUE) -> None:
     """Raises `InputError` if the settings are out of range, or the data cannot determine the model."""
-    numbers = ("steps", "batch", "learning_rate", "patience", "seconds")
-    require_positive(**{name: getattr(settings, name) for name in numbers})
+    require_positive(**{name: getattr(settings, name) for name in ("steps", "batch", "patience", "seconds")})
+    check_adamw(learning_rate=settings.learning_rate, weight_decay=settings.weight_decay)
+    require_seed(settings.seed)
     data_type(settings.precision)
     if settings.optimizer not in OPTIMIZERS:
         raise InputError(f"optimizer is '{settings.optimizer}'; expected one of {', '.join(OPTIMIZERS)}")
     if settings.optimizer == "gauss-newton":
         require_float64(settings.precision)
     objective.scale(sets.train)
+    for part in sets:
+        residuals.arrays(objective, part, data_type(settings.precision))
+
+
+def check_start(model: Model, sets: Split, settings: Settings, objective: Objective = TORQUE) -> None:
+    """Raises `InputError` if a set's loss is not finite where training starts; takes a compilation."""
+    dtype = data_type(settings.precision)
+    scale = objective.scale(sets.train).astype(dtype)
+    require_finite_start(
+        lambda parameters, batch: residuals.mean_loss(objective, model.apply(parameters), batch, scale),
+        model.init,
+        settings.seed,
+        tuple(map(lambda *parts: jnp.concatenate(parts), *(residuals.arrays(objective, part, dtype) for part in sets))),
+    )
 
 
 def train(
@@ -87,7 +113,7 @@ def train(
         report: called after every dispatch.
 
     Raises:
-        InputError: what `check` finds, or a checkpoint that does not fit.
+        InputError: what `check` finds, a loss that is not finite to begin with, or a checkpoint that does not fit.
     """
     check(sets, settings, objective)
     dtype = data_type(settings.precision)
@@ -108,7 +134,7 @@ def train(
     parameters = initial_parameters(model, settings.seed if seeds is None else seeds)
 
     if settings.optimizer == "gauss-newton":
-        return train_second_order(
+        trained = train_second_order(
             lambda parameters, *sample: objective.residual(model.apply(parameters), *sample) / scale,
             parameters,
             fitted,
@@ -118,7 +144,8 @@ def train(
             checkpoint=checkpoint,
             report=report,
         )
-    return train_first_order(
+        return require_start(trained)
+    trained = train_first_order(
         lambda parameters, batch: residuals.mean_loss(objective, model.apply(parameters), batch, scale),
         adamw(steps=settings.steps, learning_rate=settings.learning_rate, weight_decay=settings.weight_decay),
         parameters,
@@ -128,9 +155,11 @@ def train(
         steps=settings.steps,
         batch=settings.batch,
         patience=settings.patience,
+        seconds=settings.seconds,
         checkpoint=checkpoint,
         report=report,
     )
+    return require_start(trained)
 
 
 def initial_parameters(model: Model, seeds: int | Sequence[int]) -> Parameters:

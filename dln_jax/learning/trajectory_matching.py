@@ -24,7 +24,8 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.optimisers import adamw
+from dln_jax.learning.magnitudes import on_device
+from dln_jax.learning.optimisers import adamw, check_adamw
 from dln_jax.learning.runs import Checkpoint, Report, Training, silent
 from dln_jax.learning.second_order import Budget, train_second_order
 from dln_jax.mechanics.integrators import rk4, rollout
@@ -143,6 +144,20 @@ def window_residual(
     return jnp.concatenate([jnp.ravel(error) for error in errors])
 
 
+def check(windows: Windows, validation: Windows, weights: Weights) -> None:
+    """Raises `InputError` unless there are windows, with all that the weights count, and these are positive."""
+    for deviation in np.ravel(weights.state):
+        require_positive(state_weight=float(deviation))
+    if weights.rate is not None:
+        require_positive(rate_weight=weights.rate)
+        if windows.rate is None or validation.rate is None:
+            raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    if not len(windows.t) or not len(validation.t):
+        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+    for each in (windows, validation):
+        _arrays(each, weights)
+
+
 def match_trajectories(
     model: PhaseModel,
     parameters: Parameters,
@@ -168,7 +183,7 @@ def match_trajectories(
         windows: to fit.
         validation: to select by.
         weights: of the residuals.
-        budget: when to stop; its `steps` are also Adam's.
+        budget: when to stop; its `steps` and `seconds` are also Adam's.
         adam: to take Adam in place of Gauss-Newton.
         free_starts: whether starts are unknowns; otherwise windows start where they were measured to.
         substeps: of RK4 between two samples.
@@ -180,15 +195,9 @@ def match_trajectories(
     """
     require_positive(substeps=substeps)
     if adam is not None:
-        require_positive(batch=adam.batch, learning_rate=adam.learning_rate)
-    for deviation in np.ravel(weights.state):
-        require_positive(state_weight=float(deviation))
-    if weights.rate is not None:
-        require_positive(rate_weight=weights.rate)
-        if windows.rate is None or validation.rate is None:
-            raise InputError("the weights count rates, which the windows lack; leave their weight out")
-    if not len(windows.t) or not len(validation.t):
-        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+        require_positive(batch=adam.batch)
+        check_adamw(learning_rate=adam.learning_rate)
+    check(windows, validation, weights)
     fitted, held_out = (_arrays(each, weights) for each in (windows, validation))
     error = functools.partial(window_residual, weights=weights, substeps=substeps)
 
@@ -226,6 +235,7 @@ def match_trajectories(
             steps=budget.steps,
             batch=min(adam.batch, len(windows.t)),
             patience=budget.steps,
+            seconds=budget.seconds,
             checkpoint=checkpoint,
             report=report,
         )
@@ -233,9 +243,10 @@ def match_trajectories(
 
 
 def _arrays(windows: Windows, weights: Weights) -> tuple[Array, ...]:
-    rates = [] if weights.rate is None or windows.rate is None else [windows.rate]
-    given = (windows.t, windows.state, windows.weight, *rates)
-    return tuple(jnp.asarray(array) for array in given)
+    given = {"t": windows.t, "state": windows.state, "weight": windows.weight}
+    if weights.rate is not None and windows.rate is not None:
+        given["rate"] = windows.rate
+    return tuple(on_device(name, array, jnp.result_type(float)) for name, array in given.items())
 
 
 def _nearest(residual: Callable[[Array], Array], start: Array) -> Array:

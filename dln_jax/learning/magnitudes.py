@@ -1,0 +1,57 @@
+"""Whether numbers are of a size that can be computed with, before anything rests on them.
+
+Losses square what they read. Marks of missing values such as 1e308, and units far from the data's size, give scales and
+losses that are infinite or zero without any single number being so.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.learning.runs import NO_START
+from dln_jax.types import InputError
+
+
+def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
+    """An array of samples in a precision.
+
+    Raises:
+        InputError: the sum of its squares is not finite there.
+    """
+    _require_squares(name, array, dtype)
+    return jnp.asarray(array, dtype)
+
+
+def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
+    """Standard deviation of each column, in float64.
+
+    Raises:
+        InputError: it is not finite, or numbers other than zero are so small that their squares vanish.
+    """
+    _require_squares(name, array, np.float64)
+    largest = float(np.abs(array).max(initial=0.0))
+    if 0 < largest < np.sqrt(np.finfo(np.float64).tiny):
+        raise InputError(f"{name} has numbers of at most {largest:.1e}, whose squares vanish; give it in smaller units")
+    return array.std(axis=0)
+
+
+def require_finite_start(loss: Callable[[Any, Any], Array], init: Callable[[Array], Any], seed: int, data: Any) -> None:
+    """Raises `InputError` unless `loss(parameters, data)` is finite for what `init` draws by the seed."""
+    options = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
+    value = jax.jit(lambda key, data: loss(init(key), data), compiler_options=options)(jax.random.key(seed), data)
+    if not np.isfinite(value):
+        raise InputError(NO_START)
+
+
+def _require_squares(name: str, array: np.ndarray, dtype: Any) -> None:
+    largest = float(np.abs(array).max(initial=0.0))
+    if not largest < np.sqrt(float(np.finfo(dtype).max) / max(array.size, 1)):
+        raise InputError(
+            f"{name} has numbers of up to {largest:.1e}, whose squares overflow in {np.dtype(dtype).name}; remove the "
+            "samples if they mark missing values, else give it in larger units"
+        )
