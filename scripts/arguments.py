@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -61,11 +61,17 @@ def parse(arguments: type[Arguments], *, prog: str, description: str | None) -> 
         raise InputError(f"{_complaint(said.getvalue())} (see {prog} --help)") from None
 
 
-def refuse_stated(given: Any, names: Iterable[str], where: str) -> None:
-    """Raises `InputError` where one of these options, which are not used `where`, was given."""
-    for name in sorted(names):
+def refuse_given(given: Any, names: Iterable[str], why: str) -> None:
+    """Raises `InputError` for the first of these options that was given, for example "--batch is for adam: ..."."""
+    for name in names:
         if getattr(given, name) is not None:
-            raise InputError(f"--{name.replace('_', '-')} is not used {where}; leave it out")
+            raise InputError(f"--{name.replace('_', '-')} is {why}; leave it out")
+
+
+def resolved(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that `defaults` names, with its values for those that were not given."""
+    stated = {name: getattr(given, name) for name in defaults}
+    return {name: defaults[name] if value is None else value for name, value in stated.items()}
 
 
 def names_in(option: str, given: str, known: Iterable[str]) -> list[str]:

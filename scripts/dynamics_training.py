@@ -20,12 +20,12 @@ from dln_jax.learning.train import Settings, automatic_optimizer, check, check_s
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive, require_seed
+from scripts.arguments import refuse_given, resolved
 from scripts.command_line import needs_from_option, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
 from scripts.low_latency_calls import low_latency_metrics
-from scripts.options import refuse_given, resolved
 from scripts.progress import progress
 
 OF_NETWORKS = ("width", "depth", "activation")

@@ -11,7 +11,7 @@ from typing import Literal
 from dln_jax.data import generators, schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
-from scripts.arguments import Unstated, refuse_stated
+from scripts.arguments import Unstated, refuse_given
 from scripts.command_line import SceneName, run, scene_named
 
 OF_KIND = {
@@ -66,7 +66,7 @@ def generate(given: Arguments) -> Trajectories:
     """The trajectories that the arguments ask for."""
     scene = scene_named(given.scene)
     unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[given.kind])
-    refuse_stated(given, unused, f"for --kind {given.kind}")
+    refuse_given(given, sorted(unused), f"not used for --kind {given.kind}")
     chosen = {name: getattr(given, name) for name in OF_KIND[given.kind] if getattr(given, name) is not None}
     if given.kind == "characters":
         if scene.name != "two-link-arm":
@@ -74,7 +74,7 @@ def generate(given: Arguments) -> Trajectories:
         return generators.characters(**chosen)
     if given.kind == "uniform":
         actuated = scene.needs.actuation is None
-        refuse_stated(given, {"control_bound" if actuated else "acceleration_bound"}, f"for the scene {given.scene}")
+        refuse_given(given, ["control_bound" if actuated else "acceleration_bound"], f"not used for {given.scene}")
         return generators.uniform(scene, **chosen)
     return generators.free_swing(scene, **chosen)
 

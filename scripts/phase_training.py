@@ -19,6 +19,7 @@ from dln_jax.evaluation.phase_figures import TRUTH
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.runs import Progress
 from dln_jax.types import InputError, require_positive, require_seed
+from scripts.arguments import refuse_given, resolved
 from scripts.command_line import needs_from_option, stored_arguments
 from scripts.hnn_measures import Seen, figure_of, measured_once
 from scripts.hnn_models import (
@@ -36,7 +37,6 @@ from scripts.hnn_models import (
 )
 from scripts.hnn_tasks import MEASURED, REAL, Problem, problem_of
 from scripts.low_latency_calls import low_latency_metrics
-from scripts.options import refuse_given, resolved
 from scripts.progress import progress
 
 if TYPE_CHECKING:

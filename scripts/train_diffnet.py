@@ -10,7 +10,7 @@ import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -28,8 +28,9 @@ from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, ste
 from dln_jax.learning.runs import Checkpoint, Training, fingerprint
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.nn.activations import activation
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_seed
 from scripts import diffnet_table
+from scripts.arguments import refuse_given, resolved
 from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 
@@ -42,6 +43,11 @@ RELU = (
     "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "
     "predicting zero and a Hessian in the loss teaches it nothing; use softplus, tanh, cos or another smooth activation"
 )
+OF_NAMED = {"samples": 25_600, "noise": 1e-3}
+OF_ADAM = ("epochs", "batch", "learning_rate", "weight_decay")
+OF_NEWTON = ("steps", "coarse_steps")
+TABLE_DEFAULTS = {"samples": OF_NAMED["samples"], "steps": 40, "coarse_steps": 200, "epochs": 500}
+OF_TABLE = (*TABLE_DEFAULTS, "seed", "out", "resume", "figures", "table")
 SHARE_OF_DATA = 0.75
 """Width of the training box over that of the shown one, for ensembles."""
 
@@ -67,26 +73,27 @@ class Arguments:
     no longer falls)."""
     depth: int | None = None
     """Hidden layers (default: 1 for one input, else 2)."""
-    steps: int = 40
-    """Gauss-Newton: iterations on all samples at most, per network."""
-    coarse_steps: int = 200
-    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many."""
-    epochs: int = 500
-    """Adam: passes over the data."""
-    batch: int = 512
-    """Adam: samples per step."""
-    learning_rate: float = 1e-3
-    """Adam: constant rate."""
-    weight_decay: float = 1e-6
-    """Adam: decoupled weight decay."""
-    samples: int = 25_600
-    """Samples of sin and cos_sin."""
-    noise: float = 1e-3
-    """Their standard deviation of the noise on x, f, gradient and Hessian."""
+    steps: int | None = None
+    """Gauss-Newton: iterations on all samples at most, per network (default: 40)."""
+    coarse_steps: int | None = None
+    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many (default:
+    200; 0 for none)."""
+    epochs: int | None = None
+    """Adam: passes over the data (default: 500)."""
+    batch: int | None = None
+    """Adam: samples per step (default: 512)."""
+    learning_rate: float | None = None
+    """Adam: constant rate (default: 0.001)."""
+    weight_decay: float | None = None
+    """Adam: decoupled weight decay (default: 0.000001)."""
+    samples: int | None = None
+    """Samples of sin and cos_sin (default: 25600)."""
+    noise: float | None = None
+    """Their standard deviation of the noise on x, f, gradient and Hessian (default: 0.001)."""
     precision: Literal["f32", "f64"] | None = None
     """Floating-point type (default: f64 for gauss-newton, which needs it, f32 for adam)."""
     seed: int = 0
-    """Of the data, the validation split, the initial parameters and the shuffling."""
+    """Of the data, the validation split, the initial parameters and the shuffling; 0 to 4294967295."""
     out: Path | None = None
     """Folder of the run (default: runs/train_diffnet-1, -2, ...)."""
     resume: bool = False
@@ -94,8 +101,8 @@ class Arguments:
     figures: bool = True
     """Draw the figures."""
     table: bool = False
-    """Train everything that the published table has, by both optimisers; of the other arguments --samples, --steps,
-    --coarse-steps, --epochs, --seed, --out and --resume count."""
+    """Train everything that the published table has, by both optimisers; of the other arguments it takes --samples,
+    --steps, --coarse-steps, --epochs, --seed, --out and --resume."""
 
 
 class Task(NamedTuple):
@@ -119,7 +126,10 @@ def main(given: Arguments) -> None:
     console = Console(highlight=False, soft_wrap=True)
     if given.resume:
         given = with_stored_arguments(given)
+    require_seed(given.seed)
     if given.table:
+        check_table(given)
+        given = dataclasses.replace(given, **resolved(given, TABLE_DEFAULTS))
         diffnet_table.write_table(console, given)
         return
     task = prepare(given)
@@ -133,7 +143,7 @@ def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> 
     announce(console, task)
     settings, training = fit(task, folder, resume=given.resume, console=console)
     task = task._replace(settings=settings)
-    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": settings._asdict()})
+    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": {**settings._asdict(), **of_named(given)}})
     if training.stop.reason == "not finite":
         console.print("the loss stopped being finite; the run keeps the best parameters before that")
     layers = layers_in_own_units(training.parameters, task.units)
@@ -171,37 +181,54 @@ def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Se
     return chosen.candidate, chosen.outcome
 
 
+def check_table(given: Arguments) -> None:
+    """Refuses options that --table does not read."""
+    for field in dataclasses.fields(given):
+        if field.name not in OF_TABLE and getattr(given, field.name) != field.default:
+            name = field.name.replace("_", "-")
+            raise InputError(f"--{name} is not for --table, which trains all that was published; leave it out")
+
+
 def prepare(given: Arguments) -> Task:
     """Reads and checks everything that the arguments name, before anything is written."""
-    settings = settings_from(given)
-    if given.function in NAMED:
-        generate, grid = NAMED[given.function]
-        bound = np.pi * (SHARE_OF_DATA if given.ensemble > 1 else 1)
-        data = generate(samples=given.samples, noise=given.noise, bound=bound, seed=given.seed)
+    settings, function, several = settings_from(given), given.function, given.ensemble > 1
+    if function in NAMED:
+        generate, grid = NAMED[function]
+        bound = np.pi * (SHARE_OF_DATA if several else 1)
+        data = generate(**of_named(given), bound=bound, seed=given.seed)
         test, shown = grid(bound=bound), grid()
-        bound, units = (bound, own_units(data)) if given.ensemble > 1 else (None, own_units(data))
+        bound, units = (bound, own_units(data)) if several else (None, own_units(data))
     else:
-        if not given.function.endswith(".npz"):
-            raise InputError(f"function '{given.function}' is unknown; expected sin, cos_sin or an npz file's path")
-        everything = functions.load(given.function)
+        if not function.endswith(".npz"):
+            raise InputError(f"function '{function}' is unknown; expected sin, cos_sin or an npz file's path")
+        refuse_given(given, OF_NAMED, "for sin and cos_sin, not for a file")
+        everything = functions.load(function)
         if len(everything.x) < 3:
-            raise InputError(f"{given.function}: {len(everything.x)} samples; training, validation and test need 3")
+            raise InputError(f"{function}: {len(everything.x)} samples; training, validation and test need 3")
         data, test = functions.split(everything, seed=given.seed)
         shown, bound, units = test, None, standard_units(data)
     depth = given.depth if given.depth is not None else min(data.inputs, 2)
     settings = settings._replace(depth=depth)
-    check(data, settings)
-    grown = given.width is None and given.optimizer == "gauss-newton"
-    return Task(given.function, functions.split(data, seed=given.seed), test, shown, bound, units, settings, grown)
+    check(to_units(data, units), settings)
+    grown = given.width is None and settings.optimizer == "gauss-newton"
+    return Task(function, functions.split(data, seed=given.seed), test, shown, bound, units, settings, grown)
+
+
+def of_named(given: Arguments) -> dict[str, Any]:
+    """How the data of a named function are drawn; nothing for a file."""
+    return resolved(given, OF_NAMED) if given.function in NAMED else {}
 
 
 def settings_from(given: Arguments) -> Settings:
     """The settings that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
     newton = given.optimizer == "gauss-newton"
-    named = {key: value for key, value in dataclasses.asdict(given).items() if key in Settings._fields}
-    named["width"] = given.width if given.width is not None else (WIDTHS[0] if newton else 128)
-    named["precision"] = given.precision or ("f64" if newton else "f32")
-    return Settings(**{**named, "depth": 1, "members": given.ensemble})
+    if newton:
+        refuse_given(given, OF_ADAM, "for adam: add --optimizer adam")
+    else:
+        refuse_given(given, OF_NEWTON, "for gauss-newton")
+    own = {"width": WIDTHS[0] if newton else 128, "precision": "f64" if newton else "f32", "depth": 1}
+    defaults = {key: value for key, value in Settings._field_defaults.items() if hasattr(given, key)}
+    return Settings(**resolved(given, defaults | own), members=given.ensemble)
 
 
 def announce(console: Console, task: Task) -> None:

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from scripts import dynamics_training, phase_training, pixel_training
+from scripts.arguments import refuse_given
 from scripts.command_line import run, with_stored_arguments
 from scripts.hnn_published import PIXELS
-from scripts.options import refuse_given
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 

@@ -22,15 +22,15 @@ from dln_jax.deploy.load import save_model
 from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.evaluation.soft_body_animations import write_soft_body_gif
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
-from dln_jax.locomotion import comparison
+from dln_jax.locomotion import comparison, gradient
 from dln_jax.locomotion.learning import Goal, Record
 from dln_jax.locomotion.methods import METHODS, STEPS, Method, Trained, settings_of, shown_walk, train
 from dln_jax.locomotion.policy import WIDTH
 from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, FALLEN, UPRIGHT, Task, creature_named, make_task
 from dln_jax.softbody.creature_terms import TIME_STEP
-from dln_jax.types import InputError, require_positive
-from scripts.arguments import Unstated, refuse_stated
+from dln_jax.types import InputError, require_positive, require_seed
+from scripts.arguments import Unstated, refuse_given
 from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 from scripts.report_table import print_report
@@ -54,7 +54,7 @@ class Arguments:
     compare: bool = False
     """All methods, 3 seeds each unless --seeds says otherwise, until 1.2 body lengths or --steps."""
     seed: int = 0
-    """The first seed."""
+    """The first seed, 0 to 4294967295."""
     seeds: Unstated[int] = None
     """How many seeds, one after the other (default: 1, with --compare 3)."""
     steps: Unstated[int] = None
@@ -112,16 +112,25 @@ def train_into(folder: Path, given: Arguments, task: Task) -> None:
 def check(given: Arguments) -> None:
     """Refuses what cannot be trained, before anything is written."""
     require_positive(episode=given.episode, clock_period=given.clock_period)
-    refuse_stated(given, () if given.compare else UNUSED[given.method], f"by --method {given.method}")
+    if not given.compare:
+        refuse_given(given, UNUSED[given.method], f"not used by --method {given.method}")
     for name in ("seeds", "steps", "until", "window", "width"):
         if getattr(given, name) is not None:
             require_positive(**{name: getattr(given, name)})
+    require_seed(given.seed, seed_count(given))
+    if given.compare or given.method == "gradient":
+        gradient.check(settings_of("gradient", given.creature, given.window), given.episode)
     if not (math.isfinite(given.upright) and given.upright >= 0):
         raise InputError(f"--upright is {given.upright}; expected 0 or a positive number")
     if given.resume and (given.compare or given.method == "ppo"):
         raise InputError("--resume is for one run of gradient or evolution; train again without it")
     if given.compare or given.method == "ppo":
         require_stable_baselines3()
+
+
+def seed_count(given: Arguments) -> int:
+    """How many seeds train."""
+    return given.seeds or (3 if given.compare else 1)
 
 
 def width_of(given: Arguments) -> int:
@@ -131,7 +140,7 @@ def width_of(given: Arguments) -> int:
 
 def learned(given: Arguments, task: Task, method: Method, folder: Path) -> Trained:
     """All seeds of one method."""
-    count = given.seeds or (3 if given.compare else 1)
+    count = seed_count(given)
     steps = given.steps or STEPS[method]
     until = given.until or (COMPARED_UNTIL if given.compare else math.inf)
     seeds = range(given.seed, given.seed + count)

@@ -234,11 +234,16 @@ def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
         (("--upright", "-1"), "--upright is -1"),
         (("--method", "ppo", "--resume", "--out", "run"), "holds none"),
         (("--episode", "50"), "a window has 40 steps"),
+        (("--window", "7"), "a window has 7 steps"),
+        (("--window", "8", "--method", "evolution"), "--window is for gradients"),
+        (("--seed", "-1"), "seed is -1"),
+        (("--seed", "4294967295", "--seeds", "2"), "and 1 after it"),
     ],
 )
 def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message):
     monkeypatch.chdir(tmp_path)
     assert message in refused(capsys, train_locomotion, *arguments)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_medians_and_the_crossover():

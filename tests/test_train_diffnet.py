@@ -15,7 +15,9 @@ from dln_jax.learning import first_order, runs, second_order
 from dln_jax.types import InputError
 from scripts import diffnet_report, diffnet_table, train_diffnet
 
-TINY = ("--samples", "200", "--width", "4", "--steps", "4", "--epochs", "2", "--batch", "64")
+SMALL = ("--samples", "200", "--width", "4")
+TINY = (*SMALL, "--steps", "4")
+ADAM = (*SMALL, "--optimizer", "adam", "--epochs", "2", "--batch", "64")
 FILES = {".lock", "config.json", "metrics.json", "model.json", "model.safetensors"}
 METRICS = {
     *("value_mse", "gradient_mse", "hessian_mse", "parameters", "validation_loss"),
@@ -77,7 +79,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
     coarse = partial(functions.cosine_sine_grid, points=9)
     monkeypatch.setitem(train_diffnet.NAMED, "cos_sin", (functions.cosine_sine, coarse))
-    command(train_diffnet, *TINY, "--function", "cos_sin", "--optimizer", "adam", "--ensemble", "3", "--out", "run")
+    command(train_diffnet, *ADAM, "--function", "cos_sin", "--ensemble", "3", "--out", "run")
     folder = workplace / "run"
     assert names_in(folder) == FILES | {f"{name}.png" for name in ("ensemble", "heat_maps", "surfaces", "training")}
     metrics = metrics_of(folder)
@@ -103,8 +105,8 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
 
 
 def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
-    quick = ("--optimizer", "adam", "--loss", "type2", "--no-figures")
-    command(train_diffnet, *TINY, *quick, "--activation", "relu", "--derivative", "2", "--out", "run")
+    quick = ("--loss", "type2", "--no-figures")
+    command(train_diffnet, *ADAM, *quick, "--activation", "relu", "--derivative", "2", "--out", "run")
     out = capsys.readouterr().out
     assert "Hessian is zero almost everywhere" in out and "teaches it nothing" in out
     assert names_in(workplace / "run") == FILES
@@ -116,23 +118,9 @@ def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
 def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, optimizer):
     """Stopped after a few reports, and continued; Gauss-Newton chooses its width again."""
     own_file("mine.npz")
-    growing = ("--coarse-steps", "6") if optimizer == "gauss-newton" else ("--width", "3")
-    wanted = (
-        "--function",
-        "mine.npz",
-        "--loss",
-        "type2",
-        "--depth",
-        "1",
-        "--optimizer",
-        optimizer,
-        "--steps",
-        "12",
-        "--epochs",
-        "6",
-        "--batch",
-        "16",
-    )
+    newton, adam = ("--steps", "12", "--coarse-steps", "6"), ("--width", "3", "--epochs", "6", "--batch", "16")
+    growing = newton if optimizer == "gauss-newton" else adam
+    wanted = ("--function", "mine.npz", "--loss", "type2", "--depth", "1", "--optimizer", optimizer)
     monkeypatch.setattr(train_diffnet, "WIDTHS", (2,))
     command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
     stored = runs.store
@@ -172,6 +160,19 @@ MISTAKES = {
     "depth": ({}, ["--depth", "-1"], "depth is -1"),
     "ensemble": ({}, ["--ensemble", "0"], "members is 0"),
     "precision": ({}, ["--precision", "f32"], "gauss-newton needs f64"),
+    "batch": ({}, ["--batch", "-1"], "--batch is for adam"),
+    "steps of adam": ({}, ["--optimizer", "adam", "--steps", "5"], "--steps is for gauss-newton"),
+    "rate": ({}, ["--optimizer", "adam", "--learning-rate", "nan"], "learning_rate is nan"),
+    "coarse steps": ({}, ["--coarse-steps", "-1"], "coarse_steps is -1"),
+    "samples of a file": ({}, ["--samples", "5"], "--samples is for sin and cos_sin"),
+    "seed": ({}, ["--seed", "-1"], "seed is -1"),
+    "mark in y": (
+        {"y": np.where(np.arange(120).reshape(60, 2) == 3, 1e200, 0.5)},
+        [],
+        "y has numbers of up to",
+    ),
+    "mark in dy": ({"dy": np.full((60, 2, 3), 1e200)}, [], "dy has numbers of up to"),
+    "option of a table": (None, ["--table", "--width", "4"], "--width is not for --table"),
 }
 
 
@@ -180,7 +181,8 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(workplace, capsys, mist
     changes, arguments, message = MISTAKES[mistake]
     if changes is not None:
         own_file("wrong.npz", **changes)
-    assert message in refused(capsys, train_diffnet, "--function", "wrong.npz", "--out", "refused", *arguments)
+    file = () if "--table" in arguments else ("--function", "wrong.npz")
+    assert message in refused(capsys, train_diffnet, *file, "--out", "refused", *arguments)
     assert not (workplace / "refused").exists()
 
 

@@ -48,16 +48,21 @@ class GradientState(NamedTuple):
     skipped: Int[Array, ""]
 
 
+def check(settings: GradientSettings, episode: int) -> None:
+    """Raises `InputError` for a window that does not divide the episode, or a number that is not positive."""
+    require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
+    if episode % settings.window:
+        raise InputError(f"a window has {settings.window} steps; expected a divisor of the episode's {episode}")
+
+
 def make_gradient_learner(task: Task, policy: Policy, settings: GradientSettings = GradientSettings()) -> Learner:  # noqa: B008
     """The learner.
 
     Raises:
-        InputError: a window that does not divide the episode, or a number that is not positive.
+        InputError: what `check` finds.
     """
+    check(settings, task.episode)
     lanes, window = 2 * settings.pairs, settings.window
-    require_positive(**{**settings._asdict(), "deviation": settings.deviation or 1.0})
-    if task.episode % window:
-        raise InputError(f"a window has {window} steps; expected a divisor of the episode's {task.episode}")
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
 
     def start(seed: int) -> GradientState:
