@@ -38,10 +38,13 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
-def choice(names: Iterable[str], *, several: bool = False) -> Any:
-    """For `Annotated[str, ...]`: shows the names of which an option takes one, or several, by default all."""
+def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:
+    """For `Annotated[str, ...]`: shows the names of which an option takes one, or several, by default all.
+
+    With `unstated` the default is not shown, as for `Unstated`.
+    """
     return tyro.conf.arg(
-        metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several else None
+        metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several or unstated else None
     )
 
 

@@ -24,6 +24,7 @@ from dln_jax.evaluation.report import Row, conditions, write_report
 from dln_jax.files import CONFIG, is_file, matches, read_json, run_folder, write_bytes, write_figure, write_json
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, require_positive
+from scripts.arguments import Unstated
 from scripts.arm_models import (
     Curve,
     gauss_newton_rows,
@@ -53,9 +54,9 @@ VPT_SHARE = 0.98
 class Arguments:
     """What to measure."""
 
-    data: Path | None = None
+    data: Unstated[Path] = None
     """Letters written by the two-link arm, in the npz schema (default: the embedded ones)."""
-    uniform: Path | None = None
+    uniform: Unstated[Path] = None
     """Training states of the arm, in the npz schema (default: 3,000 generated ones)."""
     seeds: int = 5
     """Seeds of each model, in one program."""
@@ -63,13 +64,13 @@ class Arguments:
     """Further splits of the letters: permuted and cut into so many tests, each letter in one; 0 leaves them out."""
     split_seeds: int = 3
     """Seeds of the structured Lagrangian on each of them; other models have one."""
-    steps: int | None = None
+    steps: Unstated[int] = None
     """Iterations of Gauss-Newton (default: what each model's validation error takes to level off)."""
     adam_steps: int = 20_000
     """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
     timed_seeds: int = 5
     """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder for report.json, table.md and the figure (default: runs/arm_table-1, -2, ...)."""
     resume: bool = False
     """Continue the measurement in --out."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -20,8 +20,8 @@ from dln_jax.learning.train import Settings, automatic_optimizer, check, check_s
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive, require_seed
-from scripts.arguments import refuse_given, resolved
-from scripts.command_line import needs_from_option, scene_named, stored_arguments, with_stored_arguments
+from scripts.arguments import Unstated, choice, refuse_given, resolved
+from scripts.command_line import SCENES, needs_from_option, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
 from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
@@ -39,49 +39,49 @@ class Arguments:
 
     model: str = "structured"
     """What is learned."""
-    data: Path | None = None
+    data: Unstated[Path] = None
     """Trajectories in the npz schema (default: the embedded characters, or random states of --scene)."""
-    test: str | None = None
+    test: Unstated[str] = None
     """Labels of the test trajectories, comma separated (default: e,q,v of the embedded set, else every sixth)."""
-    scene: str | None = None
+    scene: Annotated[str | None, choice(SCENES, unstated=True)] = None
     """Textbook scene whose needs the data have; without --data, the scene to sample."""
-    needs: str | None = None
+    needs: Unstated[str] = None
     """What the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
     (default: what the scene or the file states, else revolute joints with gravity)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
     gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
-    width: int | None = None
+    width: Unstated[int] = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
-    depth: int | None = None
+    depth: Unstated[int] = None
     """Hidden layers (default: 2)."""
-    activation: str | None = None
-    """Of the hidden layers: tanh, softplus, silu, gelu, sin or cos (default: tanh)."""
-    degree: int | None = None
+    activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
+    """Of the hidden layers (default: tanh)."""
+    degree: Unstated[int] = None
     """trigonometric: degree of the polynomials in each joint (default: 1)."""
-    steps: int | None = None
+    steps: Unstated[int] = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
-    seconds: float | None = None
+    seconds: Unstated[float] = None
     """Seconds of training after which to stop and keep the best so far, compilation included (default: no limit). At
     least a few iterations are done. With --resume they count anew, and another number may be given."""
-    batch: int | None = None
+    batch: Unstated[int] = None
     """adam: samples per step (default: 512)."""
-    learning_rate: float | None = None
+    learning_rate: Unstated[float] = None
     """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
-    weight_decay: float | None = None
+    weight_decay: Unstated[float] = None
     """adam: decoupled weight decay (default: 0.00001)."""
-    patience: int | None = None
+    patience: Unstated[int] = None
     """adam: steps without a better validation error after which training stops (default: 10000)."""
-    precision: Literal["f32", "f64"] | None = None
+    precision: Unstated[Literal["f32", "f64"]] = None
     """Floating-point type of the model and its training (default: f64; f32 for adam)."""
-    target: float | None = None
+    target: Unstated[float] = None
     """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
     from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
     seed: int = 0
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder of the run (default: runs/train_delan-1, -2, ...; runs/train_hnn-1, ...)."""
     resume: bool = False
     """Continue the run in --out with the settings it was started with."""

@@ -10,7 +10,7 @@ import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -24,13 +24,13 @@ from dln_jax.evaluation import function_figures as figures
 from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
-from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, steps_of, train
+from dln_jax.learning.regression import LOSSES, WIDTHS, Settings, check, grow_width, steps_of, train
 from dln_jax.learning.runs import Checkpoint, Training, fingerprint
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
-from dln_jax.nn.activations import activation
+from dln_jax.nn.activations import ALL, activation
 from dln_jax.types import InputError, require_seed
 from scripts import diffnet_table
-from scripts.arguments import refuse_given, resolved
+from scripts.arguments import Unstated, choice, refuse_given, resolved
 from scripts.command_line import run, stored_arguments, with_stored_arguments
 from scripts.progress import progress
 
@@ -56,45 +56,45 @@ SHARE_OF_DATA = 0.75
 class Arguments:
     """What to train on, how, and where the results go."""
 
-    function: str = "sin"
+    function: Annotated[str, choice((*NAMED, "FILE.npz"))] = "sin"
     """sin, cos_sin, or the path of an npz file with x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
-    loss: str = "type1"
+    loss: Annotated[str, choice(LOSSES)] = "type1"
     """type1 fits value and gradient, type2 the value only."""
-    activation: str = "cos"
-    """relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic or cubic."""
+    activation: Annotated[str, choice(ALL)] = "cos"
+    """Of the hidden layers."""
     derivative: Literal[1, 2] = 1
     """2 adds the Hessian to the loss."""
     ensemble: int = 1
     """Networks; with more than one, sin and cos_sin are trained on ±0.75 π and shown on ±π."""
     optimizer: Literal["adam", "gauss-newton"] = "gauss-newton"
     """Levenberg-Marquardt on all samples (f64) for small networks, or Adam, the published recipe, for wide ones."""
-    width: int | None = None
+    width: Unstated[int] = None
     """Hidden units per layer (default: 128 for adam; for gauss-newton grown, 2, 4, 8, 16, until the validation error
     no longer falls)."""
-    depth: int | None = None
+    depth: Unstated[int] = None
     """Hidden layers (default: 1 for one input, else 2)."""
-    steps: int | None = None
+    steps: Unstated[int] = None
     """Gauss-Newton: iterations on all samples at most, per network (default: 40)."""
-    coarse_steps: int | None = None
+    coarse_steps: Unstated[int] = None
     """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many (default:
     200; 0 for none)."""
-    epochs: int | None = None
+    epochs: Unstated[int] = None
     """Adam: passes over the data (default: 500)."""
-    batch: int | None = None
+    batch: Unstated[int] = None
     """Adam: samples per step (default: 512)."""
-    learning_rate: float | None = None
+    learning_rate: Unstated[float] = None
     """Adam: constant rate (default: 0.001)."""
-    weight_decay: float | None = None
+    weight_decay: Unstated[float] = None
     """Adam: decoupled weight decay (default: 0.000001)."""
-    samples: int | None = None
+    samples: Unstated[int] = None
     """Samples of sin and cos_sin (default: 25600)."""
-    noise: float | None = None
+    noise: Unstated[float] = None
     """Their standard deviation of the noise on x, f, gradient and Hessian (default: 0.001)."""
-    precision: Literal["f32", "f64"] | None = None
+    precision: Unstated[Literal["f32", "f64"]] = None
     """Floating-point type (default: f64 for gauss-newton, which needs it, f32 for adam)."""
     seed: int = 0
     """Of the data, the validation split, the initial parameters and the shuffling; 0 to 4294967295."""
-    out: Path | None = None
+    out: Unstated[Path] = None
     """Folder of the run (default: runs/train_diffnet-1, -2, ...)."""
     resume: bool = False
     """Continue the run, or the table, in --out with the settings it was started with."""

@@ -13,12 +13,13 @@ least-squares problem) and baseline (a network gives the rates). Friction is lea
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from scripts import dynamics_training, phase_training, pixel_training
-from scripts.arguments import refuse_given
+from scripts.arguments import Unstated, choice, refuse_given
 from scripts.command_line import run, with_stored_arguments
 from scripts.hnn_published import PIXELS
+from scripts.hnn_tasks import TASKS
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 
@@ -29,9 +30,9 @@ class Arguments(dynamics_training.Arguments):
 
     model: Literal["auto", "separable", "structured", "black-box", "pairwise", "polynomial", "baseline"] = "auto"
     """What is learned; without --task structured (auto) or black-box."""
-    task: str | None = None
+    task: Annotated[str | None, choice((*TASKS, PIXELS), unstated=True)] = None
     """Task of a phase space, in place of torques."""
-    trajectories: int | None = None
+    trajectories: Unstated[int] = None
     """--task: generated trajectories (default: the task's own number)."""
 
 

@@ -167,7 +167,7 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
             )
     state = checkpoints.load_tree(checkpoint.directory, checkpoint.name, like)
     path = checkpoint.directory / f"{checkpoint.name}.json"
-    rows = stored_rows(path, manifest, "history", (int, *[float | None] * 3, float))
+    rows = stored_rows(path, manifest, "history", (int, *[float | None] * 3, float, str))
     return state, [Progress(*map(_number, row)) for row in rows]
 
 
