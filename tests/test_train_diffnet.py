@@ -162,7 +162,7 @@ MISTAKES = {
     "precision": ({}, ["--precision", "f32"], "gauss-newton needs f64"),
     "batch": ({}, ["--batch", "-1"], "--batch is for adam"),
     "steps of adam": ({}, ["--optimizer", "adam", "--steps", "5"], "--steps is for gauss-newton"),
-    "rate": ({}, ["--optimizer", "adam", "--learning-rate", "nan"], "learning_rate is nan"),
+    "rate": ({}, ["--optimizer", "adam", "--learning-rate", "nan"], "--learning-rate is nan"),
     "coarse steps": ({}, ["--coarse-steps", "-1"], "coarse_steps is -1"),
     "samples of a file": ({}, ["--samples", "5"], "--samples is for sin and cos_sin"),
     "seed": ({}, ["--seed", "-1"], "seed is -1"),
