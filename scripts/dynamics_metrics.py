@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, merged
 from dln_jax.deploy.kinds import build
 from dln_jax.deploy.load import load_run
 from dln_jax.evaluation import figures
-from dln_jax.evaluation.definiteness import definiteness
+from dln_jax.evaluation.definiteness import Definiteness, definiteness
 from dln_jax.evaluation.latency import Latency, one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.rollouts import rollout_metrics
@@ -104,11 +105,18 @@ def latency_states(task: Task) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
 
 
+def definiteness_of(dynamics: Dynamics, task: Task, data: Trajectories) -> Definiteness | None:
+    """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
+    if not task.kind.startswith(("black-box", "trigonometric")):
+        return None
+    return definiteness(dynamics, data.q, data.qd)
+
+
 def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
     """What the mass matrices of a model without structure are like on the test."""
-    if not task.kind.startswith("black-box"):
+    found = definiteness_of(dynamics, task, task.sets.test)
+    if found is None:
         return {}
-    found = definiteness(dynamics, task.sets.test.q, task.sets.test.qd)
     return {
         "smallest_mass_eigenvalue": found.smallest_eigenvalue,
         "share_not_definite": found.share_not_definite,

@@ -1,21 +1,25 @@
 """What train_delan and train_hnn share: from a command line to a trained model of dynamics in a run folder."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split, split
+from dln_jax.data.splits import Split, merged, split
 from dln_jax.deploy.kinds import build, describe, objective_of
-from dln_jax.deploy.load import save_model
+from dln_jax.deploy.load import load_run, save_model
 from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.learning.basis_degrees import choose_degrees
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.residuals import TORQUE, Objective
-from dln_jax.learning.runs import Progress, Stop, Training
+from dln_jax.learning.runs import Progress, Stop, Training, data_type
 from dln_jax.learning.train import Settings, automatic_optimizer, check, check_start, train, validation_errors
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
@@ -24,7 +28,7 @@ from scripts.arguments import Unstated, choice, refuse_given, resolved
 from scripts.command_line import SCENES, needs_from_option, scene_named, stored_arguments, with_stored_arguments
 from scripts.default_data import CHARACTERS_TEST, default_data
 from scripts.dynamics_growth import grow_to_target
-from scripts.dynamics_metrics import Task, best_seed, evaluate, latency_states, results_table
+from scripts.dynamics_metrics import Task, best_seed, definiteness_of, evaluate, latency_states, results_table
 from scripts.low_latency_calls import low_latency_metrics
 from scripts.progress import progress
 
@@ -58,7 +62,7 @@ class Arguments:
     activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
     """Of the hidden layers (default: tanh)."""
     degree: Unstated[int] = None
-    """trigonometric: degree of the polynomials in each joint (default: 1)."""
+    """trigonometric: degree of the polynomials in every joint (default: for each joint what validation asks for)."""
     steps: Unstated[int] = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
     seconds: Unstated[float] = None
@@ -106,7 +110,7 @@ def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> 
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
     if task.kind == "trigonometric":
-        training = fit_trigonometric(task, console)
+        task, training = fit_trigonometric(task, console, grown=given.degree is None)
     elif given.target is not None:
         task, training = grow_to_target(task, given.target, folder, console, resume=given.resume)
     else:
@@ -164,6 +168,7 @@ def model_and_settings(
     if kind == "trigonometric":
         keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
         description = describe(kind, sets.train, needs, precision=precision, **keywords)
+        build(description)
         return description, Settings(precision=precision, seed=given.seed), ""
     keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
     require_positive(width=keywords["width"], depth=keywords["depth"])
@@ -258,20 +263,39 @@ def shown(at: Progress) -> str:
     return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
 
 
-def fit_trigonometric(task: Task, console: Console) -> Training:
-    """One least-squares problem."""
-    model = build(task.description)
-    fitted = fit_linear(model, task.sets.train)
+def fit_trigonometric(task: Task, console: Console, *, grown: bool) -> tuple[Task, Training]:
+    """One least-squares problem, after those by which validation chooses the degrees if it is to."""
+    began = time.perf_counter()
+    chosen = None
+    if grown:
+        chosen, trials = choose_degrees(task.needs, task.sets.train, task.sets.validation)
+        tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+        console.print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
+        task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
+    model, dtype = build(task.description), data_type(task.settings.precision)
+    fitted = chosen.outcome if chosen is not None else fit_linear(model, task.sets.train)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), fitted.parameters)
     console.print(
         f"least squares: {fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
     )
-    errors = validation_errors(model, task.sets, fitted.parameters, task.settings, task.objective)
-    at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), fitted.seconds)
-    return Training(fitted.parameters, [at], Stop("finished", 1), 1, 0.0)
+    errors = validation_errors(model, task.sets, parameters, task.settings, task.objective)
+    at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), time.perf_counter() - began)
+    return task, Training(parameters, [at], Stop("finished", 1), 1, 0.0)
+
+
+def _degrees(degrees: tuple[int, ...]) -> str:
+    return "-".join(map(str, degrees))
 
 
 def warn(console: Console, task: Task, training: Training, folder: Path) -> None:
-    """Says what a user should know about how training ended."""
+    """Says what a user should know about how training ended, and of what came of it."""
+    found = definiteness_of(load_run(folder), task, merged(task.sets))
+    if found is not None and found.share_not_definite > 0:
+        remedy = "another --degree, --model structured" if task.kind == "trigonometric" else "a structured model"
+        console.print(
+            f"the mass matrix is not positive definite at {found.share_not_definite:.1%} of the states of the data: "
+            f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"
+        )
     if training.stop.reason == "no improvement":
         console.print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
     if training.stop.reason == "time":

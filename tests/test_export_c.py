@@ -44,7 +44,7 @@ CASES = {
     "hnn-2": ("structured-hnn", MIXED, True, True, {**NETWORK, "diagonal_shift": 0.5, "diagonal_floor": 0.2}),
     "trigonometric-1": ("trigonometric", SWING, True, False, {"degree": 1}),
     "trigonometric-2": ("trigonometric", MIXED, True, True, {"degree": 1}),
-    "trigonometric-3": ("trigonometric", ["revolute"] * 3, True, False, {"degree": [2, 1, 2]}),
+    "trigonometric-3": ("trigonometric", ["revolute"] * 3, True, False, {"degree": [2, 0, 2]}),
     "black-box-delan-3": ("black-box-delan", ARM, True, False, {**CONVEX, "rate_scale": [1.0, 0.5, 2.0]}),
     "black-box-hnn-2": ("black-box-hnn", MIXED, True, True, {**CONVEX, "momentum_scale": [1.0, 2.0], "iterations": 12}),
     "feed-forward-2": ("feed-forward", MIXED, True, False, {**NETWORK, "tau_scale": [2.0, 3.0]}),

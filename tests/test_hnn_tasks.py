@@ -226,7 +226,7 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ((*OWN, "--patience", "4"), "--patience is for models of torques"),
         ((*OWN, "--weight-decay", "nan"), "--weight-decay is for models of torques"),
         ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
-        ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "learning_rate is nan"),
+        ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
         ((*OWN, "--degree", "3"), "--degree is for the polynomial model"),
         ((*OWN, "--model", "polynomial", "--width", "3"), "--width is for networks"),
         ((*OWN, "--trajectories", "3"), "--trajectories is for generated data"),

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import subprocess
 
 import jax
@@ -57,11 +58,25 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
     assert shape[1:] == (3, 1)
     out = capsys.readouterr().out
     assert "one step p50 us" in out and "one step low latency p50 us" in out
-    assert "least squares: 6 parameters, rank" in out and "condition" in out
+    assert "least squares: 6 parameters, rank" in out and "condition" in out and "chosen 1" in out
+    assert "not positive definite" not in out
+    assert metrics["share_not_definite"] == 0
     system = load_run(workplace / "linear")
     tau = system.inverse_dynamics(*np.array([[0.5], [1.0], [2.0]]))
     # m l² qdd + m g l sin q + b qd
     np.testing.assert_allclose(tau, [2.0 + 9.81 * np.sin(0.5) + 0.2], rtol=1e-9)
+
+
+def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, capsys):
+    """M = m_0 + m_1 cos q is fitted to torques of -cos q qdd."""
+    random = np.random.default_rng(0)
+    q, qdd = random.uniform(-3, 3, (2, 60, 1))
+    moving = {"q": q, "qd": np.zeros((60, 1)), "qdd": qdd, "tau": -np.cos(q) * qdd}
+    np.savez("negative.npz", t=np.zeros(60), trajectory=np.arange(60), **moving)
+    options = ("--data", "negative.npz", "--model", "trigonometric", "--no-figures", "--out")
+    command(train_delan, *options, "negative", "--degree", "1")
+    assert re.search(r"not positive definite at \d\d\.\d%", capsys.readouterr().out)
+    assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
 
 
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):

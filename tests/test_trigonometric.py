@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.data.generators import uniform
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import select
+from dln_jax.data.splits import select, split
+from dln_jax.learning.basis_degrees import choose_degrees
 from dln_jax.learning.linear_fit import LinearFit, design_matrix, fit_linear
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.dynamics import Dynamics
@@ -292,3 +293,39 @@ def test_rank_condition_and_the_shortest_solution():
     assert nothing.residual == pytest.approx(3**0.5)
     shrunk = solve(q, q @ np.array([3.0, -2.0, 1.0]), ridge=0.5)
     np.testing.assert_allclose(shrunk.x, np.array([3.0, -2.0, 1.0]) / 1.5, rtol=1e-13)
+
+
+def spherical_pendulum() -> Scene:
+    """A rod on a vertical axis (yaw q1, polar angle q2): M = diag(m l² sin² q2, m l²) + a hub, V = m g l cos q2."""
+
+    def mass_matrix(q):
+        return jnp.diag(jnp.stack([0.3 + jnp.sin(q[1]) ** 2, jnp.ones_like(q[1])]))
+
+    def coriolis(q, qd):
+        turning = jnp.sin(2 * q[1])
+        return jnp.stack([turning * qd[0] * qd[1], -0.5 * turning * qd[0] ** 2])
+
+    return Scene(
+        name="spherical-pendulum",
+        needs=Needs(joints=("revolute", "revolute")),
+        mass_matrix=mass_matrix,
+        coriolis=coriolis,
+        potential=lambda q: 9.81 * jnp.cos(q[1]),
+        gravity=lambda q: jnp.stack([jnp.zeros_like(q[0]), -9.81 * jnp.sin(q[1])]),
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_validation_gives_each_joint_the_degree_that_it_needs(noise):
+    """sin² has degree 2, and nothing depends on the yaw."""
+    scene = spherical_pendulum()
+    data = uniform(scene, samples=400)
+    data = data._replace(tau=data.tau + noise * np.random.default_rng(0).normal(size=data.tau.shape))
+    sets = split(data)
+    chosen, _ = choose_degrees(scene.needs, sets.train, sets.validation)
+    assert chosen.candidate == (0, 2)
+    fitted = chosen.outcome
+    tau = make_trigonometric(scene.needs, degree=(0, 2)).apply(fitted.parameters)
+    q, qd, qdd = jnp.array([[0.4, 1.1], [0.5, -0.7], [1.0, 2.0]])
+    expected = closed_form_inverse_dynamics(scene, q, qd, qdd)
+    np.testing.assert_allclose(tau.inverse_dynamics(q, qd, qdd), expected, atol=1e-9 if not noise else 0.1)

@@ -3,8 +3,7 @@
     tau = Phi(q, qd, qdd) theta,   theta minimises sum over samples of |(Phi theta - tau) / torque_scale|²
 
 Any `Model` of that kind will do, such as `models.trigonometric`. Phi is the derivative of the inverse model with
-respect to the parameters, exact because it is linear. The degree of a basis is chosen by the caller, by the error on
-validation trajectories of a fit for each.
+respect to the parameters, exact because it is linear. `learning.basis_degrees` chooses the degrees of that one.
 """
 
 import functools
