@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -21,11 +22,13 @@ from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.deploy.load_function import load_function, save_function
 from dln_jax.evaluation import function_figures as figures
-from dln_jax.evaluation.function_metrics import Prediction, errors, predictions, typical_spread
+from dln_jax.evaluation.figures import training_curve
+from dln_jax.evaluation.function_metrics import errors, predictions, typical_spread
 from dln_jax.evaluation.latency import one_step
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.learning.growth import Trial
 from dln_jax.learning.regression import LOSSES, WIDTHS, Settings, check, grow_width, steps_of, train
-from dln_jax.learning.runs import Checkpoint, Training, fingerprint
+from dln_jax.learning.runs import Checkpoint, Progress, Training, fingerprint, one_after_the_other
 from dln_jax.learning.standardisation import Units, layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.nn.activations import ALL, activation
 from dln_jax.types import InputError, require_seed
@@ -141,14 +144,16 @@ def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> 
     """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
-    settings, training = fit(task, folder, resume=given.resume, console=console)
+    settings, training, trials = fit(task, folder, resume=given.resume, console=console)
     task = task._replace(settings=settings)
     write_json(folder / CONFIG, {**stored_arguments(given), "chosen": {**settings._asdict(), **of_named(given)}})
     if training.stop.reason == "not finite":
         console.print("the loss stopped being finite; the run keeps the best parameters before that")
     layers = layers_in_own_units(training.parameters, task.units)
     save_function(folder, layers, activation=task.settings.activation, precision=task.settings.precision)
-    metrics = evaluate(folder, task, training, draw=given.figures)
+    metrics = evaluate(folder, task, training)
+    if given.figures:
+        draw_figures(folder, task, training, trials)
     write_json(folder / "metrics.json", metrics)
     console.print(results_table(metrics, task))
     if task.settings.activation == "relu":
@@ -156,8 +161,8 @@ def train_into(folder: Path, given: Arguments, task: Task, console: Console) -> 
     console.print(f"run folder: {folder}")
 
 
-def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Settings, Training]:
-    """Trains at the width asked for, or at growing ones; the settings that were chosen, and the training."""
+def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Settings, Training, list[Trial]]:
+    """Trains at the width asked for, or at growing ones: the settings chosen, their training, and all trials."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     identity = {"data": fingerprint(array for data in standard for array in data)}
 
@@ -170,15 +175,15 @@ def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Se
                 standard,
                 settings,
                 checkpoint=checkpoint,
-                report=lambda at: show(min(at.step, total), f"loss {at.loss:.3e}  validation {at.validation:.3e}"),
+                report=lambda at: show(min(at.step, total), shown(settings, at)),
             )
 
     if not task.grown:
-        return task.settings, train_one(task.settings)
+        return task.settings, train_one(task.settings), []
     chosen, trials = grow_width(standard, task.settings, train_one, widths=WIDTHS)
     tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
     console.print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
-    return chosen.candidate, chosen.outcome
+    return chosen.candidate, chosen.outcome, trials
 
 
 def check_table(given: Arguments) -> None:
@@ -187,6 +192,12 @@ def check_table(given: Arguments) -> None:
         if field.name not in OF_TABLE and getattr(given, field.name) != field.default:
             name = field.name.replace("_", "-")
             raise InputError(f"--{name} is not for --table, which trains all that was published; leave it out")
+
+
+def shown(settings: Settings, at: Progress) -> str:
+    """A line of progress, with what is trained on what."""
+    stage = f", {at.stage}" if at.stage else ""
+    return f"width {settings.width}{stage}: loss {at.loss:.3e}  validation {at.validation:.3e}"
 
 
 def prepare(given: Arguments) -> Task:
@@ -248,20 +259,18 @@ def announce(console: Console, task: Task) -> None:
         console.print(RELU)
 
 
-def evaluate(folder: Path, task: Task, training: Training, *, draw: bool) -> dict[str, float]:
-    """Loads the stored model as a user would, measures it on the test samples, and draws it."""
+def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
+    """Loads the stored model as a user would, and measures it on the test samples."""
     loaded = load_function(folder)
     function = activation(task.settings.activation)
     tested = predictions(loaded.layers, task.test.x, activation=function)
-    shown = predictions(loaded.layers, task.shown.x, activation=function)
     metrics = errors(tested.mean, task.test)
-    if task.bound is not None and shown.spread is not None:
+    spread = predictions(loaded.layers, task.shown.x, activation=function).spread if task.bound is not None else None
+    if task.bound is not None and spread is not None:
         inside = np.all(abs(task.shown.x) <= task.bound, axis=1)
-        metrics["spread_inside"] = typical_spread(shown.spread, inside)
-        metrics["spread_outside"] = typical_spread(shown.spread, ~inside)
+        metrics["spread_inside"] = typical_spread(spread, inside)
+        metrics["spread_outside"] = typical_spread(spread, ~inside)
     latency = one_step(loaded.derivatives, [(x,) for x in task.test.x[:512]], calls=1000)
-    if draw:
-        draw_figures(folder, task, shown, training)
     return {
         **metrics,
         "validation_loss": float(training.validation),
@@ -276,10 +285,11 @@ def evaluate(folder: Path, task: Task, training: Training, *, draw: bool) -> dic
     }
 
 
-def draw_figures(folder: Path, task: Task, shown: Prediction, training: Training) -> None:
+def draw_figures(folder: Path, task: Task, training: Training, trials: list[Trial]) -> None:
     """Writes what fits the number of inputs."""
-    inputs = task.test.inputs
-    drawn = {"training": figures.training_curve(training.history)} if training.history else {}
+    inputs, loaded = task.test.inputs, load_function(folder)
+    shown = predictions(loaded.layers, task.shown.x, activation=activation(task.settings.activation))
+    drawn = {"training": training_figure(training, trials)} if training.history else {}
     if inputs == 1:
         drawn["curves"] = figures.curves(task.shown, shown.mean)
     elif task.name in NAMED:
@@ -291,6 +301,19 @@ def draw_figures(folder: Path, task: Task, shown: Prediction, training: Training
         drawn["ensemble"] = figures.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
     for name, figure in drawn.items():
         write_figure(folder / f"{name}.png", figure)
+
+
+def training_figure(training: Training, trials: list[Trial]) -> Figure:
+    """The losses of every width that was tried, one after the other."""
+    words = {"error": "loss", "loss": "training loss", "unit": "loss, in the units of the fit"}
+    before, histories = 0, []
+    for trial in trials:
+        if trial.outcome is training:
+            before = sum(history[-1].step for history in histories)
+        name = f"width {trial.candidate.width}"
+        histories.append([at._replace(stage=name) for at in trial.outcome.history])
+    joined = one_after_the_other(histories) if trials else training.history
+    return training_curve(joined, best_step=before + training.best_step, **words)
 
 
 def results_table(metrics: dict[str, float], task: Task) -> Table:

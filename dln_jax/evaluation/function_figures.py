@@ -3,7 +3,7 @@
 Each function returns a Matplotlib figure and touches no global state.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.learning.runs import Progress
 
 TRUTH, MODEL, ERROR = "#111111", "#d1495b", "#2e6f95"
 SIGNED, POSITIVE = "RdBu_r", "viridis"
@@ -176,21 +175,6 @@ def ensemble_maps(spread: FunctionSamples, *, bound: float) -> Figure:
         axis.set_xlabel("$x_1$")
         axis.set_aspect("equal")
     figure.axes[0].set_ylabel("$x_2$")
-    return figure
-
-
-def training_curve(history: Sequence[Progress]) -> Figure:
-    """Training and validation loss against steps."""
-    figure = _figure(7.0, 4.0)
-    axis = figure.subplots()
-    steps = [progress.step for progress in history]
-    marker = "." if len(history) < 40 else ""
-    axis.semilogy(steps, [at.loss for at in history], marker=marker, color=TRUTH, label="training")
-    axis.semilogy(steps, [at.validation for at in history], "--", marker=marker, color=MODEL, label="validation")
-    axis.set_xlabel("step")
-    axis.set_ylabel("loss")
-    axis.grid(True, alpha=0.25)
-    axis.legend(frameon=False)
     return figure
 
 

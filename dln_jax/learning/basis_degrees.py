@@ -1,8 +1,8 @@
 """How much of a trigonometric basis data ask for: a degree for each joint, chosen by validation trajectories.
 
 One degree for all joints grows until it no longer helps (`learning.growth`); where that is more than 1, each joint in
-turn is given the smallest degree that is not significantly worse. A joint that neither turns the mass matrix nor lifts a weight, such as
-an arm's first vertical axis, ends at degree 0, which divides the basis by 2 n + 1.
+turn is given the smallest degree that is not significantly worse. A joint that neither turns the mass matrix nor lifts
+a weight, such as an arm's first vertical axis, ends at degree 0, which divides the basis by 2 n + 1.
 """
 
 import jax

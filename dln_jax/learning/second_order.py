@@ -25,6 +25,8 @@ MOST_PARAMETERS = 2_000
 MOST_BYTES = 2**31
 """Of the normal equations and a kept Jacobian, for `choose_optimizer`."""
 
+STAGES = ("some samples", "all samples")
+"""Of a run that starts on a part of the samples."""
 COARSE_SAMPLES = 2_048
 """Samples of the first phase, unless the budget says otherwise."""
 
@@ -106,7 +108,8 @@ def train_second_order(
         nonlocal elsewhere
         seconds = earlier + time.perf_counter() - began - elsewhere
         value, shown = (plain(each) for each in np.moveaxis(np.asarray(at.scores), -1, 0))
-        history.append(Progress(before + int(np.max(at.iteration)), plain(at.loss), value, shown, seconds))
+        step, stage = before + int(np.max(at.iteration)), STAGES[phase] if coarse else ""
+        history.append(Progress(step, plain(at.loss), value, shown, seconds, stage))
         storing_from = time.perf_counter()
         if checkpoint is not None:
             store(checkpoint, (optimised, jnp.asarray(phase), jnp.asarray(before)), history)
