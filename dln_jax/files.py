@@ -127,9 +127,10 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Itera
 
     Raises:
         InputError: the folder holds something already, cannot be created, or another process is writing there.
+        KeyboardInterrupt: with the folder as its argument, so that whoever reports it can say where the run is.
     """
     if resume and out is not None:
-        with locked(out):
+        with locked(out), _naming_itself(out):
             yield out
         return
     folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
@@ -137,7 +138,8 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Itera
     with locked(folder):
         _require_free(folder)
         try:
-            yield folder
+            with _naming_itself(folder):
+                yield folder
         except InputError:
             _withdraw(folder, created)
             raise
@@ -169,6 +171,14 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextmanager
+def _naming_itself(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(folder) from stop
 
 
 def _is_partial(entry: Path) -> bool:

@@ -68,8 +68,17 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
     except KeyboardInterrupt as stop:
-        print("\n".join(["interrupted", *map(str, stop.args)]), file=sys.stderr)
+        print(interrupted(f"python -m {name}", arguments, *stop.args), file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def interrupted(command: str, arguments: type, folder: Path | None = None) -> str:
+    """What a user is told whose interrupt ended a command, in whose folder there may be a run to continue."""
+    if folder is None:
+        return "interrupted"
+    if "resume" in {field.name for field in dataclasses.fields(arguments)} and (folder / CONFIG).is_file():
+        return f"interrupted; continue with: {command} --out {folder} --resume"
+    return f"interrupted; {folder} is incomplete"
 
 
 def require_storable(given: Any) -> None:

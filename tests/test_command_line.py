@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import pytest
 from rich.console import Console
 
+from dln_jax.files import CONFIG, run_folder
 from scripts.arguments import Unstated, choice, names_in
 from scripts.command_line import run
 from scripts.progress import progress
@@ -128,3 +129,35 @@ def test_an_interrupt_during_imports_is_one_word(tmp_path):
     child.send_signal(signal.SIGINT)
     said = child.stderr.read()
     assert said == "interrupted\n" and child.wait() in (-signal.SIGINT, 130)
+
+
+@dataclass(frozen=True)
+class Resumable:
+    """Of a command that can continue."""
+
+    resume: bool = False
+    """Continue."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stored", "said"),
+    [
+        (Resumable, True, "interrupted; continue with: python -m {module} --out {folder} --resume"),
+        (Resumable, False, "interrupted; {folder} is incomplete"),
+        (Arguments, True, "interrupted; {folder} is incomplete"),
+    ],
+)
+def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):
+    folder = tmp_path / "run"
+
+    def main(given):
+        with run_folder(folder, "command"):
+            if stored:
+                (folder / CONFIG).write_text("{}")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["command"])
+    with pytest.raises(SystemExit) as ended:
+        run(main, arguments)
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == said.format(module=__name__, folder=folder) + "\n"
