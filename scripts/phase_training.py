@@ -194,6 +194,16 @@ def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained
         write_figure(folder / "training.png", figures.training_curve(named, best_step=best, **words))
 
 
+MEANINGS = {
+    "published_energy_mse": ("published energy along predicted motions, mean square error", "units of that energy²"),
+    "energy_mse": ("energy along predicted motions, mean square error", "J²"),
+    "rollout_mse": ("(q, p) of predicted motions, mean square error", "units of q² and p²"),
+    "train_loss": ("(qd, pd) at training states, mean square error", "units of qd² and pd²"),
+    "test_loss": ("(qd, pd) at test states, mean square error", "units of qd² and pd²"),
+    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", "units of qd² and pd²"),
+    "validation_error": ("validation loss of the last stage", "see training.png"),
+}
+"""What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
 UNITS = {
     **dict.fromkeys(("train_seconds", "compile_seconds"), "s"),
     **{f"one_step_{mode}{quantile}_us": "µs" for mode in ("", "low_latency_") for quantile in ("p50", "p99")},
@@ -208,5 +218,7 @@ def results_table(metrics: dict[str, float], problem: Problem) -> Table:
     table.add_column("unit")
     for name, value in metrics.items():
         if np.isfinite(value):
-            table.add_row(name.replace("_", " "), f"{value:.4g}", UNITS.get(name, ""))
+            quantity = next((key for key in MEANINGS if name.startswith(key)), None)
+            meaning, unit = MEANINGS[quantity] if quantity else (name, UNITS.get(name, ""))
+            table.add_row((meaning + name.removeprefix(quantity or name)).replace("_", " "), f"{value:.4g}", unit)
     return table

@@ -316,12 +316,23 @@ def training_figure(training: Training, trials: list[Trial]) -> Figure:
     return training_curve(joined, best_step=before + training.best_step, **words)
 
 
+UNITS = {
+    "value_mse": "y²",
+    "gradient_mse": "(y / x)²",
+    "hessian_mse": "(y / x²)²",
+    "spread_inside": "y",
+    "spread_outside": "y",
+    "validation_loss": "units of the fit",
+}
+"""Of metrics, in those of the data."""
+
+
 def results_table(metrics: dict[str, float], task: Task) -> Table:
     """The figures that a user wants to see, with units."""
     table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.settings.precision}")
     table.columns[1].justify = "right"
     for key, value in metrics.items():
-        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else ""
+        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else UNITS.get(key, "")
         small = f"{value:.2e}" if re.search("_mse|_loss|spread", key) else f"{value:,.1f}"
         table.add_row(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else small, unit)
     return table

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from dln_jax.data import generators
+from dln_jax.evaluation import figures
 from dln_jax.evaluation.latency import one_step
 from dln_jax.evaluation.metrics import errors, predictions
 from dln_jax.evaluation.report import Row, conditions, write_report
+from dln_jax.learning.runs import Progress, one_after_the_other
 from dln_jax.mechanics.hamiltonian import hamiltonian_from_lagrangian
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import dynamics
@@ -80,3 +82,22 @@ def test_a_report_is_plain_json_and_passes_only_what_meets_its_bound(tmp_path):
     assert list(report["rows"][0]) == ["case", "quantity", "value", "unit", "reference", "bound", "pass"]
     assert report["rows"][2]["value"] is None
     assert {"machine", "versions", "dtype", "threads", "seeds", "command"} <= set(report["conditions"])
+
+
+def test_a_training_figure_has_every_stage_with_its_name_and_a_line_where_it_ends():
+    def stage(name, steps):
+        return [Progress(step, 1.0 / step, 2.0 / step, float("nan"), 0.0, name) for step in steps]
+
+    for first, rotation in ((range(1, 6), 0.0), ([1], 90.0)):
+        history = one_after_the_other([stage("rates", first), stage("motions", range(5, 11, 5))])
+        (axis,) = figures.training_curve(history, best_step=history[-1].step).axes
+        assert [(text.get_text(), text.get_rotation()) for text in axis.texts] == [
+            ("rates", rotation),
+            ("motions", rotation),
+        ]
+        ends = len(first) if rotation == 0.0 else 1
+        drawn = [line.get_xdata() for line in axis.lines]
+        assert any(np.array_equal(x, [ends, ends]) for x in drawn)
+        # Training and validation of each stage: no curve crosses the line.
+        curves = [x for x in drawn if x[0] != x[-1] or len(x) == 1]
+        assert all(max(x) <= ends or min(x) > ends for x in curves) and len(curves) == 4

@@ -179,3 +179,21 @@ def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
     plant = hamiltonian.dynamics(H, dissipation=pendulum(friction=0.2).dissipation)
     errors = residuals(CANONICAL, plant, arrays(CANONICAL, data, jnp.float64))
     assert errors.shape == (120, 2) and float(jnp.abs(errors).max()) < 1e-12
+
+
+def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_no_mistake(workplace, capsys):
+    data = generators.free_swing(pendulum(), trajectories=7, steps=40)
+    torque = np.random.default_rng(0).normal(size=data.tau.shape)
+    data = data._replace(tau=data.tau + 1e-3 * torque)
+    schema.save("swings.npz", data)
+    options = ("--width", "3", "--depth", "1", "--steps", "2", "--no-figures", "--scene", "pendulum", "--data")
+    command(train_delan, *options, "swings.npz", "--out", "swings")
+    out = capsys.readouterr().out
+    assert "true plant" in out and re.search(r"valid prediction time, torque held +│ +[\d.]+ │ +[\d.]+ │ s", out)
+    metrics = metrics_of(workplace / "swings")
+    assert metrics["normalised_state_error_ceiling"] < metrics["normalised_state_error"]
+    still = np.where((data.trajectory == 5)[:, None], 0.3, data.q)
+    schema.save("still.npz", data._replace(q=still))
+    command(train_delan, *options, "still.npz", "--out", "still")
+    assert "no rollouts: q[:, 0] is the same in all samples" in capsys.readouterr().out
+    assert "torque_mse" in metrics_of(workplace / "still")

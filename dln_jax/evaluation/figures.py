@@ -97,7 +97,7 @@ def training_curve(
         if start:
             axis.axvline(start, color="0.4", linewidth=0.8)
         if upright:
-            place, style = (start, 0.98), {"rotation": 90.0, "ha": "left", "va": "top"}
+            place, style = (start + 0.004 * last, 0.98), {"rotation": 90.0, "ha": "left", "va": "top"}
         else:
             place, style = (start + length / 2, 1.02), {"rotation": 0.0, "ha": "center", "va": "bottom"}
         name = axis.text(*place, stage[0].stage, transform=axis.get_xaxis_transform(), fontsize=8, color="0.3")
