@@ -146,7 +146,8 @@ def minimise(
     reached = dispatched = False
     while remaining := _remaining(state, iterations):
         reached = bool(np.all(np.asarray(state.best_validation) <= target))
-        if reached or (dispatched and clock() - start >= seconds):
+        late = clock() - start >= seconds
+        if reached or (late and dispatched):
             break
         dispatched = True
         state = jax.block_until_ready(optimiser.run(state, arrays, min(dispatch, remaining)))
