@@ -184,6 +184,8 @@ MEANINGS = {
     "energy_error_j": "energy balance error of a rollout",
     "one_step_p50_us": "one call of the inverse model, median",
     "one_step_p99_us": "one call of the inverse model, 99 %",
+    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
+    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
 }
 """Of the metrics' names; others say it themselves."""
 

@@ -27,7 +27,7 @@ from scripts import (
     low_latency_calls,
 )
 from scripts.arm_models import needs_of
-from scripts.arm_table import letters
+from scripts.arm_table import letters, published_split
 from scripts.hnn_tasks import Problem
 
 
@@ -101,7 +101,7 @@ def small_run(tmp_path_factory):
     """A run with random parameters."""
     folder = tmp_path_factory.mktemp("runs") / "structured-delan"
     folder.mkdir()
-    sets = letters(None)
+    sets = published_split(letters(None))
     description = describe(
         "structured-delan", sets.train, needs_of(sets), precision="f64", width=2, depth=1, activation="tanh"
     )

@@ -314,10 +314,6 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
         export_c(description, large, tmp_path, precision="f32")
     with pytest.raises(InputError, match="precision is 'f16'"):
         export_c(description, parameters, tmp_path, precision="f16")
-    shallow = {**description, "depth": 0}
-    with pytest.raises(InputError, match="no hidden layer"):
-        like = jax.eval_shape(build(shallow).init, KEY)
-        export_c(shallow, jax.tree.map(lambda leaf: np.zeros(leaf.shape), like), tmp_path)
     with pytest.raises(InputError, match="activation is 'sigmoid'"):
         export_c({**description, "activation": "sigmoid"}, parameters, tmp_path)
     (tmp_path / "file").touch()

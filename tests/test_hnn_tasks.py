@@ -151,7 +151,7 @@ def test_mistakes_are_one_line(workplace, capsys):
     two = schema.load("swing.npz")
     schema.save("double.npz", two._replace(q=np.hstack([two.q, two.q]), estimated=("qd", "qdd", "tau")))
     cases = [
-        (("--tasks", "spring,pixel"), "task 'pixel' is unknown"),
+        (("--tasks", "spring,pixel"), "--tasks: 'pixel' is unknown"),
         (("--seeds", "0"), "seeds is 0"),
         (("--steps", "0"), "steps is 0"),
         (("--real-pendulum", "missing.npz"), "no such file"),
@@ -221,10 +221,10 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         (("--model", "baseline"), "expected one of auto, structured, black-box"),
         (("--trajectories", "5"), "--trajectories is for a --task"),
         ((*OWN, "--seed", "-1"), "seed is -1"),
-        ((*OWN, "--seconds", "nan"), "seconds is nan"),
+        ((*OWN, "--seconds", "nan"), "--seconds is nan"),
         ((*OWN, "--batch", "-1"), "--batch is for models of torques"),
         ((*OWN, "--patience", "4"), "--patience is for models of torques"),
-        ((*OWN, "--weight-decay", "nan"), "--weight-decay is for models of torques"),
+        ((*OWN, "--weight-decay", "0.1"), "--weight-decay is for models of torques"),
         ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
         ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
         ((*OWN, "--degree", "3"), "--degree is for the polynomial model"),

@@ -235,7 +235,7 @@ def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
         (("--method", "ppo", "--resume", "--out", "run"), "holds none"),
         (("--episode", "50"), "a window has 40 steps"),
         (("--window", "7"), "a window has 7 steps"),
-        (("--window", "8", "--method", "evolution"), "--window is for gradients"),
+        (("--window", "8", "--method", "evolution"), "--window is not used by --method evolution"),
         (("--seed", "-1"), "seed is -1"),
         (("--seed", "4294967295", "--seeds", "2"), "and 1 after it"),
     ],

@@ -42,7 +42,7 @@ def test_the_script_writes_its_report_and_figures(tmp_path, capsys, monkeypatch)
 def test_refuses_bad_input(tmp_path, capsys):
     out = tmp_path / "a"
     assert "'nonsense' is unknown; choose from" in refused(capsys, softbody_report, "--only", "nonsense", "--out", out)
-    assert "names no subject" in refused(capsys, softbody_report, "--only", ",", "--out", out)
+    assert "names nothing" in refused(capsys, softbody_report, "--only", ",", "--out", out)
     assert not out.exists()
     with pytest.raises(InputError, match="has no 'nonsense'"):
         measure("hard", "nonsense")

@@ -58,6 +58,6 @@ def test_the_script_refuses_bad_input(tmp_path, capsys):
     assert "'nonsense' is unknown; choose from" in refused(
         capsys, stability, "--only", "nonsense", "--out", tmp_path / "a"
     )
-    assert "names no case" in refused(capsys, stability, "--only", ",", "--out", tmp_path / "a")
+    assert "names nothing" in refused(capsys, stability, "--only", ",", "--out", tmp_path / "a")
     assert "steps is 0" in refused(capsys, stability, "--steps", "0", "--out", tmp_path / "a")
     assert not (tmp_path / "a").exists()

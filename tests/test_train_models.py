@@ -57,7 +57,7 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
     assert options == ["--run", str((workplace / "linear").resolve()), "--function", "inverse_dynamics"]
     assert shape[1:] == (3, 1)
     out = capsys.readouterr().out
-    assert "one step p50 us" in out and "one step low latency p50 us" in out
+    assert "one call of the inverse model, median" in out and "one call in low-latency mode, median" in out
     assert "least squares: 6 parameters, rank" in out and "condition" in out and "chosen 1" in out
     assert "not positive definite" not in out
     assert metrics["share_not_definite"] == 0

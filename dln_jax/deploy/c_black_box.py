@@ -10,7 +10,7 @@ import numpy as np
 from dln_jax.deploy import c_joints, c_networks
 from dln_jax.deploy.c_text import table
 from dln_jax.models.black_box import per_coordinate
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 
 _STATE = """
 /* What the network sees of the state: features of q, then ${second} / ${scale}. */
@@ -149,16 +149,10 @@ void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
-    """Body of the C source, with `$name` and `${f}` left to fill in.
-
-    Raises:
-        InputError: a network without a hidden layer.
-    """
+    """Body of the C source, with `$name` and `${f}` left to fill in."""
     lagrangian = description["kind"] == "black-box-delan"
     scale, second = ("rate_scale", "qd") if lagrangian else ("momentum_scale", "p")
     network = c_networks.from_haiku("energy", parameters, "lagrangian" if lagrangian else "hamiltonian")
-    if not network.widths:
-        raise InputError("the model's network has no hidden layer; exported C needs one, so train with depth >= 1")
     friction = parameters.get("~", {}).get("viscous_friction")
     d, features = needs.degrees_of_freedom, c_joints.count(needs)
     enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]

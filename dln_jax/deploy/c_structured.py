@@ -12,21 +12,15 @@ from dln_jax.deploy import c_joints, c_networks
 from dln_jax.deploy.c_natural import DELAN, FACTOR, HAMILTONIAN
 from dln_jax.deploy.c_networks import Network
 from dln_jax.deploy.c_text import number, table
-from dln_jax.types import InputError, Needs
+from dln_jax.types import Needs
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
-    """Body of the C source, with `$name` and `${f}` left to fill in.
-
-    Raises:
-        InputError: networks without a hidden layer.
-    """
+    """Body of the C source, with `$name` and `${f}` left to fill in."""
     delan = description["kind"] == "structured-delan"
     shared = "energies/~/linear_0" in parameters
     factor = c_networks.from_haiku("factor", parameters, "energies" if shared else "cholesky")
     potential = None if shared or not needs.gravity else c_networks.from_haiku("potential", parameters, "potential")
-    if not factor.widths:
-        raise InputError("the model's networks have no hidden layer; exported C needs one, so train with depth >= 1")
     shift, floor = (float(description.get(key, default)) for key, default in _defaults(delan))
     friction = parameters.get("~", {}).get("viscous_friction")
     entries = needs.degrees_of_freedom * (needs.degrees_of_freedom + 1) // 2

@@ -15,7 +15,7 @@ def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
         InputError: another shape, or nothing that is an array of numbers.
     """
     try:
-        if argument.shape == shape:
+        if argument.shape == shape and argument.dtype.kind in "fiu":
             return argument
     except AttributeError:
         pass
