@@ -20,7 +20,7 @@ if CACHE not in os.environ:
     atexit.register(shutil.rmtree, os.environ[CACHE], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.02)
 
 # Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
