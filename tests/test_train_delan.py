@@ -178,8 +178,10 @@ def arrays(**changes):
     return {key: value for key, value in data.items() if value is not None}
 
 
-MARKED = np.where(np.arange(40).reshape(20, 2) == 7, 1e308, np.random.default_rng(1).normal(size=(20, 2)))
-"""A mark for a missing value among numbers of size one."""
+def marked(mark, size=1.0):
+    """A mark for a missing value among numbers of this size."""
+    return np.where(np.arange(40).reshape(20, 2) == 7, mark, size * np.random.default_rng(1).normal(size=(20, 2)))
+
 
 MISTAKES = {
     "missing file": (None, [], "no such file"),
@@ -200,9 +202,10 @@ MISTAKES = {
     "negative seed": (arrays(), ["--seed", "-1"], "seed is -1"),
     "large seed": (arrays(), ["--seed", "4294967295", "--seeds", "2"], "seed is 4294967295 and 1 after it"),
     "activation of adam": (arrays(), ["--activation", "sigmoidal", "--optimizer", "adam"], "tanh"),
-    "mark for a missing torque": (arrays(tau=MARKED), [], "tau has numbers of up to 1.0e+308"),
-    "mark beyond single precision": (arrays(tau=1e-280 * MARKED), ["--optimizer", "adam"], "overflow in float32"),
-    "mark for a missing rate": (arrays(qd=1e-188 * MARKED), [], "the loss is not finite before training"),
+    "mark for a missing torque": (arrays(tau=marked(1e308)), [], "tau has numbers of up to 1.0e+308"),
+    "mark beyond single precision": (arrays(tau=marked(1e28, 1e10)), ["--optimizer", "adam"], "overflow in float32"),
+    "mark for a missing rate": (arrays(qd=marked(1e120)), [], "the loss is not finite before training"),
+    "mark that has a square": (arrays(tau=marked(9.96921e36)), [], "up to 1.0e+37 where half are below"),
     "tiny torque": (arrays(tau=np.full((20, 2), 1e-170)), [], "squares vanish"),
     "degree": (arrays(), ["--degree", "2"], "--degree is for the trigonometric model"),
     "batch": (arrays(), ["--batch", "64"], "--batch is for adam, but auto chose gauss-newton"),
