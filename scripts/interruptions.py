@@ -34,6 +34,8 @@ RUNS = {
     "locomotion": ("train_locomotion", "--steps", "6000"),
 }
 """Script and options of each run; short, but of several checkpoints."""
+TIMED = ("train_delan", "train_hnn")
+"""Scripts that would also time calls in another process."""
 MODEL = "model.safetensors"
 ROOT = Path(__file__).parent.parent
 
@@ -106,9 +108,10 @@ def interrupted(
 def start(command: Sequence[str], place: Path, name: str, *others: str) -> subprocess.Popen[str]:
     """A run in a process of its own; runs of one place share compiled programs."""
     script, *options = command
-    settings = options if "--resume" not in others else []
+    settings = [*options, "--no-figures"] if "--resume" not in others else ["--no-figures"]
+    untimed = ["--no-low-latency"] if script in TIMED else []
     return subprocess.Popen(
-        [sys.executable, "-m", f"scripts.{script}", *settings, "--no-figures", "--out", str(place / name), *others],
+        [sys.executable, "-m", f"scripts.{script}", *settings, *untimed, "--out", str(place / name), *others],
         cwd=ROOT,
         env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(place / "programs")},
         stdout=subprocess.DEVNULL,
