@@ -108,10 +108,10 @@ def interrupted(
 def start(command: Sequence[str], place: Path, name: str, *others: str) -> subprocess.Popen[str]:
     """A run in a process of its own; runs of one place share compiled programs."""
     script, *options = command
-    settings = [*options, "--no-figures"] if "--resume" not in others else ["--no-figures"]
-    untimed = ["--no-low-latency"] if script in TIMED else []
+    settings = options if "--resume" not in others else []
+    left_out = ["--no-figures", *(["--no-low-latency"] if script in TIMED else [])]
     return subprocess.Popen(
-        [sys.executable, "-m", f"scripts.{script}", *settings, *untimed, "--out", str(place / name), *others],
+        [sys.executable, "-m", f"scripts.{script}", *settings, *left_out, "--out", str(place / name), *others],
         cwd=ROOT,
         env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(place / "programs")},
         stdout=subprocess.DEVNULL,

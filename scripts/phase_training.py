@@ -204,6 +204,8 @@ MEANINGS = {
     "validation_error": ("validation loss of the last stage", "see training.png"),
 }
 """What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
+OF_STARTS = {"_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
+"""What the rest of such a name says."""
 UNITS = {
     **dict.fromkeys(("train_seconds", "compile_seconds"), "s"),
     **{f"one_step_{mode}{quantile}_us": "µs" for mode in ("", "low_latency_") for quantile in ("p50", "p99")},
@@ -220,5 +222,6 @@ def results_table(metrics: dict[str, float], problem: Problem) -> Table:
         if np.isfinite(value):
             quantity = next((key for key in MEANINGS if name.startswith(key)), None)
             meaning, unit = MEANINGS[quantity] if quantity else (name, UNITS.get(name, ""))
-            table.add_row((meaning + name.removeprefix(quantity or name)).replace("_", " "), f"{value:.4g}", unit)
+            rest = name.removeprefix(quantity or name)
+            table.add_row(meaning.replace("_", " ") + OF_STARTS.get(rest, rest), f"{value:.4g}", unit)
     return table
