@@ -105,30 +105,34 @@ def test_a_bar_shows_count_text_and_time_left_whole(width):
 
 
 def test_a_closed_pipe_ends_a_command_without_a_word():
-    command = "import sys; sys.argv = ['command', '--help']; from tests.test_command_line import *; run(say, Arguments)"
-    done = subprocess.Popen([sys.executable, "-c", command], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert done.stdout is not None and done.stderr is not None
-    done.stdout.close()
-    assert done.stderr.read() == b"" and done.wait() in (0, 1, 141)
+    """What it prints stays in a buffer that nobody takes, and is flushed as the command ends."""
+    command = "import sys; sys.argv = ['command']; from tests.test_command_line import *; run(say, Arguments)"
+    with subprocess.Popen(
+        [sys.executable, "-c", command], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        said = child.stderr.read()
+    assert said == b"" and child.returncode == 141
 
 
 def test_an_interrupt_during_imports_is_one_word(tmp_path):
     """The first import of the script waits, so that the interrupt meets it."""
     (tmp_path / "jax.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
-    child = subprocess.Popen(
+    with subprocess.Popen(
         [sys.executable, "-m", "scripts.make_data"],
         cwd=ROOT,
         env={"PYTHONPATH": f"{tmp_path}"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    assert child.stdout is not None and child.stderr is not None
-    assert child.stdout.readline() == "importing\n"
-    time.sleep(0.05)
-    child.send_signal(signal.SIGINT)
-    said = child.stderr.read()
-    assert said == "interrupted\n" and child.wait() in (-signal.SIGINT, 130)
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        assert child.stdout.readline() == "importing\n"
+        time.sleep(0.05)
+        child.send_signal(signal.SIGINT)
+        said = child.stderr.read()
+    assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
 
 
 @dataclass(frozen=True)
