@@ -1,9 +1,8 @@
 """Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers."""
 
 from dln_jax.data.schema import Trajectories, load, save
-from dln_jax.deploy.c_source import export_c
-from dln_jax.deploy.load import load_phase_field, load_run
-from dln_jax.deploy.load_c import load_c
+from dln_jax.deploy.c.load import load_c
+from dln_jax.deploy.c.source import export_c
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.mechanics import lagrangian, natural
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics
@@ -11,6 +10,7 @@ from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.delan import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
+from dln_jax.zoo.load import load_phase_field, load_run
 
 __all__ = [
     "Decomposition",

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import os
 import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -230,3 +231,14 @@ def _withdraw(folder: Path, created: list[Path]) -> None:
         (folder / LOCK).unlink(missing_ok=True)
         for each in created:
             each.rmdir()
+
+
+def cache_folder() -> Path:
+    """Where what can be made again is kept: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "dln_jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot create the folder ({error.strerror}); set XDG_CACHE_HOME") from error
+    return folder

@@ -1,12 +1,7 @@
-"""Command lines: thin layers from arguments to library calls to files and figures."""
+"""`python -m scripts.NAME` for each command of dln_jax."""
 
-import os
 import sys
 from types import TracebackType
-
-# Factorisations here are small: OpenBLAS's threads spin while they wait for each other, which took 4 to 20 times the
-# processor time of one thread in a step of 560 tetrahedra. Read when SciPy is first imported; what is set stays.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -17,5 +12,5 @@ def _in_a_word(kind: type[BaseException], error: BaseException, trace: Traceback
         sys.__excepthook__(kind, error, trace)
 
 
-if sys.argv[:1] == ["-m"]:  # `python -m scripts.NAME`, which has not been imported yet
+if sys.argv[:1] == ["-m"]:  # which has not been imported yet
     sys.excepthook = _in_a_word

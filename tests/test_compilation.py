@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import pytest
 from jaxlib import xla_client
 
-from dln_jax.learning import compilation
+from dln_jax import compilation
 
 ROOT = Path(__file__).parent.parent
 AS_USERS_COMPILE = (
     "test_compilation.py::test_the_compiler_is_at_its_defaults_where_asked",
-    "test_activations.py::test_derivatives_equal_high_precision",
+    "nn/test_activations.py::test_derivatives_equal_high_precision",
     *(
-        f"test_mechanics.py::test_{name}[{scene}]"
+        f"mechanics/test_mechanics.py::test_{name}[{scene}]"
         for name in (
             "generic_mechanics_equals_the_textbook",
             "decomposition_equals_the_textbook_and_sums_to_the_total",
@@ -27,11 +27,11 @@ AS_USERS_COMPILE = (
         for scene in ("cart-pole", "double-pendulum-friction")
     ),
     *(
-        f"test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[{case}]"
+        f"nn/test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[{case}]"
         for case in ("silu-sizes1", "gelu-sizes2")
     ),
-    *(f"test_stability.py::test_hard_cases_meet_their_bounds[{name}]" for name in ("float32", "activations")),
-    "test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
+    *(f"commands/test_stability.py::test_hard_cases_meet_their_bounds[{name}]" for name in ("float32", "activations")),
+    "commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
 )
 """What fusion, fast approximations and reordering could break, cheap enough to compile with them."""
 

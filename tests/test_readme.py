@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tyro
+from calls import command
 from conftest import CACHE
-from test_train_delan import command
 
-from dln_jax.data import generators, schema
+from dln_jax.data import schema
+from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
 
 ROOT = Path(__file__).parent.parent
@@ -42,7 +43,7 @@ def commands(text):
 
 def script_and_arguments(words):
     assert words[:2] == ["python", "-m"] and words[2].startswith("scripts."), words
-    return importlib.import_module(words[2]), words[3:]
+    return importlib.import_module(f"dln_jax.commands.{words[2].removeprefix('scripts.')}"), words[3:]
 
 
 SCRIPTS = [words for block in BLOCKS["bash"] for words in commands(block) if words[2:3] and words[2].startswith("scr")]

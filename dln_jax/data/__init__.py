@@ -1,1 +1,1 @@
-"""Trajectories: the npz schema, validation, splits, and generators that sample the scenes."""
+"""What a user's file is: the schema, its reading and its splits."""

@@ -16,9 +16,9 @@ import numpy as np
 from jax import Array, export
 
 from dln_jax.deploy.exports import described, read_export, write_exports
-from dln_jax.learning.runs import require_double_precision
 from dln_jax.mechanics.arguments import require_shape
 from dln_jax.mechanics.dynamics import Dynamics, no_energy
+from dln_jax.precision import require_double_precision
 from dln_jax.types import InputError
 
 SUFFIX = ".stablehlo"

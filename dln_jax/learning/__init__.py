@@ -1,1 +1,1 @@
-"""Residuals, optimisers, the fit loop and its checkpoints."""
+"""Learning: what is made small, and how."""

@@ -21,15 +21,25 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
-from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.magnitudes import on_device, require_finite_start
-from dln_jax.learning.optimisers import adamw, check_adamw
-from dln_jax.learning.runs import Checkpoint, Progress, Report, Stop, Training, data_type, require_start, silent
-from dln_jax.learning.second_order import Budget, require_float64, train_second_order
+from dln_jax.learning.engine.first_order import train_first_order
+from dln_jax.learning.engine.optimisers import adamw, check_adamw
+from dln_jax.learning.engine.runs import (
+    Checkpoint,
+    Progress,
+    Report,
+    Stop,
+    Training,
+    require_finite_start,
+    require_start,
+    silent,
+)
+from dln_jax.learning.engine.second_order import Budget, train_second_order
 from dln_jax.models.model import Parameters
 from dln_jax.models.phase_field import PhaseModel
+from dln_jax.precision import data_type, require_float64
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Scalar, require_positive, require_seed
 

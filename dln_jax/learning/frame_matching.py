@@ -25,9 +25,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.optimisers import adamw
-from dln_jax.learning.runs import Checkpoint, Report, Training, silent
+from dln_jax.learning.engine.first_order import train_first_order
+from dln_jax.learning.engine.optimisers import adamw
+from dln_jax.learning.engine.runs import Checkpoint, Report, Training, silent
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters

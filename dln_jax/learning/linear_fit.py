@@ -17,12 +17,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.compilation import quick_compilation
-from dln_jax.learning.normal_equations import count
-from dln_jax.learning.residuals import torque_scale
+from dln_jax.learning.objectives import torque_scale
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
+from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Vector, require_positive
 
 # Phi theta may differ from the model's force by the rounding of its sum, relative to the sum of absolute terms.

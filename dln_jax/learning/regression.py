@@ -20,15 +20,16 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.learning.first_order import train_first_order
+from dln_jax.data.magnitudes import on_device
+from dln_jax.learning.engine.first_order import train_first_order
+from dln_jax.learning.engine.optimisers import check_adamw
+from dln_jax.learning.engine.runs import Checkpoint, Progress, Report, Training, require_start, silent
+from dln_jax.learning.engine.second_order import COARSE_SAMPLES, Budget, train_second_order
 from dln_jax.learning.growth import Trial, grow
-from dln_jax.learning.magnitudes import on_device
-from dln_jax.learning.optimisers import check_adamw
-from dln_jax.learning.runs import Checkpoint, Progress, Report, Training, data_type, require_start, silent
-from dln_jax.learning.second_order import COARSE_SAMPLES, Budget, require_float64, train_second_order
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
+from dln_jax.precision import data_type, require_float64
 from dln_jax.types import InputError, Scalar, require_network, require_positive, require_seed
 
 LOSSES = ("type1", "type2")

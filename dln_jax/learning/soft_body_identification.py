@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from dln_jax.learning.compilation import quick_compilation
+from dln_jax.compilation import quick_compilation
 from dln_jax.softbody.rollout import rollout
 from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import Step, static_solve

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.learning.magnitudes import spread
+from dln_jax.data.magnitudes import spread
 from dln_jax.nn.differential_mlp import Layers
 
 

@@ -22,12 +22,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.first_order import train_first_order
-from dln_jax.learning.magnitudes import on_device
-from dln_jax.learning.optimisers import adamw, check_adamw
-from dln_jax.learning.runs import Checkpoint, Report, Training, silent
-from dln_jax.learning.second_order import Budget, train_second_order
+from dln_jax.learning.engine.first_order import train_first_order
+from dln_jax.learning.engine.optimisers import adamw, check_adamw
+from dln_jax.learning.engine.runs import Checkpoint, Report, Training, silent
+from dln_jax.learning.engine.second_order import Budget, train_second_order
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.models.model import Parameters
 from dln_jax.models.phase_field import PhaseField, PhaseModel

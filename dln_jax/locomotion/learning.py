@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
-from dln_jax.learning import checkpoints
-from dln_jax.learning.compilation import quick_compilation
-from dln_jax.learning.runs import has_checkpoint, stored_rows
+from dln_jax.learning.engine.runs import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
 from dln_jax.types import InputError
+from dln_jax.zoo import parameter_files as checkpoints
 
 CHECKPOINT = "checkpoint"
 """Beginning of the names of the files from which a seed can continue."""

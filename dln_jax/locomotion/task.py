@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.creature_terms import MASS, TIME_STEP, creature_terms
-from dln_jax.softbody.creatures import Creature, biped, body_length, crawler, quadruped
+from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
 from dln_jax.softbody.scene import SoftScene, State, initial_state, make_scene
 from dln_jax.softbody.step import Step, make_step
+from dln_jax.softbody.terms.creature_terms import MASS, TIME_STEP, creature_terms
 from dln_jax.types import InputError, require_positive
 
 CREATURES: dict[str, Callable[[], Creature]] = {"crawler": crawler, "biped": biped, "quadruped": quadruped}

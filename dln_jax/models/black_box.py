@@ -5,7 +5,7 @@ One network is the Lagrangian, with no structure in it:
 
     L = network([features(q), qd / rate_scale])
 
-Its mass matrix d²L/dqd² is symmetric and nothing more: `evaluation.definiteness` reports where it is indefinite.
+Its mass matrix d²L/dqd² is symmetric and nothing more: `metrics.definiteness` reports where it is indefinite.
 """
 
 import functools

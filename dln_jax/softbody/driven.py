@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State
 from dln_jax.softbody.step import Integrator, Step, make_step
-from dln_jax.solvers.minimise import Info
+from dln_jax.solvers.elements.minimise import Info
 
 Path = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k dim"]]
 Signal = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k"]]

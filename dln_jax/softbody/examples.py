@@ -19,18 +19,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.contact import plane_contact
-from dln_jax.softbody.creature_terms import MASS, TIME_STEP, creature_terms
-from dln_jax.softbody.creatures import body_length, crawler
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.elasticity import elastic
-from dln_jax.softbody.gravity import gravity
-from dln_jax.softbody.mesh import Mesh, lumped_masses, vertices_where
-from dln_jax.softbody.mesh_builders import beam as beam_mesh
-from dln_jax.softbody.mesh_builders import box, disc
+from dln_jax.softbody.mesh.builders import beam as beam_mesh
+from dln_jax.softbody.mesh.builders import box, disc
+from dln_jax.softbody.mesh.creatures import body_length, crawler
+from dln_jax.softbody.mesh.simplicial_mesh import Mesh, lumped_masses, vertices_where
 from dln_jax.softbody.scene import initial_state, make_scene
-from dln_jax.softbody.strain_energies import StrainEnergy, stable_neo_hookean
-from dln_jax.softbody.term import Term
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
+from dln_jax.softbody.terms.term import Term
 from dln_jax.types import InputError
 
 GRAVITY = 9.81

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import Step
-from dln_jax.solvers.minimise import Info
+from dln_jax.solvers.elements.minimise import Info
 from dln_jax.types import InputError, require_positive
 
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.mesh import Mesh, lumped_masses
-from dln_jax.softbody.term import Context, Term
-from dln_jax.solvers.element_energies import ElementEnergy, value
+from dln_jax.softbody.mesh.simplicial_mesh import Mesh, lumped_masses
+from dln_jax.softbody.terms.term import Context, Term
+from dln_jax.solvers.elements.element_energies import ElementEnergy, value
 from dln_jax.types import InputError
 
 

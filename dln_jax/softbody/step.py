@@ -21,10 +21,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
-from dln_jax.softbody.term import Context
-from dln_jax.solvers.element_energies import Corners, ElementEnergy, pattern, value
-from dln_jax.solvers.linear_solvers import LinearSolverFactory, by_size
-from dln_jax.solvers.minimise import Info, minimise
+from dln_jax.softbody.terms.term import Context
+from dln_jax.solvers.elements.element_energies import Corners, ElementEnergy, pattern, value
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
+from dln_jax.solvers.elements.minimise import Info, minimise
 from dln_jax.types import InputError, require_positive
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint"]

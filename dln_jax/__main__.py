@@ -1,0 +1,65 @@
+"""The commands from the shell: `dln-jax NAME ...`, or `python -m dln_jax NAME ...`."""
+
+import ast
+import importlib
+import importlib.util
+import os
+import pkgutil
+import sys
+from pathlib import Path
+
+
+def command(name: str, prog: str) -> None:
+    """Runs one command with the arguments of this process.
+
+    Args:
+        name: of a module in `dln_jax.commands`.
+        prog: what the user typed to get here, for help and for messages.
+    """
+    # Factorisations here are small: OpenBLAS's threads spin while they wait for each other, which took 4 to 20
+    # times the processor time of one thread in a step of 560 tetrahedra. Read as SciPy is imported; what is set stays.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        from dln_jax.command_line.running import run
+
+        module = importlib.import_module(f"dln_jax.commands.{name}")
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+    run(module.main, module.Arguments, prog=prog)
+
+
+def main() -> None:
+    """The command that the first argument names; without one, or with --help, what there is."""
+    names = command_names()
+    given = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if given in ("-h", "--help"):
+        print("usage: dln-jax COMMAND [OPTIONS], where dln-jax COMMAND --help states units and defaults\n\ncommands:")
+        width = max(map(len, names))
+        for name in names:
+            print(f"  {name:{width}}  {_first_line(name)}")
+        return
+    name = given.replace("-", "_")
+    if name not in names:
+        print(f"error: '{given}' is no command; choose from {', '.join(names)}", file=sys.stderr)
+        raise SystemExit(2)
+    del sys.argv[1]
+    command(name, f"dln-jax {name}")
+
+
+def command_names() -> list[str]:
+    """Names of all commands, sorted."""
+    from dln_jax import commands
+
+    return sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
+
+
+def _first_line(name: str) -> str:
+    # Read and not imported: some commands take seconds to import.
+    specification = importlib.util.find_spec(f"dln_jax.commands.{name}")
+    source = Path(str(specification and specification.origin)).read_text(encoding="utf-8")
+    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What the commands share: typed arguments, errors as one line, progress and tables."""

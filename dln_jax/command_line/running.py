@@ -1,0 +1,130 @@
+"""What the command lines share: errors as one line, names for scenes, and the arguments that a run was started with."""
+
+import dataclasses
+import math
+import os
+import reprlib
+import sys
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
+
+import jax
+
+from dln_jax.command_line.arguments import choice, parse
+from dln_jax.data.schema import needs_from_text
+from dln_jax.files import CONFIG, is_file, matches, read_json
+from dln_jax.scenes.registry import SCENES
+from dln_jax.types import InputError, Needs
+
+CHOSEN = "chosen"
+"""Key in a run's config.json of what its arguments came to, beside these."""
+PLACES = ("out", "resume", "figures", "low_latency")
+"""Arguments that do not decide the result."""
+CHANGEABLE = ("seconds",)
+"""Arguments that may be given anew to --resume."""
+
+SceneName = Annotated[str, choice(SCENES)]
+
+Arguments = TypeVar("Arguments")
+
+
+def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: str) -> None:
+    """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130.
+
+    Args:
+        main: the command.
+        arguments: the class of what it takes.
+        prog: what the user typed, for help and messages.
+    """
+    # Data and references are float64; models state their own precision.
+    jax.config.update("jax_enable_x64", True)
+    try:
+        given = parse(arguments, prog=prog, description=sys.modules[main.__module__].__doc__)
+        require_storable(given)
+        main(given)
+        sys.stdout.flush()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except BrokenPipeError:
+        # Whoever read the output has gone; the interpreter must not try to flush it once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
+    except KeyboardInterrupt as stop:
+        print(interrupted(prog, arguments, *stop.args), file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def interrupted(command: str, arguments: type, folder: Path | None = None) -> str:
+    """What a user is told whose interrupt ended a command, in whose folder there may be a run to continue."""
+    if folder is None:
+        return "interrupted"
+    if "resume" in {field.name for field in dataclasses.fields(arguments)} and (folder / CONFIG).is_file():
+        return f"interrupted; continue with: {command} --out {folder} --resume"
+    return f"interrupted; {folder} is incomplete"
+
+
+def require_storable(given: Any) -> None:
+    """Raises `InputError` for a number that is not finite: a run's config.json could not hold it."""
+    for name, value in dataclasses.asdict(given).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"--{name.replace('_', '-')} is {value}; expected a finite number, or leave it out")
+
+
+def needs_from_option(text: str) -> Needs:
+    """The needs that --needs states; `InputError` for what states none."""
+    try:
+        return needs_from_text(text)
+    except InputError as error:
+        raise InputError(f"--{error}; see --help for an example") from None
+
+
+def stored_arguments(given: Any) -> dict[str, Any]:
+    """The arguments that decide the result, as JSON values."""
+    values = dataclasses.asdict(given)
+    return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
+
+
+def with_stored_arguments(given: Arguments) -> Arguments:
+    """The arguments that the run in --out was started with; what is given anew must not differ.
+
+    Raises:
+        InputError: --out holds no run, one of other arguments, or one whose config.json is damaged.
+    """
+    folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
+    if folder is None or not is_file(folder / CONFIG):
+        raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
+    unset = stored_arguments(type(given)())
+    stored = checked_arguments(folder / CONFIG, type(given), unset)
+    for key, value in stored_arguments(given).items():
+        if key not in CHANGEABLE and value not in (stored[key], unset[key]):
+            option = key.replace("_", "-")
+            raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
+    hints = get_type_hints(type(given))
+    stored |= {key: getattr(given, key) for key in CHANGEABLE if getattr(given, key, None) is not None}
+    for key, value in stored.items():
+        if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
+            stored[key] = Path(value)
+    return dataclasses.replace(cast(Any, given), **stored)
+
+
+def checked_arguments(path: Path, arguments: type, expected: Collection[str]) -> dict[str, Any]:
+    """The stored arguments in a config.json, each of the type that a script's arguments state for it.
+
+    Raises:
+        InputError: the file is damaged, or a release with other arguments has written it.
+    """
+    remedy = "restore the file, or train again into another folder"
+    stored = read_json(path, remedy=remedy)
+    stored.pop(CHOSEN, None)
+    if absent := [key for key in expected if key not in stored]:
+        raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
+    hints = get_type_hints(arguments)
+    for key, value in stored.items():
+        if key not in expected:
+            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
+        if not matches(value, hints[key]):
+            wanted = str(getattr(hints[key], "__name__", hints[key])).replace("typing.", "").replace("pathlib.", "")
+            raise InputError(f"{path}: {key} is {reprlib.repr(value)}, expected {wanted}; {remedy}")
+    return stored

@@ -1,0 +1,33 @@
+"""Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
+
+Models: structured (a deep Lagrangian network, M = L Lᵀ), black-box (a network is the Lagrangian), trigonometric (linear
+in its parameters, one least-squares problem) and feed-forward (no physics). Without --data it trains on the embedded
+set: the tip of a two-link arm writes 20 letters, of which e, q and v are the test. A run folder gets config.json,
+metrics.json, model.safetensors and model.json (load them with dln_jax.load_run), a checkpoint to --resume from, and
+figures. For Hamiltonian networks see train_hnn.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from dln_jax.runs import dynamics as dynamics_training
+
+KINDS = {
+    "structured": "structured-delan",
+    "black-box": "black-box-delan",
+    "trigonometric": "trigonometric",
+    "feed-forward": "feed-forward",
+}
+
+
+@dataclass(frozen=True)
+class Arguments(dynamics_training.Arguments):
+    """What to train on, how, and where the results go."""
+
+    model: Literal["structured", "black-box", "trigonometric", "feed-forward"] = "structured"
+    """What is learned."""
+
+
+def main(given: Arguments) -> None:
+    """Trains, evaluates, and writes the run folder."""
+    dynamics_training.run_training(given, "train_delan", KINDS)

@@ -1,0 +1,1 @@
+"""Data that are generated from scenes, and the published tasks."""

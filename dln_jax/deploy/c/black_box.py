@@ -1,0 +1,178 @@
+"""Black-box Lagrangian and Hamiltonian as C: `mechanics.lagrangian` and `mechanics.hamiltonian` of one network.
+
+All second derivatives are rates of the gradient along a direction, one pass forward and one back each.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from dln_jax.deploy.c import joints as c_joints
+from dln_jax.deploy.c import networks as c_networks
+from dln_jax.deploy.c.text import table
+from dln_jax.models.black_box import per_coordinate
+from dln_jax.types import Needs
+
+_STATE = """
+/* What the network sees of the state: features of q, then ${second} / ${scale}. */
+static void inputs(const real *restrict q, const real *restrict ${second}, real *restrict x)
+{
+    features(q, x);
+    for (int i = 0; i < D; ++i) x[FEATURES + i] = ${second}[i] / ${scale}[i];
+}
+
+/* Second derivatives of the network's value in ${second}, row by row */
+static void hessian(const energy_trace *restrict trace, real *restrict H)
+{
+    for (int i = 0; i < D; ++i) {
+        real direction[INPUTS] = {0}, rate[INPUTS];
+        direction[FEATURES + i] = 1 / ${scale}[i];
+        energy_gradient_rate(trace, direction, rate);
+        for (int j = 0; j < D; ++j) H[i * D + j] = rate[FEATURES + j] / ${scale}[j];
+    }
+}
+"""
+_LAGRANGIAN = """
+void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
+{
+    real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
+    energy_trace trace;
+    inputs(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    feature_rates(x, qd, x_rate);
+    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = qdd[i] / rate_scale[i];
+    energy_gradient_rate(&trace, x_rate, rate);
+    pull_back_features(x, slope, force);
+    for (int i = 0; i < D; ++i) tau[i] = rate[FEATURES + i] / rate_scale[i] - force[i]${friction};
+}
+
+void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
+{
+    real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], M[D * D];
+    energy_trace trace;
+    inputs(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    feature_rates(x, qd, x_rate);
+    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = 0;
+    energy_gradient_rate(&trace, x_rate, rate);
+    pull_back_features(x, slope, force);
+    for (int i = 0; i < D; ++i) qdd[i] = tau[i] - (rate[FEATURES + i] / rate_scale[i] - force[i]${friction});
+    hessian(&trace, M);
+    eliminate_1(M, qdd);
+}
+
+real ${name}_energy(const real q[D], const real qd[D])
+{
+    real x[INPUTS], slope[INPUTS], energy;
+    energy_trace trace;
+    inputs(q, qd, x);
+    energy = -energy_gradient(x, &trace, slope);
+    for (int i = 0; i < D; ++i) energy += slope[FEATURES + i] / rate_scale[i] * qd[i];
+    return energy;
+}
+
+void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
+{
+    real x[INPUTS], slope[INPUTS];
+    energy_trace trace;
+    inputs(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    hessian(&trace, M);
+}
+"""
+_HAMILTONIAN = """
+/* p where dH/dp = qd, by a fixed number of full Newton steps from 0; leaves the state (q, p) in x. */
+static void momentum(const real *restrict q, const real *restrict qd, real *restrict x)
+{
+    real p[D] = {0};
+    inputs(q, p, x);
+    for (int step = 0; step < NEWTON_STEPS; ++step) {
+        real slope[INPUTS], residual[D], H[D * D];
+        energy_trace trace;
+        energy_gradient(x, &trace, slope);
+        for (int i = 0; i < D; ++i) residual[i] = slope[FEATURES + i] / momentum_scale[i] - qd[i];
+        hessian(&trace, H);
+        eliminate_1(H, residual);
+        for (int i = 0; i < D; ++i) p[i] -= residual[i];
+        for (int i = 0; i < D; ++i) x[FEATURES + i] = p[i] / momentum_scale[i];
+    }
+}
+
+void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
+{
+    real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], momentum_rate[D], H[D * D];
+    energy_trace trace;
+    momentum(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    feature_rates(x, qd, x_rate);
+    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = 0;
+    energy_gradient_rate(&trace, x_rate, rate);
+    pull_back_features(x, slope, force);
+    for (int i = 0; i < D; ++i) momentum_rate[i] = qdd[i] - rate[FEATURES + i] / momentum_scale[i];
+    hessian(&trace, H);
+    eliminate_1(H, momentum_rate);
+    for (int i = 0; i < D; ++i) tau[i] = momentum_rate[i] + force[i]${friction};
+}
+
+void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
+{
+    real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
+    energy_trace trace;
+    momentum(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    pull_back_features(x, slope, force);
+    feature_rates(x, qd, x_rate);
+    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = (tau[i] - (force[i]${friction})) / momentum_scale[i];
+    energy_gradient_rate(&trace, x_rate, rate);
+    for (int i = 0; i < D; ++i) qdd[i] = rate[FEATURES + i] / momentum_scale[i];
+}
+
+real ${name}_energy(const real q[D], const real qd[D])
+{
+    real x[INPUTS], energy;
+    momentum(q, qd, x);
+    energy_value(x, &energy);
+    return energy;
+}
+
+void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
+{
+    real x[INPUTS], slope[INPUTS], H[D * D];
+    energy_trace trace;
+    momentum(q, qd, x);
+    energy_gradient(x, &trace, slope);
+    hessian(&trace, H);
+    for (int i = 0; i < D; ++i)
+        for (int j = 0; j < D; ++j) M[i * D + j] = i == j;
+    eliminate_${degrees}(H, M);
+}
+"""
+
+
+def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
+    """Body of the C source, with `$name` and `${f}` left to fill in."""
+    lagrangian = description["kind"] == "black-box-delan"
+    scale, second = ("rate_scale", "qd") if lagrangian else ("momentum_scale", "p")
+    network = c_networks.from_haiku("energy", parameters, "lagrangian" if lagrangian else "hamiltonian")
+    friction = parameters.get("~", {}).get("viscous_friction")
+    d, features = needs.degrees_of_freedom, c_joints.count(needs)
+    enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]
+    if not lagrangian:
+        enumerators.append(f"NEWTON_STEPS = {description.get('iterations', 8)}")
+    size = description.get(scale, 1.0)
+    sizes = per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size)
+    head = f"enum {{ {', '.join(enumerators)} }};\n\n/* Typical size of {second}, by which it is divided */\n"
+    head += table(scale, np.array(sizes), precision)
+    if friction is not None:
+        head += "\n/* Viscous friction, N m s or N s/m */\n"
+        head += table("friction", np.logaddexp(0, np.asarray(friction, np.float64)), precision)
+    functions = c_joints.functions(needs, ("features", "feature_rates", "pull_back_features"))
+    functions += c_networks.trace(network, bends=True)
+    functions += "" if lagrangian else c_networks.value(network)
+    functions += c_networks.gradient(network) + c_networks.gradient_rate(network)
+    body = _STATE + (_LAGRANGIAN if lagrangian else _HAMILTONIAN)
+    texts = {"second": second, "scale": scale, "degrees": str(d)}
+    texts["friction"] = " + friction[i] * qd[i]" if friction is not None else ""
+    for key, text in texts.items():
+        body = body.replace(f"${{{key}}}", text)
+    return head + c_networks.tables(network, precision) + functions + body

@@ -1,0 +1,166 @@
+"""A trained model as C99 source without dependencies, a demo of it, and what builds both.
+
+The source holds constant tables and functions of one state: no allocation, no mutable state outside the stack, no
+library but <math.h>. The same model, name and precision give the same files, byte for byte.
+"""
+
+import importlib.metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from dln_jax.data.schema import needs_from_json
+from dln_jax.deploy.c import black_box as c_black_box
+from dln_jax.deploy.c import function as c_function
+from dln_jax.deploy.c import structured as c_structured
+from dln_jax.deploy.c import trigonometric as c_trigonometric
+from dln_jax.deploy.c.activations import EXPORTABLE
+from dln_jax.deploy.c.demo import cmake, demo
+from dln_jax.deploy.c.interface import FORMAT, interface, signatures
+from dln_jax.deploy.c.library import helpers
+from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, fill
+from dln_jax.deploy.exports import described, write_exports
+from dln_jax.types import InputError
+from dln_jax.zoo.kinds import build
+from dln_jax.zoo.load import MODEL
+from dln_jax.zoo.load_function import KIND as FUNCTION
+from dln_jax.zoo.load_function import load_function
+from dln_jax.zoo.parameter_files import load_manifest, load_tree
+
+KINDS = {
+    "structured-delan": c_structured.source,
+    "structured-hnn": c_structured.source,
+    "black-box-delan": c_black_box.source,
+    "black-box-hnn": c_black_box.source,
+    "trigonometric": c_trigonometric.source,
+    "feed-forward": c_function.feed_forward_source,
+}
+_MEANINGS = {
+    "inverse_dynamics": "Generalised force tau that the motion (q, qd, qdd) takes, friction included.",
+    "forward_dynamics": "Acceleration qdd of the state (q, qd) under the generalised force tau.",
+    "energy": "Energy T + V of the state, in J.",
+    "mass_matrix": "Mass matrix M, row by row.",
+    "value": "y at x.",
+    "value_and_jacobian": "y and dy/dx at x; element (k, j) of the Jacobian at k * {n} + j is dy_k/dx_j.",
+}
+
+
+def export_c(
+    description: dict[str, Any],
+    parameters: Any,
+    directory: str | Path,
+    *,
+    name: str = "model",
+    precision: str | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
+
+    Args:
+        description: of the model, as `zoo.kinds.describe` gives and `model.json` holds it; or that of a differential
+            network, with `kind` "differential-mlp" and `activation`.
+        parameters: of the model; layers with the members of an ensemble first, for a differential network.
+        directory: is created where it is missing.
+        name: a C name; every file and public function starts with it.
+        precision: f32 or f64; by default that of the training.
+        overwrite: replace files that exist.
+
+    Raises:
+        InputError: a model that has no C export, a name that is none in C, files that exist, or the folder of a run,
+            whose files are never replaced.
+    """
+    directory = Path(directory)
+    texts = source_files(description, parameters, name=check_name(name), precision=precision)
+    return write_exports(directory, texts, overwrite=overwrite)
+
+
+def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[Path]:
+    """`export_c` of the model in a run's folder, of `train_delan`, `train_hnn` or `train_diffnet`."""
+    directory = Path(directory)
+    description = load_manifest(directory, MODEL).get("model")
+    if not isinstance(description, dict):
+        raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
+    if description.get("kind") == FUNCTION:
+        return export_c(description, load_function(directory).layers, out, **keywords)
+    _check_kind(description)
+    like = jax.eval_shape(build(description).init, jax.random.key(0))
+    return export_c(description, load_tree(directory, MODEL, like), out, **keywords)
+
+
+def source_files(description: dict[str, Any], parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
+    """Content of each file, by its name."""
+    _check_kind(description)
+    kind = description["kind"]
+    precision = precision or str(description.get("precision", "f64"))
+    if precision not in PRECISIONS:
+        raise InputError(f"precision is '{precision}'; expected f32 or f64")
+    activation = str(description.get("activation", "tanh"))
+    if activation not in EXPORTABLE:
+        raise InputError(f"activation is '{activation}'; C export knows {', '.join(EXPORTABLE)}")
+    if kind == FUNCTION:
+        sizes = {"n": parameters[0][0].shape[1], "m": parameters[-1][0].shape[2]}
+        body = c_function.source(parameters, precision)
+        about = f"{sizes['n']} inputs x, {sizes['m']} outputs y"
+    else:
+        needs = needs_from_json(description["needs"])
+        sizes = {"d": needs.degrees_of_freedom}
+        body = KINDS[kind](description, parameters, needs, precision)
+        units = ", ".join(f"{joint} ({'rad' if joint == 'revolute' else 'm'})" for joint in needs.joints)
+        about = f"joints: {units}; {'with' if needs.friction else 'without'} friction"
+    version = importlib.metadata.version("dln-jax")
+    written_by = (
+        f"Written by dln-jax {version}, C format {FORMAT}, from a model of kind {kind}.\n{about[0].upper()}{about[1:]}."
+    )
+    stated = interface(name, kind, precision, sizes, version)
+    declared = signatures(kind, precision, sizes)
+    filled = fill(body, precision, name=name)
+    texts = {
+        f"{name}.h": _header(name, written_by, declared, sizes),
+        f"{name}.c": _source(name, written_by, filled, precision, activation),
+        f"{name}_demo.c": demo(name, declared, sizes, precision),
+        "CMakeLists.txt": cmake(name),
+    }
+    files = {file_name: text.encode() for file_name, text in texts.items()}
+    return {**files, f"{name}.json": described(stated, files)}
+
+
+def _check_kind(description: dict[str, Any]) -> None:
+    kind = description.get("kind")
+    if kind not in KINDS and kind != FUNCTION:
+        raise InputError(f"a model of kind {kind!r} has no C export; exportable are {', '.join((*KINDS, FUNCTION))}")
+
+
+def _header(name: str, written_by: str, declared: dict[str, tuple[str, str]], sizes: dict[str, int]) -> str:
+    guard = f"{name.upper()}_H"
+    conventions = "Units: q in rad or m, qd in 1/s and qdd in 1/s^2 of that, tau in N m or N.\n" * ("d" in sizes)
+    about = comment(
+        f"{name}.h",
+        written_by,
+        conventions
+        + "Functions of one state, which keep their workspace on the stack and may run in several threads.\n"
+        "Arrays that are written must not overlap others. What is not finite in a state gives results that are not.",
+    )
+    size_names = {"d": "DEGREES_OF_FREEDOM", "n": "INPUTS", "m": "OUTPUTS"}
+    defines = "".join(f"#define {name.upper()}_{size_names[key]} {size}\n" for key, size in sizes.items())
+    declarations = "".join(
+        f"\n/* {_MEANINGS[function].format(**sizes)} */\n{result} {name}_{function}({arguments});\n"
+        for function, (result, arguments) in declared.items()
+    )
+    return (
+        f'{about}#ifndef {guard}\n#define {guard}\n\n{defines}\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
+        f"{declarations}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
+    )
+
+
+def _source(name: str, written_by: str, body: str, precision: str, activation: str) -> str:
+    about = comment(
+        f"{name}.c",
+        written_by,
+        "C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);\n"
+        "results do not rely on reordered arithmetic (-ffast-math).",
+    )
+    real = PRECISIONS[precision][1]
+    start = f'{about}#include <math.h>\n\n#include "{name}.h"\n\ntypedef {real} real;\n'
+    constants, _, functions = body.partition("\n")
+    return f"{start}\n{constants}\n{helpers(functions, precision, activation)}{functions}"

@@ -1,1 +1,0 @@
-"""Metrics, latency, reports and figures."""

@@ -1,0 +1,1 @@
+"""The optimisers' loops: resumable at any dispatch, the best parameters by validation."""

@@ -1,0 +1,63 @@
+"""What differential networks say of a function and its derivatives, and how wrong they are."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data.functions import FunctionSamples
+from dln_jax.metrics.errors import mean_square
+from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn.activations import Activation
+from dln_jax.nn.differential_mlp import Layers
+
+QUANTITIES = {"y": "value", "dy": "gradient", "d2y": "hessian"}
+"""Name of each field in the metrics."""
+
+
+class Prediction(NamedTuple):
+    """Answers of an ensemble at N inputs, with the inputs in `x` of both; arrays are float64."""
+
+    mean: FunctionSamples
+    """Value, Jacobian and Hessian: of the one network, or means over the members."""
+    spread: FunctionSamples | None
+    """Sample standard deviation over the members; `None` for one network."""
+
+
+def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Prediction:
+    """Answers at x [N, n]; `layers` have the members of an ensemble on their leading axis, also when there is one."""
+    members, dtype = layers[0][0].shape[0], layers[0][0].dtype
+
+    def network(layers: Layers, x: jax.Array):
+        return differential_mlp.value_jacobian_and_hessian(layers, x, activation=activation)
+
+    def answer(x: jax.Array):
+        if members == 1:
+            return network(jax.tree.map(lambda leaf: leaf[0], layers), x), None
+        return tuple(ensembles.mean_and_spread(network, layers, x))
+
+    mean, spread = jax.jit(jax.vmap(answer))(jnp.asarray(x, dtype))
+    return Prediction(_samples(x, mean), None if spread is None else _samples(x, spread))
+
+
+def errors(predicted: FunctionSamples, truth: FunctionSamples) -> dict[str, float]:
+    """Mean over samples of the squared error summed over components (the published metric).
+
+    `value_mse`, and `gradient_mse` and `hessian_mse` where the truth has derivatives; units are squares of the data's.
+    """
+    result = {}
+    for key, name in QUANTITIES.items():
+        if getattr(truth, key) is not None:
+            error = getattr(predicted, key) - getattr(truth, key)
+            result[f"{name}_mse"] = mean_square(error.reshape(len(error), -1))
+    return result
+
+
+def typical_spread(spread: FunctionSamples, where: np.ndarray) -> float:
+    """Root mean square of the spread of the value over the inputs that the mask `where` [N] selects."""
+    return float(np.sqrt(np.mean(spread.y[where] ** 2)))
+
+
+def _samples(x: np.ndarray, arrays) -> FunctionSamples:
+    return FunctionSamples(np.asarray(x, np.float64), *(np.asarray(array, np.float64) for array in arrays))

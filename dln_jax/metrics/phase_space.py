@@ -1,0 +1,146 @@
+"""Errors of a model of a phase space: of its field at test states, and of the motions that it predicts.
+
+    test loss        mean over samples and components of (rates - measured rates)², as published
+    clean field      the same against the exact field at the same, noisy, states: what tells models apart
+    energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², H the true one
+    rollout          mean over starts, times and components of (x_hat(t) - x(t))²
+
+Standard errors are over starts. Means are dominated by single motions where these are chaotic, so that medians over
+starts stand beside them. A motion that is not finite, or needs more than `MOST_STEPS`, has infinite errors.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.datasets.phase_samples import Part
+from dln_jax.mechanics.integrators import adaptive_rollout
+from dln_jax.models.model import Parameters
+from dln_jax.models.phase_field import PhaseModel
+from dln_jax.types import Hamiltonian
+
+MOST_STEPS = 5_000
+"""Of a predicted motion."""
+
+
+class Motions(NamedTuple):
+    """K motions at common times."""
+
+    t: Float[np.ndarray, " T"]
+    q: Float[np.ndarray, "K T d"]
+    p: Float[np.ndarray, "K T d"]
+
+
+def field_rates(
+    model: PhaseModel, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
+) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N d"]]:
+    """(qd, pd) of states."""
+    qd, pd = _rates(model, parameters, jnp.asarray(q), jnp.asarray(p))
+    return np.asarray(qd), np.asarray(pd)
+
+
+def field_errors(model: PhaseModel, parameters: Parameters, part: Part) -> dict[str, float]:
+    """`loss`, against the measured rates, and `clean_field_mse`, against the exact field at the measured states."""
+    data = part.data
+    assert data.p is not None and data.pd is not None
+    qd, pd = field_rates(model, parameters, data.q, data.p)
+
+    def mean_square(velocity: np.ndarray, force: np.ndarray) -> float:
+        return float(np.mean(np.concatenate([qd - velocity, pd - force]) ** 2))
+
+    return {"loss": mean_square(data.qd, data.pd), "clean_field_mse": mean_square(part.field.qd, part.field.pd)}
+
+
+def predict(
+    model: PhaseModel,
+    parameters: Parameters,
+    q: Float[np.ndarray, "K d"],
+    p: Float[np.ndarray, "K d"],
+    t: Float[np.ndarray, " T"],
+    *,
+    tolerance: float = 1e-9,
+) -> Motions:
+    """The motions of a model from the states at t[0], integrated adaptively to the tolerance per step."""
+    states, successful = _motions(model, parameters, jnp.asarray(q), jnp.asarray(p), jnp.asarray(t), tolerance)
+    finished = np.asarray(successful)[:, None, None]
+    q_hat, p_hat = (np.where(finished, np.asarray(state), np.inf) for state in states)
+    return Motions(np.asarray(t), q_hat, p_hat)
+
+
+def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
+    """H along motions; infinite where a state is not finite."""
+    values = np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p)))
+    return np.where(np.isfinite(values), values, np.inf)
+
+
+def energy_errors(H: Hamiltonian, predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
+    """Mean over time of (H(x_hat) - H(x))² for each motion; infinite for one that is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.mean((energies(H, predicted) - energies(H, truth)) ** 2, axis=1)
+
+
+def state_errors(predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
+    """Mean over time and components of (x_hat - x)² for each motion; infinite for one that is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.concatenate([predicted.q - truth.q, predicted.p - truth.p], axis=2) ** 2
+        errors = np.mean(errors, axis=(1, 2))
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def summary(name: str, errors: Float[np.ndarray, " K"]) -> dict[str, float]:
+    """Mean, its standard error (NaN of one), and median, under `name`, `name_standard_error` and `name_median`."""
+    count = len(errors)
+    finite = bool(np.isfinite(errors).all())
+    spread = float(np.std(errors, ddof=1) / np.sqrt(count)) if finite and count > 1 else float("nan")
+    return {
+        name: float(np.mean(errors)),
+        f"{name}_standard_error": spread,
+        f"{name}_median": float(np.median(errors)),
+    }
+
+
+def motion_errors(
+    predicted: Sequence[Motions],
+    truth: Sequence[Motions],
+    H: Hamiltonian | None,
+    *,
+    published_energy: Hamiltonian | None = None,
+) -> dict[str, float]:
+    """`rollout_mse`, and where they are known `energy_mse` and, where it is another one, `published_energy_mse`.
+
+    Each as by `summary`, over all motions of all entries, whose times may differ.
+    """
+
+    def over_all(name: str, errors: Callable[[Motions, Motions], np.ndarray]) -> dict[str, float]:
+        return summary(name, np.concatenate([errors(*pair) for pair in zip(predicted, truth, strict=True)]))
+
+    found = {} if H is None else over_all("energy_mse", functools.partial(energy_errors, H))
+    if published_energy is not None and published_energy is not H:
+        found |= over_all("published_energy_mse", functools.partial(energy_errors, published_energy))
+    return found | over_all("rollout_mse", state_errors)
+
+
+# Compiled once for each model, whatever its parameters.
+@functools.partial(jax.jit, static_argnames=("model",))
+def _rates(model: PhaseModel, parameters, q, p):
+    return jax.vmap(model.apply(parameters).rates)(q, p)
+
+
+@functools.partial(jax.jit, static_argnames=("model", "tolerance"))
+def _motions(model: PhaseModel, parameters, q, p, t, tolerance: float):
+    rates = model.apply(parameters).rates
+
+    def motion(q, p):
+        return adaptive_rollout(lambda t, state: rates(*state), (q, p), t, tolerance=tolerance, max_steps=MOST_STEPS)
+
+    return jax.vmap(motion)(q, p)
+
+
+@functools.partial(jax.jit, static_argnames=("H",))
+def _along(H: Hamiltonian, q, p):
+    return jax.vmap(jax.vmap(H))(q, p)

@@ -1,0 +1,43 @@
+"""Where the energy of a soft body in motion is: kinetic, and term by term."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.scene import Params, SoftScene, element_energies, prepare
+from dln_jax.softbody.terms.term import Context
+from dln_jax.solvers.elements.element_energies import value
+
+KINETIC, TOTAL = "kinetic", "total"
+# So many moments at a time.
+_BATCH = 32
+
+
+def motion_energies(
+    scene: SoftScene,
+    params: Params,
+    x: Float[Array, "T n dim"],
+    v: Float[Array, "T n dim"],
+    control: Float[Array, "T k"] | None = None,
+) -> dict[str, Float[np.ndarray, " T"]]:
+    """Kinetic energy, that of each term by its name, and their total, in J, at each moment of a motion.
+
+    The potential of gravity is zero at the origin. Friction stores nothing.
+    """
+    energies = element_energies(scene)
+
+    def of_moment(moment: tuple[Array, Array, Array | None]) -> dict[str, Array]:
+        x, v, control = moment
+        context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
+        data = prepare(scene, params, context)
+        stored = {
+            term.name: value([energy], x, [of]) for term, energy, of in zip(scene.terms, energies, data, strict=True)
+        }
+        return {KINETIC: 0.5 * jnp.sum(params.masses[:, None] * v**2), **stored}
+
+    moments = (jnp.asarray(x), jnp.asarray(v), control)
+    found = jax.jit(lambda moments: jax.lax.map(of_moment, moments, batch_size=_BATCH))(moments)
+    by_name = {name: np.asarray(values) for name, values in found.items()}
+    by_name = {KINETIC: by_name[KINETIC], **{term.name: by_name[term.name] for term in scene.terms}}
+    return {**by_name, TOTAL: np.sum(list(by_name.values()), axis=0)}

@@ -1,0 +1,101 @@
+"""--target: structured networks of growing size, until one is as accurate as asked; of those, the fastest."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.zoo.kinds import build
+from dln_jax.zoo.load import compiled
+from dln_jax.files import write_json
+from dln_jax.learning.engine.runs import Training
+from dln_jax.precision import data_type
+from dln_jax.learning.dynamics_fit import train
+from dln_jax.runs.dynamics_results import Task, latency_of
+
+WIDTHS = (4, 8, 16, 32)
+DEPTHS = (1, 2)
+
+
+class Candidate(NamedTuple):
+    """A network that was tried."""
+
+    width: int
+    depth: int
+    networks: int
+    """1 where factor and potential share one, else 2."""
+    parameters: int
+    validation_error: float
+    train_seconds: float
+    """Compilation included."""
+    one_step_us: float
+
+
+def grow_to_target(task: Task, target: float, folder: Path, console: Console, *, resume: bool) -> tuple[Task, Training]:
+    """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
+
+    Chosen is the fastest that meets it, or, if none does, the most accurate. Writes `candidates.json` and a table.
+    """
+    tried: list[tuple[Candidate, Task, Training]] = []
+    for width in WIDTHS:
+        for depth in DEPTHS:
+            for shared in (True, False) if task.needs.gravity else (False,):
+                description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
+                tried.append(_try(task._replace(description=description), folder, resume=resume))
+                candidate = tried[-1][0]
+                verdict = "met" if candidate.validation_error <= target else "not met"
+                console.print(f"{_name(candidate)}: validation {candidate.validation_error:.2e}, target {verdict}")
+        if any(candidate.validation_error <= target for candidate, *_ in tried):
+            break
+    enough = [each for each in tried if each[0].validation_error <= target]
+    fastest = min(enough, key=lambda each: each[0].one_step_us, default=None)
+    chosen = fastest or min(tried, key=lambda each: each[0].validation_error)
+    write_json(folder / "candidates.json", {"candidates": [candidate._asdict() for candidate, *_ in tried]})
+    console.print(_table([candidate for candidate, *_ in tried], chosen[0], target))
+    if fastest is None:
+        console.print(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
+    return chosen[1], chosen[2]
+
+
+def _try(task: Task, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Training]:
+    """Trains one candidate and measures it."""
+    model, wanted = build(task.description), task.description
+    networks = 1 if wanted["shared_trunk"] else 2
+    name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"
+    training = train(
+        model, task.sets, task.settings, objective=task.objective, directory=folder, name=name, resume=resume
+    )
+    system = compiled(model.apply(training.parameters), data_type(task.settings.precision))
+    candidate = Candidate(
+        width=wanted["width"],
+        depth=wanted["depth"],
+        networks=networks,
+        parameters=sum(jnp.size(leaf) for leaf in jax.tree.leaves(training.parameters)),
+        validation_error=float(training.validation),
+        train_seconds=training.train_seconds + training.compile_seconds,
+        one_step_us=latency_of(system, task, calls=2000).p50_us,
+    )
+    return candidate, task, training
+
+
+def _name(candidate: Candidate) -> str:
+    networks = "one network" if candidate.networks == 1 else "two networks"
+    return f"{candidate.depth} x {candidate.width}, {networks}"
+
+
+def _table(candidates: list[Candidate], chosen: Candidate, target: float) -> Table:
+    columns: tuple[Any, ...] = ("network", "parameters", "validation error", "training, s", "one step, µs", "")
+    table = Table(*columns, title=f"grown until the validation error is {target:g}")
+    for each in candidates:
+        table.add_row(
+            _name(each),
+            f"{each.parameters:,}",
+            f"{each.validation_error:.2e}",
+            f"{each.train_seconds:.1f}",
+            f"{each.one_step_us:.1f}",
+            "kept" if each == chosen else "met" if each.validation_error <= target else "",
+        )
+    return table

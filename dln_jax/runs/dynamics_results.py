@@ -1,0 +1,221 @@
+"""What a training of dynamics comes to: the task, its test errors and speed, figures and tables."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split, merged
+from dln_jax.zoo.kinds import build
+from dln_jax.zoo.load import load_run
+from dln_jax.figures import dynamics as figures
+from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.latency import Latency, one_step
+from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.rollouts import rollout_metrics
+from dln_jax.files import write_figure
+from dln_jax.learning.objectives import Objective
+from dln_jax.learning.engine.runs import Training
+from dln_jax.precision import data_type
+from dln_jax.learning.dynamics_fit import Settings
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.scene import dynamics as scene_dynamics
+from dln_jax.types import InputError, Needs
+
+
+class Task(NamedTuple):
+    """What the arguments come to: the data, what they need, and the model to train."""
+
+    name: str
+    kind: str
+    sets: Split
+    scene: Scene | None
+    needs: Needs
+    needs_origin: str
+    description: dict[str, Any]
+    """Of the model, for `dln_jax.zoo.kinds.build`."""
+    objective: Objective
+    settings: Settings
+    optimizer_reason: str
+    """Why the optimiser is the one it is; empty where the user chose."""
+
+
+def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
+    """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
+    dtype = data_type(task.settings.precision)
+    dynamics = load_run(folder)
+    test = task.sets.test
+    predicted = predictions(dynamics, test, dtype)
+    latency = latency_of(dynamics, task)
+    if draw:
+        draw_figures(folder, task, training, predicted)
+    every = range(seeds) if seeds > 1 else ()
+    model = build(task.description)
+    of_seeds = [
+        errors(predictions(model.apply(parameters_of(training, index)), test, dtype), test)["torque_mse"]
+        for index in every
+    ]
+    spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items() if seeds > 1}
+    return {
+        **errors(predicted, test),
+        **spread,
+        **definiteness_metrics(dynamics, task),
+        **rollouts(dynamics, task),
+        **({"validation_error": float(np.min(training.validation))} if training.history else {}),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
+        "steps": training.stop.step,
+        "best_step": int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": training.train_seconds,
+        "one_step_p50_us": latency.p50_us,
+        "one_step_p99_us": latency.p99_us,
+    }
+
+
+SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
+"""Of the seeds' test errors."""
+
+
+def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
+    """Parameters and index of the seed with the lowest validation error."""
+    if seeds == 1:
+        return training.parameters, 0
+    best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
+    return parameters_of(training, best), best
+
+
+def parameters_of(training: Training, index: int) -> Any:
+    """Parameters of one of several seeds."""
+    return jax.tree.map(lambda leaf: leaf[index], training.parameters)
+
+
+def latency_of(dynamics: Dynamics, task: Task, *, calls: int = 5000) -> Latency:
+    """Of one inverse-dynamics call."""
+    states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
+    return one_step(dynamics.inverse_dynamics, states, calls=calls)
+
+
+def latency_states(task: Task) -> tuple[np.ndarray, ...]:
+    """q, qd and qdd of the test, in the precision of the model."""
+    test, dtype = task.sets.test, data_type(task.settings.precision)
+    return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
+
+
+def definiteness_of(dynamics: Dynamics, task: Task, data: Trajectories) -> Definiteness | None:
+    """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
+    if not task.kind.startswith(("black-box", "trigonometric")):
+        return None
+    return definiteness(dynamics, data.q, data.qd)
+
+
+def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
+    """What the mass matrices of a model without structure are like on the test."""
+    found = definiteness_of(dynamics, task, task.sets.test)
+    if found is None:
+        return {}
+    return {
+        "smallest_mass_eigenvalue": found.smallest_eigenvalue,
+        "share_not_definite": found.share_not_definite,
+        "largest_condition_number": found.largest_condition_number,
+    }
+
+
+def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
+    """Valid prediction times on the test, and the true plant's as their ceiling where the scene is known.
+
+    None for independent states, which are no motion.
+    """
+    test = task.sets.test
+    if len(np.unique(test.trajectory)) == len(test.t):
+        return {}
+    try:
+        found = rollout_metrics(dynamics, test, dtype=data_type(task.settings.precision))
+    except InputError as error:
+        # The model is trained: what its test cannot tell is left out, not refused.
+        print(f"no rollouts: {error}")
+        return {}
+    if task.scene is None:
+        return found
+    plant = rollout_metrics(scene_dynamics(task.scene), test)
+    return {**found, **{ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}}
+
+
+CEILINGS = {
+    "vpt_seconds": "vpt_ceiling_seconds",
+    "vpt_interpolated_seconds": "vpt_ceiling_interpolated_seconds",
+    "normalised_state_error": "normalised_state_error_ceiling",
+    "energy_error_j": "energy_error_ceiling_j",
+}
+"""Metrics of a rollout, and the names of what the true plant gets."""
+
+
+def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[str, np.ndarray]) -> None:
+    """Writes what there is to draw."""
+    test = task.sets.test
+    write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted))
+    if training.history and task.kind != "trigonometric":
+        torque = task.objective.selects_by == "torque"
+        units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
+        best = int(np.max(training.best_step))
+        write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, **units))
+    if task.scene is not None and task.scene.tip is not None:
+        paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
+        write_figure(folder / "tip_paths.png", paths)
+
+
+MEANINGS = {
+    "torque_mse": "torque, mean square error",
+    "forward_mse": "acceleration, mean square error",
+    "power_mse": "power, mean square error",
+    "inertial_mse": "inertial force, mean square error",
+    "coriolis_mse": "Coriolis force, mean square error",
+    "gravity_mse": "gravity force, mean square error",
+    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
+    "share_not_definite": "states where the mass matrix is not definite",
+    "largest_condition_number": "largest condition number of the mass matrix",
+    "vpt_seconds": "valid prediction time, torque held",
+    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
+    "rollout_seconds": "duration of a test motion",
+    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "energy_error_j": "energy balance error of a rollout",
+    "one_step_p50_us": "one call of the inverse model, median",
+    "one_step_p99_us": "one call of the inverse model, 99 %",
+    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
+    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
+}
+"""Of the metrics' names; others say it themselves."""
+
+
+def results_table(metrics: dict[str, float], task: Task) -> Table:
+    """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
+    force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
+    units = {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
+    units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
+    known = any(ceiling in metrics for ceiling in CEILINGS.values())
+    columns = ("quantity", "value", *(["true plant"] if known else []), "unit")
+    table = Table(*columns, title=f"test on {task.name}, {task.settings.precision}")
+    for column in table.columns[1:-1]:
+        column.justify = "right"
+
+    def text(key: str, value: float) -> str:
+        if isinstance(value, int):
+            return f"{value:,}"
+        tiny = "_mse" in key or "error" in key or "eigenvalue" in key or "condition" in key
+        return f"{value:.2e}" if tiny else f"{value:,.2f}" if key.startswith(("vpt", "share")) else f"{value:,.1f}"
+
+    for key, value in metrics.items():
+        if key in CEILINGS.values():
+            continue
+        unit = units.get(key, f"({force})²" if "_mse" in key else "")
+        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else unit
+        ceiling = metrics.get(CEILINGS.get(key, ""))
+        beside = [] if not known else ["" if ceiling is None else text(key, ceiling)]
+        table.add_row(MEANINGS.get(key, key.replace("_", " ")), text(key, value), *beside, unit)
+    calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
+    table.add_row("calls of the inverse model", calls, *([""] if known else []), "1/s")
+    return table

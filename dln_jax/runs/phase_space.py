@@ -1,0 +1,216 @@
+"""What `train_hnn --task` does: from a command line to a trained model of a phase space in a run folder."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
+from dln_jax.zoo.load import load_phase_field, save_model
+from dln_jax.zoo.phase_kinds import build_phase
+from dln_jax.figures import animations
+from dln_jax.figures import dynamics as figures
+from dln_jax.metrics.latency import one_step
+from dln_jax.figures.phase_space import TRUTH
+from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.learning.engine.runs import Progress
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.command_line.arguments import refuse_given, resolved
+from dln_jax.command_line.running import needs_from_option, stored_arguments
+from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once
+from dln_jax.studies.hamiltonian.training import KINDS, LEARNING_RATE, MOTIONS, POLYNOMIAL, RATES, Trained, check, description_of, settings_of, stages_of, train
+from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem, problem_of
+from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
+from dln_jax.command_line.progress import progress
+
+if TYPE_CHECKING:
+    from dln_jax.commands.train_hnn import Arguments
+
+GIF_FRAMES = 80
+LOSSES = {
+    RATES: "rates: mean square error of (qd, pd)",
+    MOTIONS: "motions: mean square error of (q, p) over its weight",
+}
+"""What each stage makes small."""
+OF_TORQUES = ("test", "scene", "target", "batch", "weight_decay", "patience")
+"""Options of models of torques, which a task decides itself."""
+
+
+def run_task(given: "Arguments") -> None:
+    """Trains, evaluates, and writes the run folder."""
+    console = Console(highlight=False, soft_wrap=True)
+    check_options(given)
+    needs = None if given.needs is None else needs_from_option(given.needs)
+    problem = problem_of(given.task or "", trajectories=given.trajectories, data=given.data, needs=needs)
+    size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
+    description = description_of(problem, given.model, **size)
+    check_suited(given, problem, description)
+    options: dict[str, Any] = {
+        "seed": given.seed,
+        "optimizer": "adam" if given.optimizer == "adam" else "gauss-newton",
+        "steps": given.steps,
+        **resolved(given, {"learning_rate": LEARNING_RATE, "seconds": math.inf}),
+    }
+    check(problem, description, settings_of(problem, description, **options))
+    with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
+        train_into(folder, given, problem, description, options, console)
+
+
+def train_into(
+    folder: Path,
+    given: "Arguments",
+    problem: Problem,
+    description: dict[str, Any],
+    options: dict[str, Any],
+    console: Console,
+) -> None:
+    """Trains, evaluates, and writes the files of the run."""
+    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": description})
+    announce(console, problem, description)
+    with stage_progress(stages_of(problem, description, given.steps)) as report:
+        trained = train(problem, description, **options, directory=folder, resume=given.resume, report=report)
+    if not np.isfinite(trained.result.validation):
+        raise InputError(f"{trained.stopped}; {folder} holds no model")
+    save_model(folder, description, trained.result.parameters)
+    numbers, seen = measured_once(problem, trained)
+    metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.result.validation)}
+    if given.low_latency:
+        truth = problem.truth[0]
+        metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
+    write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
+    if given.figures:
+        draw(folder, problem, description["kind"], seen, trained)
+    console.print(results_table(metrics, problem))
+    console.print(f"run folder: {folder}")
+    if trained.diverged:
+        raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
+    if trained.stopped:
+        console.print(trained.stopped)
+
+
+def check_options(given: "Arguments") -> None:
+    """Refuses what no task takes, before anything is written."""
+    require_seed(given.seed)
+    for name in ("width", "depth", "degree", "steps", "trajectories", "seconds"):
+        if getattr(given, name) is not None:
+            require_positive(**{name: getattr(given, name)})
+    refuse_given(given, OF_TORQUES, "for models of torques, not for --task")
+    if given.precision == "f32":
+        raise InputError("tasks are fitted in f64; leave --precision out")
+    if given.seeds != 1:
+        raise InputError("a task trains one seed at a time; scripts.hnn_table measures several")
+    if given.optimizer != "adam":
+        refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
+    if given.model != POLYNOMIAL:
+        refuse_given(given, ["degree"], "for the polynomial model")
+
+
+def check_suited(given: "Arguments", problem: Problem, description: dict[str, Any]) -> None:
+    """Refuses what this task or its model does not take, before anything is written."""
+    build_phase(description)
+    if problem.name in PROTOCOLS:
+        refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
+    else:
+        refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
+    if problem.name == REAL:
+        refuse_given(given, ["needs"], "what the task decides itself")
+    if description["kind"] == KINDS[POLYNOMIAL]:
+        linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
+        refuse_given(given, ["width", "depth", "activation"], linear)
+        if MOTIONS not in stages_of(problem, description):
+            refuse_given(given, ["steps", "seconds"], linear)
+        if given.optimizer == "adam":
+            raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
+
+
+@contextmanager
+def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None]]:
+    """Yields `report(at)`: the stages, one after the other, each with a count of its own."""
+    with ExitStack() as shown:
+        current = next(iter(stages), "")
+        show = shown.enter_context(progress(stages[current])) if stages else None
+
+        def report(at: Progress) -> None:
+            nonlocal current, show
+            if show is None or at.stage != current:
+                shown.close()
+                current, show = at.stage, shown.enter_context(progress(stages[at.stage]))
+            show(at.step, f"{at.stage}: loss {at.loss:.2e}  validation {at.validation:.2e}")
+
+        yield report
+
+
+def announce(console: Console, problem: Problem, description: dict[str, Any]) -> None:
+    """Says what is trained on what, and what was assumed."""
+    data = problem.fitted
+    trajectories = len(np.unique(data.trajectory))
+    needs = problem.needs
+    terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
+    console.print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
+    console.print(f"{'-'.join(needs.joints)} with {terms}; {description['kind']}, f64")
+    missing = [key for key in data.estimated if key != "tau"]
+    if missing:
+        console.print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
+    if problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
+        console.print("momenta p are taken as qd, per unit of inertia")
+
+
+def latency_of(folder: Path, problem: Problem) -> dict[str, float]:
+    """Of one call of the rates, of the stored model as a user loads it."""
+    field, truth = load_phase_field(folder), problem.truth[0]
+    states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
+    found = one_step(field.rates, states, calls=2000)
+    return {"one_step_p50_us": found.p50_us, "one_step_p99_us": found.p99_us}
+
+
+def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained) -> None:
+    """Writes what there is to draw."""
+    name = "baseline" if kind == KINDS["baseline"] else "hnn"
+    write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
+    truth = problem.truth[0]
+    stride = max(1, len(truth.t) // GIF_FRAMES)
+    animations.write_motion_gif(folder / "motions.gif", {TRUTH: truth, name: seen.motions}, stride=stride)
+    history = trained.history
+    if len(history) > 1:
+        best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
+        named = [at._replace(stage=LOSSES[at.stage]) for at in history]
+        words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
+        write_figure(folder / "training.png", figures.training_curve(named, best_step=best, **words))
+
+
+MEANINGS = {
+    "published_energy_mse": ("published energy along predicted motions, mean square error", "units of that energy²"),
+    "energy_mse": ("energy along predicted motions, mean square error", "J²"),
+    "rollout_mse": ("(q, p) of predicted motions, mean square error", "units of q² and p²"),
+    "train_loss": ("(qd, pd) at training states, mean square error", "units of qd² and pd²"),
+    "test_loss": ("(qd, pd) at test states, mean square error", "units of qd² and pd²"),
+    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", "units of qd² and pd²"),
+    "validation_error": ("validation loss of the last stage", "see training.png"),
+}
+"""What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
+OF_STARTS = {"_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
+"""What the rest of such a name says."""
+UNITS = {
+    **dict.fromkeys(("train_seconds", "compile_seconds"), "s"),
+    **{f"one_step_{mode}{quantile}_us": "µs" for mode in ("", "low_latency_") for quantile in ("p50", "p99")},
+}
+
+
+def results_table(metrics: dict[str, float], problem: Problem) -> Table:
+    """Of numbers with their units."""
+    table = Table(title=f"test motions of {problem.name}, f64")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
+    for name, value in metrics.items():
+        if np.isfinite(value):
+            quantity = next((key for key in MEANINGS if name.startswith(key)), None)
+            meaning, unit = MEANINGS[quantity] if quantity else (name, UNITS.get(name, ""))
+            rest = name.removeprefix(quantity or name)
+            table.add_row(meaning.replace("_", " ") + OF_STARTS.get(rest, rest), f"{value:.4g}", unit)
+    return table

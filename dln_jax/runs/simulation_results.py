@@ -1,0 +1,161 @@
+"""What `simulate` shows of a motion: numbers, warnings, figures and the GIF."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.studies.report import Row
+from dln_jax.figures.soft_body_animations import write_soft_body_gif
+from dln_jax.metrics.soft_body_energies import motion_energies
+from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
+from dln_jax.files import write_figure
+from dln_jax.softbody.driven import Example, drive
+from dln_jax.softbody.mesh.simplicial_mesh import Mesh, volumes
+from dln_jax.softbody.mesh.simplices import simplex_volumes
+from dln_jax.solvers.elements.minimise import Info
+
+TITLES = {
+    "beam": "beam: falls under its weight",
+    "twist": "twist: ends turned against each other",
+    "slope": "slope: slides against friction",
+    "drop": "drop: falls, rolls and bounces",
+    "creature": "creature: a wave of its muscles makes it crawl",
+}
+STACKED = ("twist", "creature")
+"""Scenes whose moments are drawn below each other."""
+FRAMES_PER_SECOND, MOST_FRAMES = 20.0, 100
+
+
+class Motion(NamedTuple):
+    """A motion of T steps, its start included in t, x and v."""
+
+    t: np.ndarray
+    x: np.ndarray
+    v: np.ndarray
+    info: Info
+    compile_seconds: float
+    steps_per_second: float
+
+
+def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
+    """What the table shows."""
+    info = motion.info
+    ratios = np.stack([simplex_volumes(x.astype(np.float64), mesh.elements) for x in motion.x]) / volumes(mesh)
+    missed = float((~info.converged).sum())
+    numbers = (
+        ("steps_per_second", motion.steps_per_second, "1/s", None),
+        ("compile_seconds", motion.compile_seconds, "s", None),
+        ("newton_iterations_mean", float(info.iterations.mean()), "1", None),
+        ("newton_iterations_max", float(info.iterations.max()), "1", None),
+        ("worst_residual_m_per_s2", float(info.residual.max()), "m/s²", None),
+        ("steps", float(len(info.converged)), "1", None),
+        ("steps_not_converged", missed, "1", 0.0),
+        ("smallest_volume_ratio", float(ratios.min()), "1", None),
+    )
+    return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
+
+
+def results_table(rows: list[Row]) -> Table:
+    """One line per number."""
+    table = Table("quantity", "value", "unit")
+    table.columns[1].justify = "right"
+    labels = {"worst_residual_m_per_s2": "worst residual", "smallest_volume_ratio": "smallest J = volume / rest volume"}
+    for row in rows:
+        label = labels.get(row.quantity, row.quantity.replace("_", " "))
+        table.add_row(label, f"{row.value:.4g}", "" if row.unit == "1" else row.unit)
+    return table
+
+
+def warn(motion: Motion, console: Console) -> None:
+    """Says what is not as it should be."""
+    missed = np.flatnonzero(~motion.info.converged)
+    if missed.size:
+        console.print(
+            f"warning: {missed.size} of {len(motion.t) - 1} steps did not converge, the first at "
+            f"t = {motion.t[missed[0] + 1]:.4g} s: the motion is not to be trusted from there; try a shorter --dt"
+        )
+    if (finite := finite_moments(motion)) < len(motion.t):
+        console.print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
+
+
+def finite_moments(motion: Motion) -> int:
+    """How many moments come before the first that is not finite."""
+    bad = np.array([not np.isfinite(x + v).all() for x, v in zip(motion.x, motion.v, strict=True)])
+    return int(np.argmax(bad)) if bad.any() else len(bad)
+
+
+def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: str, figures: bool) -> Moments:
+    """Writes the figures and the GIF; gives what the picture of moments shows."""
+    shown = finite_moments(motion)
+    dt = float(motion.t[1])
+    t, x, v = motion.t[:shown], motion.x[:shown], motion.v[:shown]
+    driven = drive(example, dt, max(shown - 1, 1))
+    control = driven.control
+    if control is not None:
+        # The start has the actuation of the first step.
+        control = jnp.concatenate([control[:1], control])[:shown]
+    picture = moments(scene, example, t, x)
+    if not figures:
+        return picture
+    energies = motion_energies(example.scene, example.scene.params, jnp.asarray(x), jnp.asarray(v), control)
+    figure = energies_against_time(t, energies, taken=what_takes(example), title=title)
+    write_figure(folder / "energy.png", figure)
+    write_figure(folder / "moments.png", moments_figure([picture], columns=1))
+    stride = max(round(1 / (FRAMES_PER_SECOND * dt)), math.ceil(shown / MOST_FRAMES), 1)
+    mesh, positions = with_slope(example, x)
+    write_soft_body_gif(
+        folder / "motion.gif",
+        mesh,
+        positions,
+        t,
+        muscles=example.muscles,
+        actuation=None if control is None else np.asarray(control),
+        ground=0.0 if example.ground == 0.0 else None,
+        title=scene,
+        stride=stride,
+        frames_per_second=max(1 / (stride * dt), 1.0),
+    )
+    return picture
+
+
+def what_takes(example: Example) -> str | None:
+    """What takes energy away, where nothing feeds it in."""
+    if example.control is not None or example.held_path is not None:
+        return None
+    rubs = any(getattr(parameters, "friction", None) is not None for parameters in example.scene.params.terms.values())
+    return "taken by friction\nand by the time step" if rubs else "taken by the time step"
+
+
+def moments(scene: str, example: Example, t: np.ndarray, x: np.ndarray) -> Moments:
+    """The moments worth a picture, or start, middle and end where the motion is too short for them."""
+    # Pictures of bodies in space hide each other.
+    every = 1 if scene in STACKED or example.scene.mesh.dimension == 2 else 2
+    within = [moment for moment in example.moments[::every] if moment <= t[-1] + 1e-9]
+    times = within if len(within) > 1 else [0.0, t[-1] / 2, t[-1]]
+    chosen = np.unique(np.abs(t[:, None] - np.array(times)).argmin(axis=0))
+    # A beam's times stand beside its tip.
+    rest = example.scene.mesh.vertices
+    tip = int(np.argmax(rest[:, 0] - 1e-6 * rest[:, -1])) if scene == "beam" else None
+    stacked = scene in STACKED
+    return Moments(
+        TITLES[scene], example.scene.mesh, x[chosen], t[chosen], example.ground, stacked=stacked, labelled=tip
+    )
+
+
+def with_slope(example: Example, x: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """The body and, where the ground rises, a wedge below it: the animation knows level ground only."""
+    mesh = example.scene.mesh
+    if not example.ground:
+        return mesh, x
+    low, high = float(x[..., 0].min()) - 0.2, float(x[..., 0].max()) + 0.2
+    wedge = np.array([[low, example.ground * low], [high, example.ground * low], [high, example.ground * high]])
+    both = Mesh(
+        np.concatenate([mesh.vertices, wedge]),
+        np.concatenate([mesh.elements, len(mesh.vertices) + np.arange(3, dtype=np.int32)[None]]),
+    )
+    return both, np.concatenate([x, np.broadcast_to(wedge, (len(x), 3, 2))], axis=1)

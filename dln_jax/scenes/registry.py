@@ -1,0 +1,34 @@
+"""The textbook scenes by name."""
+
+from collections.abc import Callable
+
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.henon_heiles import henon_heiles
+from dln_jax.scenes.mass_spring import mass_spring
+from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "two-link-arm": two_link_arm,
+    "two-link-arm-hanging": lambda: two_link_arm(zero="hanging"),
+    "pendulum": pendulum,
+    "double-pendulum": double_pendulum,
+    "cart-pole": cart_pole,
+    "mass-spring": mass_spring,
+    "henon-heiles": henon_heiles,
+    "two-body": lambda: n_body(2),
+    "three-body": lambda: n_body(3),
+    **{f"chain-{d}": (lambda d=d: chain(d)) for d in range(1, 13)},
+}
+
+
+def scene_named(name: str) -> Scene:
+    """The scene of a name; `InputError` lists the names."""
+    if name not in SCENES:
+        raise InputError(f"scene '{name}' is unknown; choose from {', '.join(SCENES)}")
+    return SCENES[name]()

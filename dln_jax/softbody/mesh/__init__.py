@@ -1,0 +1,1 @@
+"""Meshes of simplices: built, checked and measured."""

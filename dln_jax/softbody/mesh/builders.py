@@ -1,0 +1,96 @@
+"""Meshes of simple shapes: beam, box, disc, and any set of cells of a lattice."""
+
+import itertools
+import math
+
+import numpy as np
+from jaxtyping import Int
+from numpy.typing import ArrayLike
+
+from dln_jax.softbody.mesh.simplicial_mesh import Mesh, make_mesh
+from dln_jax.types import InputError, require_positive
+
+# Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror
+# images, which makes them fit, and no direction is preferred. In space that is one regular tetrahedron between four
+# alternate corners and one tetrahedron in each of the other four. The alternative, six equal tetrahedra around a space
+# diagonal (Kuhn), costs a fifth more elements, has flatter ones, and a bent bar twists towards its diagonals.
+PATTERNS = {
+    2: (((0, 0), (1, 0), (1, 1)), ((0, 0), (1, 1), (0, 1))),
+    3: (
+        ((0, 0, 0), (1, 1, 0), (0, 1, 1), (1, 0, 1)),
+        ((1, 0, 0), (1, 1, 0), (0, 0, 0), (1, 0, 1)),
+        ((0, 1, 0), (0, 0, 0), (1, 1, 0), (0, 1, 1)),
+        ((0, 0, 1), (1, 0, 1), (0, 0, 0), (0, 1, 1)),
+        ((1, 1, 1), (0, 1, 1), (1, 1, 0), (1, 0, 1)),
+    ),
+}
+"""Corners of each simplex in a cell at even coordinates; in one at odd coordinates x is mirrored."""
+
+
+def beam(length: float, height: float, cells_x: int, cells_y: int) -> Mesh:
+    """Triangles on [0, length] x [0, height], in m; (cells_x + 1)(cells_y + 1) vertices, ordered along x first.
+
+    Diagonals alternate: with an even number of cells along an axis, the mesh is its own mirror image along it.
+    """
+    return _grid((length, height), (cells_x, cells_y))
+
+
+def box(lengths: tuple[float, float, float], cells: tuple[int, int, int]) -> Mesh:
+    """Five tetrahedra per cell on [0, lx] x [0, ly] x [0, lz], in m; as symmetric as `beam`."""
+    return _grid(lengths, cells)
+
+
+def disc(radius: float, rings: int) -> Mesh:
+    """Triangles on a disc around the origin, radius in m; 1 + 3 rings (rings + 1) vertices, 6 rings² triangles.
+
+    Ring k has 6 k vertices; the boundary is a regular polygon inscribed in the circle.
+    """
+    _require_sizes(radius=radius)
+    require_positive(rings=rings)
+    vertices, elements = [np.zeros((1, 2))], []
+    for k in range(1, rings + 1):
+        angles = 2 * np.pi * np.arange(6 * k) / (6 * k)
+        vertices.append(radius * k / rings * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+        for sector, t in itertools.product(range(6), range(k)):
+            within, without = (k - 1) * sector + t, k * sector + t
+            elements.append((_on_ring(k - 1, within), _on_ring(k, without), _on_ring(k, without + 1)))
+            if t < k - 1:
+                elements.append((_on_ring(k - 1, within), _on_ring(k, without + 1), _on_ring(k - 1, within + 1)))
+    return make_mesh(np.concatenate(vertices), elements)
+
+
+def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray, "m corners"]]:
+    """Integer positions and positively oriented elements of the unit cells that have these lower corners [c, dim].
+
+    Vertices are in lexicographic order. Cells may be any set; scale the positions and give both to `make_mesh`.
+    """
+    lower = np.asarray(cells, dtype=np.int64)
+    pattern = np.array(PATTERNS[lower.shape[1]])
+    mirrored = pattern.copy()
+    mirrored[..., 0] = 1 - mirrored[..., 0]
+    mirrored[:, -2:] = mirrored[:, :-3:-1].copy()  # A mirror image is inverted; two corners swapped are so again.
+    odd = lower.sum(axis=1) % 2 == 1
+    corners = lower[:, None, None] + np.where(odd[:, None, None, None], mirrored, pattern)
+    positions, numbers = np.unique(corners.reshape(-1, lower.shape[1]), axis=0, return_inverse=True)
+    return positions, numbers.reshape(-1, pattern.shape[1])
+
+
+def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
+    names = "xyz"[: len(lengths)]
+    _require_sizes(**{f"length along {name}": length for name, length in zip(names, lengths, strict=True)})
+    require_positive(**{f"number of cells along {name}": count for name, count in zip(names, cells, strict=True)})
+    positions, elements = lattice(list(itertools.product(*(range(count) for count in cells))))
+    ticks = [np.linspace(0.0, length, count + 1) for length, count in zip(lengths, cells, strict=True)]
+    return make_mesh(np.stack([tick[positions[:, axis]] for axis, tick in enumerate(ticks)], axis=1), elements)
+
+
+def _on_ring(k: int, place: int) -> int:
+    """Index of a vertex by its place on ring k, counted on around the ring."""
+    return 0 if k == 0 else 1 + 3 * k * (k - 1) + place % (6 * k)
+
+
+def _require_sizes(**sizes: float) -> None:
+    require_positive(**sizes)
+    for name, value in sizes.items():
+        if not math.isfinite(value):
+            raise InputError(f"{name} is {value}; expected a finite number, in m")

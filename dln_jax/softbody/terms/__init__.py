@@ -1,0 +1,1 @@
+"""Energy terms of soft bodies, one file each."""

@@ -1,0 +1,102 @@
+"""Elastic simplices: constant strain triangles (plane strain, thickness 1 m) and tetrahedra.
+
+    F = [x1 - x0, ..., xd - x0] [X1 - X0, ..., Xd - X0]⁻¹,   energy = volume W(F, mu, lambda)
+
+in a rest shape X, with Lamé parameters mu = E / 2(1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu). The material is any
+density of `strain_energies`, or the user's own of the same form.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.mesh.simplicial_mesh import Mesh
+from dln_jax.softbody.terms.parameters import Bound, Numbers, material
+from dln_jax.softbody.terms.strain_energies import StrainEnergy, cofactors, determinant
+from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.types import Scalar
+
+_POISSON_BOUND = Bound(
+    lambda ratio: (ratio > -1.0) & (ratio < 0.5),
+    "more than -1 and less than 0.5 (0.49 or 0.4999 for a nearly incompressible material)",
+)
+
+
+class Material(NamedTuple):
+    """An isotropic elastic material, one for all elements [] or one for each [m]."""
+
+    youngs_modulus: Float[Array, "..."]
+    """E in Pa."""
+    poisson_ratio: Float[Array, "..."]
+    """nu, between -1 and 0.5."""
+
+
+class ElasticElement(NamedTuple):
+    """What one element's energy needs; [m, ...] for all."""
+
+    shape_gradients: Float[Array, "*m corners dim"]
+    """Gradients of the linear shape functions in the rest shape, in 1/m: F = sum over corners of x_k (grad N_k)ᵀ."""
+    volume: Float[Array, "*m"]
+    """In m³, or m² in 2-D; negative if the rest shape is inverted."""
+    mu: Float[Array, "*m"]
+    """In Pa."""
+    lam: Float[Array, "*m"]
+    """In Pa."""
+
+
+def elastic(
+    mesh: Mesh,
+    density: StrainEnergy,
+    *,
+    youngs_modulus: Numbers = 1e5,
+    poisson_ratio: Numbers = 0.3,
+    name: str = "elastic",
+) -> Term:
+    """Elastic energy of all elements of a mesh; parameters are a `Material`.
+
+    Young's modulus in Pa must be positive and Poisson's ratio lie between -1 and 0.5 (excluded), for all elements or
+    each: `InputError` otherwise, which names the element. In 2-D the strain is plane, so that mu and lambda are those
+    of the solid.
+    """
+    count = len(mesh.elements)
+    parameters = Material(
+        material("youngs_modulus", youngs_modulus, count, "element"),
+        material("poisson_ratio", poisson_ratio, count, "element", _POISSON_BOUND),
+    )
+
+    def prepare(parameters: Material, context: Context) -> ElasticElement:
+        gradients, volume = jax.vmap(rest_geometry)(context.rest[mesh.elements])
+        mu, lam = lame_parameters(*parameters)
+        return ElasticElement(gradients, volume, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count))
+
+    def energy(x: Corners, element: ElasticElement) -> Scalar:
+        F = deformation_gradient(x, element.shape_gradients)
+        return element.volume * density(F, element.mu, element.lam)
+
+    return Term(name, mesh.elements, energy, parameters, prepare)
+
+
+def lame_parameters(youngs_modulus: Float[Array, "..."], poisson_ratio: Float[Array, "..."]):
+    """(mu, lambda) in Pa, of the solid and of plane strain."""
+    mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
+    return mu, 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
+
+
+def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:
+    """Gradients of the shape functions in 1/m, and signed volume, of a simplex; written out and differentiable."""
+    axes = range(corners.shape[1])
+    edges = [[corners[k + 1, i] - corners[0, i] for k in axes] for i in axes]
+    size = determinant(edges)
+    # The rows of the inverse belong to corners 1 to d; all rows sum to zero.
+    inverse = jnp.stack([jnp.stack(row) for row in zip(*cofactors(edges), strict=True)]) / size
+    gradients = jnp.concatenate([-jnp.sum(inverse, axis=0, keepdims=True), inverse])
+    return gradients, size / (2.0 if len(edges) == 2 else 6.0)
+
+
+def deformation_gradient(x: Corners, shape_gradients: Float[Array, "corners dim"]) -> list[list[Array]]:
+    """Rows of F = dx/dX."""
+    corners, axes = range(len(x)), range(len(x) - 1)
+    gradients = [[shape_gradients[k, j] for j in axes] for k in corners]
+    return [[jnp.asarray(sum(x[k][i] * gradients[k][j] for k in corners)) for j in axes] for i in axes]

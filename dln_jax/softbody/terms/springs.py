@@ -1,0 +1,117 @@
+"""Springs, and muscles: springs whose rest length is driven."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dln_jax.softbody.terms.parameters import NOT_NEGATIVE, Indices, Numbers, material, vertex_pairs
+from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.types import InputError, Scalar, require_positive
+
+
+class Springs(NamedTuple):
+    """Parameters of springs, one for all [] or one for each [m]."""
+
+    stiffness: Float[Array, "..."]
+    """In N/m."""
+    rest_length: Float[Array, "..."] | None
+    """In m; `None` where it is taken from the rest shape."""
+
+
+class Muscles(NamedTuple):
+    """Parameters of muscles, one for all [] or one for each [m]."""
+
+    stiffness: Float[Array, "..."]
+    """Energy per squared relative strain, in J."""
+
+
+class Spring(NamedTuple):
+    """What the energy of one spring or muscle needs; [m] for all."""
+
+    stiffness: Float[Array, "*m"]
+    """In N/m."""
+    rest_length: Float[Array, "*m"]
+    """In m."""
+
+
+def springs(
+    pairs: Indices,
+    *,
+    stiffness: Numbers,
+    rest_length: Numbers | None = None,
+    softening: float = 0.0,
+    name: str = "springs",
+) -> Term:
+    """½ k (l - l0)² for each pair of vertices, with l = sqrt(d² + softening²) of the distance d.
+
+    The rest length l0 in m is that of the rest shape (softened likewise, so that it carries no force), or
+    `rest_length`, which then is a parameter. Unsoftened, the force of a compressed spring has no direction at d = 0
+    and its stiffness no bound: exactly there, only the parts that have one are kept (zero force, stiffness k), which
+    is the whole truth for l0 = 0.
+    """
+    indices = vertex_pairs("pairs of springs", pairs)
+    _require_softening(softening)
+    count = len(indices)
+    parameters = Springs(
+        material("stiffness", stiffness, count, "spring"),
+        None if rest_length is None else material("rest_length", rest_length, count, "spring", NOT_NEGATIVE),
+    )
+
+    def prepare(parameters: Springs, context: Context) -> Spring:
+        length = parameters.rest_length
+        if length is None:
+            length = _length(_squared_distances(context, indices), softening)
+        return Spring(jnp.broadcast_to(parameters.stiffness, count), jnp.broadcast_to(length, count))
+
+    return Term(name, indices, _energy(softening), parameters, prepare)
+
+
+def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name: str = "muscles") -> Term:
+    """½ k ((l - a l0)/(a l0))² for each pair of vertices, with l = sqrt(d² + softening²) of the distance d.
+
+    l0 is the distance in the rest shape, which must not be zero, and a > 0 the actuation: `control` [m] of the step,
+    in the order of the pairs. k is in J, and softening in m.
+    """
+    indices = vertex_pairs("pairs of muscles", pairs)
+    _require_softening(softening)
+    count = len(indices)
+    parameters = Muscles(material("stiffness", stiffness, count, "muscle"))
+
+    def prepare(parameters: Muscles, context: Context) -> Spring:
+        actuation = context.control
+        if actuation is None or actuation.shape != (count,):
+            got = "no control" if actuation is None else f"a control of shape {actuation.shape}"
+            raise InputError(f"{name} got {got}; expected shape ({count},): the actuation a > 0 of each muscle")
+        length = actuation * _length(_squared_distances(context, indices), 0.0)
+        return Spring(parameters.stiffness / length**2, length)
+
+    return Term(name, indices, _energy(softening), parameters, prepare)
+
+
+def _energy(softening: float):
+    def energy(x: Corners, spring: Spring) -> Scalar:
+        squared = jnp.asarray(sum((end - start) ** 2 for start, end in zip(*x, strict=True)))
+        deviation = (_length(squared, softening) - spring.rest_length) ** 2
+        if softening == 0.0:
+            deviation = jnp.where(squared > 0, deviation, squared + spring.rest_length**2)
+        return 0.5 * spring.stiffness * deviation
+
+    return energy
+
+
+def _length(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:
+    """sqrt(d² + softening²); unsoftened, with a derivative of zero at zero."""
+    if softening > 0.0:
+        return jnp.sqrt(squared_distance + softening**2)
+    apart = squared_distance > 0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared_distance, 1.0)), 0.0)
+
+
+def _squared_distances(context: Context, indices) -> Float[Array, " m"]:
+    return jnp.sum((context.rest[indices[:, 1]] - context.rest[indices[:, 0]]) ** 2, axis=1)
+
+
+def _require_softening(softening: float) -> None:
+    if softening != 0.0:
+        require_positive(softening=softening)

@@ -1,0 +1,209 @@
+"""Symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
+
+Three ways, chosen by their work, which size and structure tell before anything is traced:
+
+- dense Cholesky for small systems;
+- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most;
+- conjugate gradients with a block-Jacobi preconditioner on the element Hessians, without any matrix, where the band is
+  wide: bodies in space from some thousand unknowns on.
+
+A matrix that is not positive definite gives a solution that is not finite: nothing is shifted or clamped here.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.lax.linalg import cholesky, triangular_solve
+from jaxtyping import Array, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from dln_jax.solvers.elements.block_tridiagonal import factorise_blocks, solve_blocks
+from dln_jax.solvers.elements.conjugate_gradients import conjugate_gradients
+from dln_jax.solvers.elements.element_energies import ElementEnergy, Pattern, assemble, square
+
+Blocks = Float[Array, "n b"]
+
+# Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
+_DENSE_UNKNOWNS = 160
+# Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
+# rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
+# unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
+# unknowns takes 6e-10 s m s², within 1.7. A search to 1e-2 takes 1.6 to 5 N^(1/d) products at nu = 0.3 and 7 to 16 at
+# nu = 0.49 or E = 1e8, for N vertices in dimension d; and because it is inexact, a step takes 1.5 to 2 times the Newton
+# iterations. The products below stand for all of that. Whole steps in space by blocks, in units of those without a
+# matrix: 675 unknowns 0.69 (nu = 0.3) and 0.38 (0.49); 1,911: 1.19 and 0.50; 4,131 (6,994 tetrahedra): 1.88 and 0.74.
+_FACTORISATION_SECONDS = 1.3e-10
+_BLOCK_OVERHEAD = 150
+_PRODUCT_SECONDS = 6e-10
+_PRODUCTS = 15
+# Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
+_MOST_ENTRIES = 3e7
+
+
+class LinearSolver(NamedTuple):
+    """How systems with the Hessian are solved."""
+
+    factorise: Callable[[Sequence[Array], Float[Array, " entries"]], Any]
+    """(element Hessians, entries of their sum) -> what the solves need."""
+    solve: Callable[[Any, Blocks], Blocks]
+    """(factor, b) -> p, as accurate as rounding allows; p is zero where the pattern is not free."""
+    search: Callable[[Any, Blocks], Blocks]
+    """The same, as accurate as a search direction has to be."""
+
+
+LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
+
+
+def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """The way that `least_work` names."""
+    return least_work(energies, at)(energies, at)
+
+
+def least_work(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolverFactory:
+    """`dense`, `block_tridiagonal` or `matrix_free`: the least work by estimates of a factorisation and of products.
+
+    The stiffness is not known beforehand; much stiffer or nearly incompressible bodies (nu > 0.49) gain by
+    `block_tridiagonal`, soft ones in small time steps by `matrix_free`.
+    """
+    if at.unknowns <= _DENSE_UNKNOWNS:
+        return dense
+    size = _band(at, _ordering(at)) * at.width
+    stored = at.unknowns * size
+    factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
+    product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
+    # Vertices along an edge of the body, which information crosses by one a product.
+    across = at.blocks ** (1 / min(at.width, 3))
+    if stored <= _MOST_ENTRIES and factorisation <= _PRODUCTS * across * product:
+        return block_tridiagonal
+    return matrix_free
+
+
+def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Cholesky factorisation of the whole matrix."""
+    table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
+
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
+        return cholesky(_with_constants(values)[table], symmetrize_input=False)
+
+    def solve(factor: Array, b: Blocks) -> Blocks:
+        right = jnp.where(at.free, b, 0).reshape(-1, 1)
+        y = triangular_solve(factor, right, left_side=True, lower=True)
+        return triangular_solve(factor, y, left_side=True, lower=True, transpose_a=True).reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
+    """Cholesky factorisation block by block, the unknowns ordered so that only neighbouring blocks couple."""
+    order = _ordering(at)
+    size = _band(at, order)
+    count = -(-at.blocks // size)
+    # Unknowns in their new order; the last block is padded with unknowns that couple to nothing.
+    numbers = np.full(count * size * at.width, at.unknowns)
+    numbers[: at.unknowns] = (order[:, None] * at.width + np.arange(at.width)).ravel()
+    numbers = numbers.reshape(count, size * at.width)
+    lookup = _lookup(at)
+    diagonal = np.stack([lookup(rows[:, None], rows[None, :]) for rows in numbers])
+    block, row = np.nonzero(numbers == at.unknowns)
+    diagonal[block, row, row] = _one(at)
+    below = np.stack([lookup(lower[:, None], upper[None, :]) for upper, lower in itertools.pairwise(numbers)])
+    back = np.argsort(numbers.ravel()[: at.unknowns], kind="stable")
+
+    def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> tuple[Array, Array]:
+        values = _with_constants(values)
+        return factorise_blocks(values[diagonal], values[below])
+
+    def solve(factor: tuple[Array, Array], b: Blocks) -> Blocks:
+        right = jnp.append(jnp.where(at.free, b, 0).reshape(-1), 0)[numbers]
+        return solve_blocks(factor, right).reshape(-1)[back].reshape(b.shape)
+
+    return LinearSolver(factorise, solve, solve)
+
+
+def matrix_free(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    *,
+    tolerance: float = 1e-10,
+    search_tolerance: float = 1e-2,
+    iterations: int = 10_000,
+) -> LinearSolver:
+    """Conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
+
+    Args:
+        energies: whose indices say where the elements' products go.
+        at: the pattern.
+        tolerance: relative residual of `solve`; a solve that does not get there is not finite.
+        search_tolerance: relative residual of `search`.
+        iterations: products after which either gives up.
+    """
+    n, b = at.blocks, at.width
+    numbers = np.arange(n * b).reshape(n, b)
+    of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
+
+    def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
+        return tuple(map(square, hessians)), jnp.linalg.inv(_with_constants(values)[of_blocks])
+
+    def run(factor: tuple[tuple[Array, ...], Array], right: Blocks, tolerance: float) -> Blocks:
+        hessians, inverse = factor
+
+        def product(x: Blocks) -> Blocks:
+            out = jnp.zeros_like(x)
+            for element, corners, of_elements in zip(energies, at.corners, hessians, strict=True):
+                at_corners = x[element.indices].reshape(len(element.indices), -1, 1)
+                out += assemble(corners, (of_elements @ at_corners)[..., 0].T)
+            return jnp.where(at.free, out, 0)
+
+        def precondition(x: Blocks) -> Blocks:
+            return (inverse @ x[..., None])[..., 0]
+
+        right = jnp.where(at.free, right, 0)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=iterations)
+
+    return LinearSolver(
+        factorise, lambda factor, right: run(factor, right, tolerance), lambda f, right: run(f, right, search_tolerance)
+    )
+
+
+def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """(rows, columns) -> index into the entries with the constants 0 and 1 behind them; beyond the rows all is zero."""
+    size = at.unknowns + 1
+    key = at.rows * size + at.columns
+    order = np.argsort(key)
+    fixed = np.append(~at.free.ravel(), False)
+
+    def places(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        row, column = np.broadcast_arrays(row, column)
+        # The lower triangle stands for both.
+        wanted = np.maximum(row, column) * size + np.minimum(row, column)
+        nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
+        found = np.where(key[order][nearest] == wanted, order[nearest], len(key))
+        return np.where((row == column) & fixed[row], _one(at), found)
+
+    return places
+
+
+def _one(at: Pattern) -> int:
+    return len(at.rows) + 1
+
+
+def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2"]:
+    return jnp.concatenate([values, jnp.asarray([0, 1], values.dtype)])
+
+
+def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
+    """Reverse Cuthill-McKee, or the given order where its band is narrower (meshes built row by row)."""
+    rows, columns = at.rows // at.width, at.columns // at.width
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
+    found = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+    return min(found, np.arange(at.blocks), key=lambda order: _band(at, order))
+
+
+def _band(at: Pattern, order: np.ndarray) -> int:
+    """Largest distance in the ordering between two blocks that couple; at least 1."""
+    place = np.argsort(order)
+    return max(1, int(np.abs(place[at.rows // at.width] - place[at.columns // at.width]).max(initial=0)))

@@ -1,0 +1,246 @@
+"""Minima of sums of element energies by Newton's method, differentiable by the implicit function theorem.
+
+    x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
+    dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
+
+The Hessian is used as it is; only when its factorisation fails are the Hessians of the elements projected to positive
+semi-definite ones (projecting always costs several times the iterations on badly deformed bodies). The derivative is
+that of the minimum and not of the iterations: one factorisation and one solve, in forward and in reverse mode and to
+any order. A derivative at a point that is no minimum is NaN, never a plausible number.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.solvers.elements.element_energies import (
+    Blocks,
+    ElementEnergy,
+    Pattern,
+    element_hessians,
+    entries,
+    gradient,
+    pattern,
+    value_and_gradient,
+)
+from dln_jax.solvers.elements.line_search import Point, line_search
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory, by_size
+from dln_jax.solvers.elements.projection import project
+from dln_jax.types import InputError, require_positive
+
+# Gradients and energies cannot be told from zero below so many units of rounding.
+_ROUNDING_UNITS = 16
+# Shifts of the projected Hessian's diagonal, relative to the largest eigenvalue of an element, tried in turn: projected
+# elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
+_SHIFTS = (1e-6, 1e-3, 1.0)
+
+
+class Info(NamedTuple):
+    """How a minimisation ended."""
+
+    residual: Float[Array, ""]
+    """Largest |dE/dx| / scale at the point returned."""
+    iterations: Int[Array, ""]
+    """Newton steps taken."""
+    converged: Bool[Array, ""]
+    """Whether the residual is within the tolerance or at the level of rounding; false where values are not finite."""
+    definite: Bool[Array, ""]
+    """Whether the Hessian at the point returned, as it is, is positive definite: a minimum and no saddle. Costs a
+    factorisation, which is left out of the program where this is not used."""
+
+
+class _State(NamedTuple):
+    x: Blocks
+    energy: Float[Array, ""]
+    gradient: Blocks
+    floor: Blocks
+    iterations: Int[Array, ""]
+    stuck: Bool[Array, ""]
+
+
+def minimise(
+    energies: Sequence[ElementEnergy] | Callable[[Blocks, Any], Array],
+    x0: Array,
+    data: Any = None,
+    *,
+    free: Any = None,
+    scale: Float[Array, " n"] | float = 1.0,
+    tolerance: float = 1e-8,
+    iterations: int = 100,
+    linear_solver: LinearSolverFactory = by_size,
+    at: Pattern | None = None,
+) -> tuple[Blocks, Info]:
+    """x [n, b] at which the sum of the energies is least, near x0, with how the search ended.
+
+    Derivatives are those of the minimum, with respect to `data` and to the entries of x0 that are not free. Arrays that
+    an energy closes over are constants.
+
+    Args:
+        energies: what is added up, or one function (x [n, b], data) -> scalar of all unknowns.
+        x0: start [n, b]; float32 or float64 decides the precision.
+        data: for each energy, the data of its elements (leading axis m); for one function, its second argument.
+        free: [n, b], which unknowns are solved for; the others keep their value in x0. All by default.
+        scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
+        tolerance: largest |dE/dx| / scale that counts as a minimum; rounding always does.
+        iterations: Newton steps after which the search gives up, which `Info.converged` reports.
+        linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
+        at: the energies' pattern, if it is at hand; made here otherwise.
+
+    Raises:
+        InputError: indices, shapes or numbers that do not fit.
+    """
+    require_positive(tolerance=tolerance, iterations=iterations)
+    if x0.ndim != 2:
+        raise InputError(f"x0 has shape {x0.shape}; expected [n, b], blocks of unknowns")
+    if callable(energies):
+        energies = (ElementEnergy(energies, np.arange(x0.shape[0])[None]),)
+        data = (jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], data),)
+    energies = tuple(energies)
+    at = pattern(energies, x0.shape[0], x0.shape[1], free) if at is None else at
+    solver = linear_solver(energies, at)
+    scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
+
+    @jax.custom_jvp
+    def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
+        x, info = _newton(energies, at, solver, x0, data, scale, tolerance, iterations)
+        # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
+        solved = solver.solve(_factor(energies, at, solver, x, data), jnp.ones_like(x))
+        return x, info._replace(definite=jnp.isfinite(solved).all())
+
+    def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        x, info = minimum(*primals)
+        x_dot = _implicit_derivative(energies, at, solver, x, primals[1], *tangents[:2])
+        x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
+        return (x, info), (x_dot, jax.tree.map(_no_tangent, info))
+
+    minimum.defjvp(derivative, symbolic_zeros=True)
+    return minimum(x0, tuple(data), scale)
+
+
+def _is_constant(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero) or getattr(tangent, "dtype", None) == jax.dtypes.float0
+
+
+def _no_tangent(leaf: Array) -> Any:
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)
+
+
+def _implicit_derivative(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    solver: LinearSolver,
+    x: Blocks,
+    data: Any,
+    x0_dot: Any,
+    data_dot: Any,
+) -> Blocks:
+    # What does not vary is left out: its derivatives would be computed only to be multiplied by zero.
+    leaves, structure = jax.tree.flatten(data)
+    dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
+    varying = [i for i, dot in enumerate(dots) if not _is_constant(dot)]
+    moving = not (at.free.all() or _is_constant(x0_dot))
+
+    # Reverse mode keeps the arguments and nothing else: reading back what could be kept takes longer than the work.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def response(x: Blocks, leaves: list[Array], given_dots: list[Array], fixed_dot: Any) -> Blocks:
+        data = structure.unflatten(leaves)
+
+        def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
+            replaced = dict(zip(varying, given, strict=True))
+            all_leaves = [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
+            return gradient(energies, at, x, structure.unflatten(all_leaves))
+
+        def product(v: Blocks) -> Blocks:
+            masked = jnp.where(at.free, v, 0)
+            curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
+            return jnp.where(at.free, curved, v)
+
+        given = [leaves[i] for i in varying]
+        if moving:
+            _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
+        else:
+            _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
+        # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
+        factor = _factor(energies, at, solver, *jax.lax.stop_gradient((x, data)))
+        return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
+
+    fixed_dot = jnp.where(at.free, 0, x0_dot) if moving else None
+    solution = response(x, leaves, [dots[i] for i in varying], fixed_dot)
+    return solution if fixed_dot is None else solution + fixed_dot
+
+
+def _factor(energies: Sequence[ElementEnergy], at: Pattern, solver: LinearSolver, x: Blocks, data: Any) -> Any:
+    hessians = element_hessians(energies, x, data)
+    return solver.factorise(hessians, entries(at, hessians))
+
+
+def _newton(
+    energies: Sequence[ElementEnergy],
+    at: Pattern,
+    solver: LinearSolver,
+    x0: Blocks,
+    data: Any,
+    scale: Array,
+    tolerance: float,
+    iterations: int,
+) -> tuple[Blocks, Info]:
+    rounding = _ROUNDING_UNITS * jnp.finfo(x0.dtype).eps
+
+    def evaluate(x: Blocks) -> tuple[Array, Blocks]:
+        return value_and_gradient(energies, at, x, data)
+
+    def within(state: _State) -> Array:
+        return (jnp.abs(state.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
+
+    def running(state: _State) -> Array:
+        return ~within(state) & ~state.stuck & (state.iterations < iterations)
+
+    def iterate(state: _State) -> _State:
+        hessians = element_hessians(energies, state.x, data)
+        values = entries(at, hessians)
+        direction = _descent_direction(at, solver, hessians, values, state.gradient)
+        slope = jnp.vdot(direction, state.gradient)
+        # What cancels in a row of the gradient is of the size of |H| |x|.
+        diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(state.x.shape)
+        extent = jnp.max(jnp.abs(state.x), initial=0)
+        floor = rounding * diagonal * extent
+        unclear = rounding * jnp.abs(state.energy) + floor.sum() * extent
+        point = Point(state.x, state.energy, state.gradient)
+        (x, energy, gradient), accepted = line_search(evaluate, point, direction, slope, unclear, scale)
+        return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
+
+    energy, first = evaluate(x0)
+    start = _State(x0, energy, first, jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
+    last = jax.lax.while_loop(running, iterate, start)
+    residual = jnp.max(jnp.abs(last.gradient) / scale, initial=0)
+    return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy), jnp.asarray(False))
+
+
+def _descent_direction(
+    at: Pattern, solver: LinearSolver, hessians: Sequence[Array], values: Array, gradient: Blocks
+) -> Blocks:
+    def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
+        direction = solver.search(solver.factorise(hessians, values), -gradient)
+        return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)
+
+    # A loop that usually runs zero times: under vmap a branch would always be taken.
+    def failing(state: tuple[Blocks, Array, Array]) -> Array:
+        _, descends, attempts = state
+        return ~descends & (attempts < len(_SHIFTS))
+
+    def retry(state: tuple[Blocks, Array, Array]) -> tuple[Blocks, Array, Array]:
+        # The barrier ties the projection to the loop: it would be computed ahead of it, and always, otherwise.
+        here, attempts = jax.lax.optimization_barrier((tuple(hessians), state[2]))
+        projected = project(here, jnp.asarray(_SHIFTS, gradient.dtype)[attempts])
+        return *towards(projected, entries(at, projected)), attempts + 1
+
+    direction, descends, _ = jax.lax.while_loop(failing, retry, (*towards(hessians, values), jnp.asarray(0)))
+    return jnp.where(descends, direction, -gradient)

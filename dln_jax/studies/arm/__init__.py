@@ -1,0 +1,1 @@
+"""The two-link arm that writes: every model, beside the published results."""

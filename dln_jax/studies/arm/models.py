@@ -1,0 +1,253 @@
+"""One model of the arm's table: trained, measured on the test, and timed."""
+
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split
+from dln_jax.datasets import generators
+from dln_jax.learning.dynamics_fit import Settings, train
+from dln_jax.learning.engine.runs import Training
+from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.objectives import TORQUE, objective_of
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.hamiltonian import hamiltonian_from_lagrangian
+from dln_jax.metrics.definiteness import definiteness
+from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.latency import one_step
+from dln_jax.metrics.rollouts import rollout_metrics
+from dln_jax.models.model import Model
+from dln_jax.scenes.scene import Scene, dynamics
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import Needs
+from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.load import compiled
+
+TORQUE_NOISE = 0.05
+"""N m, standard deviation, of the trigonometric model's second fit."""
+TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
+"""Test errors in (N m)² whose times are measured; the first is the published code's after 108 s."""
+
+
+class Size(NamedTuple):
+    """A network, and how long Gauss-Newton takes it to level off; chosen by validation errors."""
+
+    width: int
+    depth: int
+    activation: str
+    steps: int
+
+
+SIZES = {
+    "structured-delan": Size(8, 2, "tanh", 150),
+    "structured-hnn": Size(8, 2, "tanh", 150),
+    "black-box-delan": Size(16, 2, "tanh", 150),
+    "black-box-hnn": Size(16, 2, "tanh", 150),
+    "feed-forward": Size(16, 2, "tanh", 150),
+}
+
+
+class Curve(NamedTuple):
+    """Test torque error against seconds of training, per seed, compilation included."""
+
+    seconds: list[float]
+    errors: list[float]
+
+
+Measured = tuple[dict[str, float], Curve | None]
+WHOLE_CIRCLE = {"position_bound": np.pi, "rate_bound": 2.0, "acceleration_bound": 8.0}
+"""Bounds of states with any angles, in rad, 1/s and 1/s²; rates and accelerations are those of the letters."""
+
+
+def whole_circle(*, samples: int = 1_000) -> Trajectories:
+    """Random states of the arm over the whole circle, most of them far from every letter; torques in closed form."""
+    return generators.uniform(two_link_arm(), samples=samples, seed=1, **WHOLE_CIRCLE)
+
+
+def needs_of(sets: Split) -> Needs:
+    """The needs that the data state."""
+    assert sets.train.needs is not None
+    return sets.train.needs
+
+
+def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5.0, dt: float = 0.02) -> float:
+    """How long a motion without torque stays within the training angles: median over the test's first states, in s."""
+    _, first = np.unique(sets.test.trajectory, return_index=True)
+    t = np.arange(0.0, duration, dt)
+    q, _ = generators.rollouts(scene, sets.test.q[first], sets.test.qd[first], t)
+    outside = ((q < sets.train.q.min(axis=0)) | (q > sets.train.q.max(axis=0))).any(axis=2)
+    return float(np.median(np.where(outside.any(axis=1), t[outside.argmax(axis=1)], duration)))
+
+
+def plant_rows(scene: Scene, sets: Split) -> Measured:
+    """What the true plant reaches on the test: the ceiling of every rollout, and what recorded momenta are wrong by.
+
+    The mean square of the torques over the whole circle is what a model that answers zero would be wrong by.
+    """
+    plant = dynamics(scene)._replace(hamiltonian=hamiltonian_from_lagrangian(scene.lagrangian))
+    return {
+        **errors(predictions(plant, sets.test, jnp.float64), sets.test),
+        **rollout_metrics(plant, sets.test),
+        "free_motion_inside_seconds": free_motion_inside_seconds(scene, sets),
+        "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
+    }, None
+
+
+def linear_model(sets: Split) -> Model:
+    """The trigonometric model of a data set."""
+    return build(describe("trigonometric", sets.train, needs_of(sets), precision="f64", degree=1))
+
+
+def measure_trigonometric(sets: Split) -> Measured:
+    """The linear fit, and the same with noise on the training torques."""
+    model = linear_model(sets)
+    began = time.perf_counter()
+    fitted = fit_linear(model, sets.train)
+    seconds = time.perf_counter() - began
+    noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
+    noisy = fit_linear(model, sets.train._replace(tau=sets.train.tau + noise))
+    system = compiled(model.apply(fitted.parameters), jnp.float64)
+    numbers = {
+        **errors(predictions(system, sets.test, jnp.float64), sets.test),
+        "noisy_torque_mse": torque_mse(model.apply(noisy.parameters), sets.test),
+        "whole_circle_torque_mse": torque_mse(system, whole_circle()),
+        **rollout_metrics(system, sets.test),
+        "rank": float(fitted.rank),
+        "condition": fitted.condition,
+        "train_seconds": seconds,
+        "parameters": float(fitted.parameter_count),
+        **latency(system, sets),
+    }
+    return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
+
+
+def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
+    """Gauss-Newton on several seeds in one program; medians over them, and the spread of the torque error."""
+    training, systems = trained(kind, sets, seeds=seeds, steps=steps)
+    seconds = training.compile_seconds + training.train_seconds
+    of_seeds = [
+        {
+            **errors(predictions(system, sets.test, jnp.float64), sets.test),
+            "whole_circle_torque_mse": torque_mse(system, whole_circle()),
+            **rollout_metrics(system, sets.test),
+            **definite(kind, system, sets),
+        }
+        for system in systems
+    ]
+    medians = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
+    torques = [each["torque_mse"] for each in of_seeds]
+    numbers = {
+        **medians,
+        "torque_mse_mean": float(np.mean(torques)),
+        "torque_mse_standard_deviation": float(np.std(torques)),
+        "torque_mse_largest": float(np.max(torques)),
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": seconds / seeds,
+        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds),
+        **latency(systems[0], sets),
+    }
+    return numbers, curve(kind, sets, training, numbers, seeds)
+
+
+def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Dynamics]]:
+    """Gauss-Newton on several seeds in one program, and the model of each."""
+    model, settings = prepared(kind, sets, SIZES[kind], steps)
+    training = train(model, sets, settings, objective=objective_of(kind, sets.train), seeds=tuple(range(seeds)))
+    each = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
+    return training, [compiled(model.apply(parameters), jnp.float64) for parameters in each]
+
+
+def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
+    """Test torque errors of one more split, trained as the published one: median and largest over seeds."""
+    if kind == "trigonometric":
+        model = linear_model(sets)
+        systems = [model.apply(fit_linear(model, sets.train).parameters)]
+    else:
+        _, systems = trained(kind, sets, seeds=seeds, steps=steps)
+    torques = [torque_mse(system, sets.test) for system in systems]
+    return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, None
+
+
+def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
+    """The published protocol: one seed, two layers of 64, batch 512, float32."""
+    description = describe(kind, sets.train, needs_of(sets), precision="f32", width=64, depth=2, activation="tanh")
+    model = build(description)
+    training = train(model, sets, Settings(steps=steps), objective=objective_of(kind, sets.train))
+    system = compiled(model.apply(training.parameters), jnp.float32)
+    numbers = {
+        **errors(predictions(system, sets.test, jnp.float32), sets.test),
+        **rollout_metrics(system, sets.test, dtype=jnp.float32),
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": training.compile_seconds + training.train_seconds,
+        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters))),
+        **latency(system, sets, jnp.float32),
+    }
+    return numbers, curve(kind, sets, training, numbers, 1)
+
+
+def gauss_newton_rows(sets: Split, *, seeds: int, steps: int | None) -> Measured:
+    """Structured models trained one by one: seconds to test errors, compilation included, medians over seeds.
+
+    Also the cost of ten seeds in one program in units of a single run, compilation included.
+    """
+    kind = "structured-delan"
+    model, settings = prepared(kind, sets, SIZES[kind], steps)
+    times: dict[float, list[float]] = {target: [] for target in TARGETS}
+    final, singles = [], []
+    for seed in range(seeds):
+        jax.clear_caches()
+        training = train(model, sets, settings._replace(seed=seed))
+        for target in TARGETS:
+            reached = [at.seconds for at in training.history if at.monitor <= target]
+            times[target].append(training.compile_seconds + reached[0] if reached else float("inf"))
+        final.append(torque_mse(model.apply(training.parameters), sets.test))
+        singles.append(training.compile_seconds + training.train_seconds)
+    jax.clear_caches()
+    ten = train(model, sets, settings, seeds=tuple(range(10)))
+    return {
+        **{f"seconds_to_{target:g}": float(np.median(values)) for target, values in times.items()},
+        "torque_mse": float(np.median(final)),
+        "torque_mse_largest": float(np.max(final)),
+        "train_seconds": float(np.median(singles)),
+        "cost_of_ten_seeds": (ten.compile_seconds + ten.train_seconds) / float(np.median(singles)),
+    }, None
+
+
+def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Model, Settings]:
+    """The model of a kind, and Gauss-Newton's settings for it."""
+    keywords = {"width": size.width, "depth": size.depth, "activation": size.activation}
+    model = build(describe(kind, sets.train, needs_of(sets), precision="f64", **keywords))
+    return model, Settings(optimizer="gauss-newton", precision="f64", steps=steps or size.steps)
+
+
+def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:
+    """The path of the test error; its end alone for models that are not fitted to torques."""
+    if objective_of(kind, sets.train) is not TORQUE:
+        return Curve([numbers["train_seconds"]], [numbers["torque_mse"]])
+    best: Array | np.ndarray = np.array([np.median(at.monitor) for at in training.history])
+    seconds = [(training.compile_seconds + at.seconds) / seeds for at in training.history]
+    return Curve(seconds, np.minimum.accumulate(best).tolist())
+
+
+def definite(kind: str, system: Dynamics, sets: Split) -> dict[str, float]:
+    """The share of test states whose learned mass matrix is not definite, for models without structure."""
+    if not kind.startswith("black-box"):
+        return {}
+    return {"share_not_definite": definiteness(system, sets.test.q, sets.test.qd).share_not_definite}
+
+
+def torque_mse(dynamics: Dynamics, data: Trajectories) -> float:
+    """Mean squared torque error in float64, summed over joints."""
+    predicted = jax.jit(jax.vmap(dynamics.inverse_dynamics))(data.q, data.qd, data.qdd)
+    return mean_square(np.asarray(predicted) - data.tau)
+
+
+def latency(system: Dynamics, sets: Split, dtype=jnp.float64) -> dict[str, float]:
+    """Of one inverse-dynamics call."""
+    states = list(zip(*(jnp.asarray(a[:400], dtype) for a in sets.test[1:4]), strict=True))
+    return {"one_step_p50_us": one_step(system.inverse_dynamics, states, calls=2000).p50_us}

@@ -1,0 +1,1 @@
+"""Differential networks on the published functions."""

@@ -1,0 +1,1 @@
+"""Hamiltonian tasks: data, training, errors, beside the published results."""

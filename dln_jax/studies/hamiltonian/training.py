@@ -1,0 +1,299 @@
+"""How each model is made and trained for a Hamiltonian task.
+
+Spring and pendulum have noise on the states and none on the rates: models are fitted to rates first, and then to
+trajectories with free starts, which takes away the bias of the noise. The other generated tasks have no noise: rates
+alone. Measurements have no rates, only finite differences for a first fit: the result is that to trajectories.
+"""
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.data.magnitudes import spread
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import PER_SAMPLE
+from dln_jax.learning import field_matching, trajectory_matching
+from dln_jax.learning.engine.runs import (
+    Checkpoint,
+    Progress,
+    Report,
+    Training,
+    fingerprint,
+    one_after_the_other,
+    silent,
+)
+from dln_jax.learning.engine.second_order import Budget
+from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
+from dln_jax.learning.growth import grow
+from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories
+from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, WINDOW, Problem
+from dln_jax.types import InputError
+from dln_jax.zoo.phase_kinds import build_phase, describe_phase
+
+MODELS = ("hnn", "black-box-hnn", "baseline")
+"""Of every task in the table; hnn is what suits the scene."""
+POLYNOMIAL = "polynomial"
+"""Of tasks with one coordinate and without friction, beside."""
+KINDS = {
+    "separable": "separable-hamiltonian",
+    "structured": "structured-hamiltonian",
+    "black-box": "black-box-hamiltonian",
+    "black-box-hnn": "black-box-hamiltonian",
+    "pairwise": "pairwise-hamiltonian",
+    POLYNOMIAL: "polynomial-hamiltonian",
+    "baseline": "phase-network",
+}
+DEGREES = range(2, 7)
+RATES, MOTIONS = "rates", "motions"
+"""The stages of a training."""
+LEARNING_RATE = 5e-3
+"""Of Adam."""
+VALIDATION_SHARE = 0.15
+"""Of the trajectories for training."""
+
+
+class Recipe(NamedTuple):
+    """The networks of a task, and how long they train; chosen by trial on seed 0, and the same for all seeds."""
+
+    suits: str
+    """The model that suits the scene."""
+    width: int
+    """Hidden units per layer of that."""
+    depth: int
+    network: int
+    """Hidden units per layer of the models that know less: a Hamiltonian that is one network, and the baseline."""
+    network_depth: int
+    steps: int
+    """Iterations of Gauss-Newton on rates."""
+    samples: int
+    seconds: float
+    """At most, of both fits together, compilation included: the limit that `hnn_table` states, and nothing else has."""
+    trajectory_steps: int = 0
+    """Iterations of Gauss-Newton on trajectories, afterwards."""
+    window: int = 0
+    """Samples of a window."""
+    weights: Weights | None = None
+    """Of the trajectories; `None` for the deviations of the data."""
+    substeps: int = 4
+
+
+# The noise of spring and pendulum has sd 0.1; their rates have none, and are trusted to 0.01.
+_NOISY = Weights(state=0.1, rate=0.01)
+_SPRING = Recipe("separable", 8, 1, 16, 1, 40, 10_000, 60.0, 40, 30, _NOISY, 1)
+_PENDULUM = _SPRING._replace(trajectory_steps=50, window=15)
+RECIPES = {
+    "spring": _SPRING,
+    "pendulum": _PENDULUM,
+    "damped-spring": _SPRING,
+    "damped-pendulum": _PENDULUM,
+    "henon-heiles": Recipe("separable", 12, 2, 24, 2, 100, 4_000, 60.0),
+    "double-pendulum": Recipe("structured", 8, 2, 24, 2, 100, 4_000, 60.0),
+    "two-body": Recipe("pairwise", 8, 1, 24, 2, 60, 3_000, 25.0),
+    "three-body": Recipe("pairwise", 8, 1, 24, 2, 60, 4_000, 45.0),
+    REAL: Recipe("separable", 4, 1, 8, 1, 40, 10_000, 30.0, 40, WINDOW[REAL], Weights(state=0.03), 1),
+    MEASURED: Recipe("structured", 8, 1, 16, 1, 60, 10_000, 60.0, 60, WINDOW[MEASURED], None, 2),
+}
+ANCHOR = 30.0
+"""How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
+to choose its own momentum."""
+FRICTION_WIDTH = 4
+"""Hidden units of the friction, where a scene has it; the model that is one network has one coefficient."""
+
+
+class Trained(NamedTuple):
+    """A model and how it came about."""
+
+    description: dict[str, Any]
+    """For `dln_jax.zoo.phase_kinds.build_phase`."""
+    fits: dict[str, Training]
+    """By stage, one after the other; the last one's parameters are the result."""
+    stopped: str = ""
+    """Why a stage was left out, or ended before its time; empty where all went well."""
+    diverged: bool = False
+    """Whether that is a loss that stopped being finite."""
+
+    @property
+    def result(self) -> Training:
+        """The last fit."""
+        return list(self.fits.values())[-1]
+
+    @property
+    def history(self) -> list[Progress]:
+        """Of all stages; their steps are counted on."""
+        return one_after_the_other(fit.history for fit in self.fits.values())
+
+
+def models_of(task: str) -> tuple[str, ...]:
+    """The kinds of model that the table gives a task to."""
+    return (*MODELS, POLYNOMIAL) if task in ("spring", "pendulum") else MODELS
+
+
+def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
+    """The description of a model for a task; `keywords` (width, depth, activation, degree) replace the recipe's."""
+    recipe = RECIPES[problem.name]
+    suits = model in ("hnn", "auto", recipe.suits)
+    kind = KINDS.get(recipe.suits if suits else model)
+    if kind is None:
+        raise InputError(f"model '{model}' is unknown; choose from hnn, {', '.join(KINDS)}")
+    if kind == KINDS[POLYNOMIAL]:
+        degree = keywords.get("degree") or polynomial_degree(problem)
+        return describe_phase(kind, problem.fitted, problem.needs, precision=precision, degree=degree)
+    few = (recipe.width, recipe.depth) if suits else (recipe.network, recipe.network_depth)
+    size = {"width": few[0], "depth": few[1], "activation": "tanh"}
+    size |= {key: value for key, value in keywords.items() if value is not None and key in size}
+    if problem.needs.friction and kind in (KINDS["separable"], KINDS["structured"]):
+        size["friction_width"] = FRICTION_WIDTH
+    return describe_phase(kind, problem.fitted, problem.needs, precision=precision, **size)
+
+
+def polynomial_degree(problem: Problem) -> int:
+    """The degree that the validation trajectories call enough."""
+    fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
+
+    def fit(degree: int):
+        description = describe_phase(KINDS[POLYNOMIAL], fitted, problem.needs, degree=degree)
+        return match_linear(build_phase(description), fitted, validation=validation)
+
+    return grow(DEGREES, fit)[0].candidate
+
+
+def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
+    """The stages of a training that take steps, and how many each."""
+    recipe = RECIPES[problem.name]
+    rates = {} if description["kind"] == KINDS[POLYNOMIAL] else {RATES: steps or recipe.steps}
+    return {**rates, **({MOTIONS: steps or recipe.trajectory_steps} if recipe.trajectory_steps else {})}
+
+
+def settings_of(
+    problem: Problem,
+    description: dict[str, Any],
+    *,
+    seed: int,
+    optimizer: str = "gauss-newton",
+    steps: int | None = None,
+    learning_rate: float = LEARNING_RATE,
+    seconds: float = math.inf,
+) -> Settings:
+    """How the rates are fitted; `check` and `train` take it."""
+    recipe = RECIPES[problem.name]
+    return Settings(
+        optimizer=optimizer,
+        precision=description["precision"],
+        steps=steps or recipe.steps,
+        samples=recipe.samples,
+        seconds=seconds,
+        learning_rate=learning_rate,
+        validation_share=VALIDATION_SHARE,
+        seed=seed,
+    )
+
+
+def check(problem: Problem, description: dict[str, Any], settings: Settings) -> None:
+    """Raises `InputError` for all that `train` would refuse."""
+    recipe = RECIPES[problem.name]
+    field_matching.check(problem.fitted, settings)
+    field_matching.check_start(build_phase(description), problem.fitted, settings)
+    if recipe.trajectory_steps:
+        parts = hold_out(problem.fitted, VALIDATION_SHARE, settings.seed)
+        weights = recipe.weights or deviations(parts[0])
+        windows, validation = (cut_windows(part, recipe.window) for part in parts)
+        trajectory_matching.check(windows, validation, weights)
+
+
+def train(
+    problem: Problem,
+    description: dict[str, Any],
+    *,
+    seed: int,
+    optimizer: str = "gauss-newton",
+    steps: int | None = None,
+    learning_rate: float = LEARNING_RATE,
+    seconds: float = math.inf,
+    directory: Path | None = None,
+    resume: bool = False,
+    report: Report = silent,
+) -> Trained:
+    """Fits a model to rates, and then to trajectories where the recipe says so.
+
+    `seconds` are those of both, compilation included. Where they are over after the rates, or the fit of motions is not
+    finite from its start, the fit of rates is the result.
+    """
+    began = time.perf_counter()
+    recipe, model = RECIPES[problem.name], build_phase(description)
+    settings = settings_of(
+        problem,
+        description,
+        seed=seed,
+        optimizer=optimizer,
+        steps=steps,
+        learning_rate=learning_rate,
+        seconds=seconds,
+    )
+    # As JSON reads it back, lists for tuples, so that a resumed run is recognised.
+    stated = json.loads(json.dumps({**settings._asdict(), "model": description, "seconds": None}))
+    numbers = fingerprint(getattr(problem.fitted, key) for key in PER_SAMPLE)
+
+    def checkpoint(name: str) -> Checkpoint | None:
+        identity = {"settings": stated, "data": numbers}
+        return None if directory is None else Checkpoint(directory, identity, resume, f"checkpoint_{name}")
+
+    parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
+    if description["kind"] == KINDS[POLYNOMIAL]:
+        rates = match_linear(model, parts[0], validation=parts[1])[0]
+    else:
+        at_rates = _of_stage(RATES, report)
+        rates = match_field(model, problem.fitted, settings, checkpoint=checkpoint("rates"), report=at_rates)
+    fits = {RATES: _named(RATES, rates)}
+    left = seconds - (time.perf_counter() - began)
+    if not recipe.trajectory_steps or rates.stop.reason == "not finite":
+        return Trained(description, fits, _ending(RATES, rates), rates.stop.reason == "not finite")
+    if rates.stop.reason == "time" or left <= 0:
+        return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
+    windows = (cut_windows(part, recipe.window) for part in parts)
+    first_order = trajectory_matching.Adam(learning_rate=learning_rate, seed=seed)
+    motions = match_trajectories(
+        model,
+        rates.parameters,
+        *windows,
+        weights=recipe.weights or deviations(parts[0]),
+        budget=Budget(steps or recipe.trajectory_steps, seconds=left),
+        adam=first_order if optimizer == "adam" else None,
+        substeps=recipe.substeps,
+        checkpoint=checkpoint("trajectories"),
+        report=_of_stage(MOTIONS, report),
+    )
+    if motions.stop.step and np.isfinite(motions.validation):
+        fits[MOTIONS] = _named(MOTIONS, motions)
+    return Trained(description, fits, _ending(MOTIONS, motions), motions.stop.reason == "not finite")
+
+
+def _of_stage(stage: str, report: Report) -> Report:
+    return lambda at: report(at._replace(stage=stage))
+
+
+def _named(stage: str, training: Training) -> Training:
+    return training._replace(history=[at._replace(stage=stage) for at in training.history])
+
+
+def _ending(stage: str, training: Training) -> str:
+    """What is to be said of how a fit ended."""
+    at = f"after step {training.stop.step} of the fit of {stage}"
+    if training.stop.reason == "time":
+        return f"out of time {at}: kept is the best so far"
+    if training.stop.reason == "not finite":
+        return f"the loss stopped being finite {at}; lower --learning-rate or look for very large numbers in the data"
+    return ""
+
+
+def deviations(data: Trajectories) -> Weights:
+    """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
+    assert data.p is not None
+    sizes = [spread(name, array) for name, array in (("q", data.q), ("p", data.p))]
+    sizes = [np.where(size > 0, size, 1.0) for size in sizes]
+    if "qd" in data.estimated and np.array_equal(data.p, data.qd):
+        sizes[1] = ANCHOR * sizes[1]
+    return Weights(state=tuple(float(size) for size in np.concatenate(sizes)))

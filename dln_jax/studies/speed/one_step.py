@@ -1,0 +1,149 @@
+"""benchmark one-step: microseconds of single calls against test error, for every model and call path."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.data.splits import Split
+from dln_jax.figures.benchmarks import points
+from dln_jax.learning.dynamics_fit import Settings, train
+from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.objectives import objective_of
+from dln_jax.metrics.errors import errors, predictions
+from dln_jax.studies.arm.data import letters, published_split
+from dln_jax.studies.arm.models import SIZES, needs_of
+from dln_jax.studies.report import Row
+from dln_jax.types import InputError
+from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.load import load_run, save_model
+
+WIDE = "structured-delan-64x64"
+SMALL = "structured-delan"
+BOUNDS = {
+    (f"{WIDE}/low-latency-jit", "inverse_p50_us"): 13.0,
+    (f"{WIDE}/low-latency-jit", "inverse_p99_over_p50"): 3.0,
+    (f"{WIDE}/c-from-python", "inverse_p50_us"): 6.0,
+}
+LOOP_BOUNDS = {f"{WIDE}/c-loop": 200_000.0, f"{SMALL}/c-loop": 1_500_000.0}
+CALLS = 20_000
+PROCESSES = 3
+"""Of each way to dispatch, in turns; their medians count, and their spread shows the machine's noise."""
+
+
+def measure(quick: bool) -> tuple[list[Row], Figure]:
+    """Trains every model of the arm, and times single calls in processes of their own."""
+    sets = published_split(letters(None))
+    with tempfile.TemporaryDirectory() as place:
+        folders = [train_into(Path(place), name, sets, quick=quick) for name in names(quick)]
+        test_errors = {folder.name: torque_mse(folder, sets) for folder in folders}
+        turns = [
+            timed(folders, dispatch, calls=CALLS // 20 if quick else CALLS)
+            for _ in range(1 if quick else PROCESSES)
+            for dispatch in ("default", "low-latency")
+        ]
+    times = {name: over_processes([turn[name] for turn in turns]) for name in test_errors}
+    rows, places = [], {}
+    for name, paths in times.items():
+        rows.append(Row(name, "torque_mse", test_errors[name], "N^2 m^2"))
+        for path, functions in paths.items():
+            rows += rows_of(f"{name}/{path}", functions)
+            if "p50_us" not in functions["inverse"]:
+                continue
+            places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], max(test_errors[name], 1e-16))
+    return rows, points(
+        places,
+        x="one inverse-dynamics call, median, µs",
+        y="test torque MSE, (N m)²; 1e-16 for what is exact",
+        title="two-link arm, single calls",
+        logarithmic_x=True,
+        front=True,
+    )
+
+
+def names(quick: bool) -> tuple[str, ...]:
+    """Of the models; the wide one is trained by the published protocol."""
+    return (WIDE, "trigonometric") if quick else (*SIZES, WIDE, "trigonometric")
+
+
+def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
+    """A run folder with a trained model: by Gauss-Newton, the wide one by Adam, the trigonometric one by its solve."""
+    folder = place / name
+    folder.mkdir()
+    kind = SMALL if name == WIDE else name
+    network = {"width": 64, "depth": 2} if name == WIDE else SIZES[kind]._asdict() if kind in SIZES else {"degree": 1}
+    steps = network.pop("steps", 20_000)
+    activated = network if kind == "trigonometric" else {**network, "activation": "tanh"}
+    precision = "f32" if name == WIDE else "f64"
+    description = describe(kind, sets.train, needs_of(sets), precision=precision, **activated)
+    model = build(description)
+    if kind == "trigonometric":
+        parameters = fit_linear(model, sets.train).parameters
+    else:
+        optimizer = "adam" if name == WIDE else "gauss-newton"
+        settings = Settings(optimizer=optimizer, precision=precision, steps=max(5, steps // 100) if quick else steps)
+        parameters = train(model, sets, settings, objective=objective_of(kind, sets.train)).parameters
+    save_model(folder, description, parameters)
+    return folder
+
+
+def torque_mse(folder: Path, sets: Split) -> float:
+    """On the test, as the stored model gives it."""
+    return errors(predictions(load_run(folder), sets.test, jnp.float64), sets.test)["torque_mse"]
+
+
+def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
+    """What `dln_jax.studies.speed.calls` measures, by run."""
+    command = [
+        sys.executable,
+        "-m",
+        "dln_jax.studies.speed.calls",
+        "--dispatch",
+        dispatch,
+        "--calls",
+        str(calls),
+        "--runs",
+    ]
+    done = subprocess.run([*command, *map(str, folders)], capture_output=True, text=True)
+    if done.returncode:
+        raise InputError(f"timing in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
+    """Medians of each quantity over the processes that have it, and the spread of the median call."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for path in dict.fromkeys(path for turn in turns for path in turn):
+        of_path = [turn[path] for turn in turns if path in turn]
+        found[path] = {}
+        for name in of_path[0]:
+            numbers = {key: [each[name][key] for each in of_path] for key in of_path[0][name]}
+            found[path][name] = {key: float(np.median(values)) for key, values in numbers.items()}
+            if "p50_us" in numbers:
+                found[path][name]["p50_spread_us"] = float(np.ptp(numbers["p50_us"]))
+    return found
+
+
+SHOWN = ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
+
+
+def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
+    """Quantiles of each function."""
+    rows = []
+    for name, latency in functions.items():
+        if "calls_per_second" in latency:
+            rate, bound = latency["calls_per_second"], LOOP_BOUNDS.get(case)
+            rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", None, bound, at_least=True))
+            continue
+        quantities = {
+            f"{name}_{key}": latency[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
+        }
+        rows += [Row(case, key, value, "us", None, BOUNDS.get((case, key))) for key, value in quantities.items()]
+        ratio = f"{name}_p99_over_p50"
+        rows.append(Row(case, ratio, latency["p99_us"] / latency["p50_us"], "1", None, BOUNDS.get((case, ratio))))
+    return rows

@@ -1,0 +1,65 @@
+"""benchmark precision: float32 against float64, error and time, for every kind of model with the same parameters."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.figures.benchmarks import points
+from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.metrics.latency import medians_in_turns
+from dln_jax.models.model import Model, Parameters
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.studies.arm.data import letters, published_split
+from dln_jax.studies.report import Row
+from dln_jax.zoo.kinds import KINDS, build, describe
+from dln_jax.zoo.load import compiled
+
+BATCH = 1_000
+MEASURED = tuple(kind for kind in KINDS if kind != "black-box-hnn")
+"""Parameters are random, and a random energy need not have a momentum for each velocity."""
+
+
+def measure(quick: bool) -> tuple[list[Row], Figure]:
+    """Largest difference of float32 from float64, relative to the largest value, and batches of 1,000 in both."""
+    sets = published_split(letters(None))
+    data = sets.train
+    states = tuple(array[:BATCH] for array in (data.q, data.qd, data.qdd, data.tau))
+    rows, shown = [], {}
+    for kind in ("structured-delan",) if quick else MEASURED:
+        answers, seconds = {}, {}
+        keywords = {"degree": 1} if kind == "trigonometric" else {"width": 64, "depth": 2, "activation": "tanh"}
+        needs = two_link_arm().needs
+        model = {p: build(describe(kind, data, needs, precision=p, **keywords)) for p in ("f32", "f64")}
+        # Parameters of float32 are exact in float64, so that arithmetic is all that differs.
+        narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), initial(model["f32"], kind, data))
+        wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), narrow)
+        for precision, parameters, dtype in (("f32", narrow, jnp.float32), ("f64", wide, jnp.float64)):
+            system = compiled(model[precision].apply(parameters), dtype)
+            programs = {name: jax.jit(jax.vmap(getattr(system, f"{name}_dynamics"))) for name in ("inverse", "forward")}
+            inputs = {"inverse": states[:3], "forward": (*states[:2], states[3])}
+            for name, program in programs.items():
+                arguments = tuple(jnp.asarray(array, dtype) for array in inputs[name])
+                answers[precision, name] = np.asarray(program(*arguments), np.float64)
+                found = medians_in_turns({name: program}, arguments, repetitions=10 if quick else 40)
+                seconds[precision, name] = found[name]
+        for name in ("inverse", "forward"):
+            exact = answers["f64", name]
+            error = float(np.max(np.abs(answers["f32", name] - exact)) / np.max(np.abs(exact)))
+            speed = seconds["f64", name] / seconds["f32", name]
+            rows += [
+                Row(f"{kind}/{name}", "float32_error", error, "1"),
+                Row(f"{kind}/{name}", "float32_speedup", speed, "1"),
+                *(Row(f"{kind}/{name}", f"{p}_batch_us", 1e6 * seconds[p, name], "us") for p in ("f32", "f64")),
+            ]
+            shown[f"{kind}, {name}"] = (speed, error)
+    labels = "time of float64 over time of float32, batch 1,000", "largest relative error of float32"
+    return rows, points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
+
+
+def initial(model: Model, kind: str, data: Trajectories) -> Parameters:
+    """Random parameters; the linear model starts at zero, which has no motion, and gets its fit instead."""
+    if kind != "trigonometric":
+        return jax.jit(model.init)(jax.random.key(0))
+    return fit_linear(model, data).parameters

@@ -1,0 +1,83 @@
+"""benchmark throughput: batched states per second of a structured DeLaN, and against the full-Hessian way."""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from matplotlib.figure import Figure
+
+from dln_jax.figures.benchmarks import curves
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.metrics.latency import medians_in_turns
+from dln_jax.models.delan import make_delan
+from dln_jax.scenes.chain import chain
+from dln_jax.studies.report import Row
+from dln_jax.types import Lagrangian
+
+BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
+QUICK = (1, 1_000)
+SIZES = (2, 4, 7, 12)
+HESSIAN_BATCH = 512
+
+
+def measure(quick: bool) -> tuple[list[Row], Figure]:
+    """Inverse and forward dynamics for growing batches; at one batch, the full-Hessian way for growing d."""
+    repetitions = 10 if quick else 40
+    rows: list[Row] = []
+    speeds: dict[str, tuple[list[float], list[float]]] = {}
+    for batch in QUICK if quick else BATCHES:
+        model, states = structured(2, batch)
+        programs = {
+            "inverse": jax.jit(jax.vmap(model.inverse_dynamics)),
+            "inverse_again": jax.jit(jax.vmap(model.inverse_dynamics)),
+            "forward": jax.jit(jax.vmap(model.forward_dynamics)),
+        }
+        seconds = medians_in_turns(programs, states, repetitions=repetitions)
+        for name in ("inverse", "forward"):
+            rate = batch / seconds[name]
+            rows.append(Row(f"structured-delan/batch-{batch}", f"{name}_states_per_second", rate, "1/s"))
+            speeds.setdefault(name, ([], []))[0].append(batch)
+            speeds[name][1].append(rate)
+        noise = abs(seconds["inverse_again"] / seconds["inverse"] - 1)
+        rows.append(Row(f"structured-delan/batch-{batch}", "noise_of_repetition", noise, "1"))
+    for d in SIZES[:1] if quick else SIZES:
+        rows.append(hessian_row(d, repetitions))
+    return rows, curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
+
+
+def hessian_row(d: int, repetitions: int) -> Row:
+    """How many times the states per second of the full-Hessian way."""
+    model, states = structured(d, HESSIAN_BATCH)
+    ways = {
+        "ours": jax.jit(jax.vmap(model.inverse_dynamics)),
+        "full": jax.jit(jax.vmap(by_full_hessian(lagrangian_of(model)))),
+    }
+    seconds = medians_in_turns(ways, states, repetitions=repetitions)
+    bound = 4.0 if d == 2 else None
+    return Row(f"full-hessian/d-{d}", "speedup", seconds["full"] / seconds["ours"], "1", None, bound, at_least=True)
+
+
+def structured(d: int, batch: int) -> tuple[Dynamics, tuple[Array, ...]]:
+    """A structured DeLaN of two layers of 64, and states (q, qd, qdd), float32."""
+    model = make_delan(chain(d).needs, width=64, depth=2)
+    keys = jax.random.split(jax.random.key(0), 4)
+    states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
+    return model.apply(model.init(keys[0])), states
+
+
+def lagrangian_of(model: Dynamics) -> Lagrangian:
+    """L = T - V of a natural system: qdᵀ M(q) qd - E, since E = T + V."""
+
+    def L(q: Array, qd: Array) -> Array:
+        return qd @ model.mass_matrix(q) @ qd - model.energy(q, qd)
+
+    return L
+
+
+def by_full_hessian(L: Lagrangian):
+    """(q, qd, qdd) -> tau by `jax.hessian` over both arguments, as published implementations have it."""
+
+    def inverse_dynamics(q: Array, qd: Array, qdd: Array) -> Array:
+        _, (mixed, inertia) = jax.hessian(L, argnums=(0, 1))(q, qd)
+        return inertia @ qdd + mixed @ qd - jax.grad(L)(q, qd)
+
+    return inverse_dynamics

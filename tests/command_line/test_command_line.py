@@ -1,0 +1,176 @@
+"""What all command lines share: one line for a mistake, help that says what an option takes, bars that fit."""
+
+import io
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from rich.console import Console
+
+from dln_jax.__main__ import command, command_names
+from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import run
+from dln_jax.files import CONFIG, run_folder
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = command_names()
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Of a command that does nothing."""
+
+    kind: Literal["this", "that"] = "this"
+    """Which."""
+    names: Annotated[str, choice(("one", "two"), several=True)] = "one,two"
+    """Some (default: all)."""
+    steps: Unstated[int] = None
+    """How many (default: 7)."""
+    precision: Unstated[Literal["f32", "f64"]] = None
+    """Floating-point type (default: f64)."""
+
+
+def say(given: Arguments) -> None:
+    print(given)
+
+
+def called(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    run(say, Arguments, prog="command")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--kind", "other"], "invalid choice 'other' for argument '--kind'. Expected one of ('this', 'that')"),
+        (["--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+        (["--steps"], "Missing value for argument '--steps'"),
+        (["--stepz", "3"], "Unrecognized options: --stepz, 3"),
+        (["--precision", "None"], "invalid choice 'None' for argument '--precision'. Expected one of ('f32', 'f64')"),
+        (["stray"], "Unrecognized options: stray"),
+    ],
+)
+def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys, arguments, complaint):
+    with pytest.raises(SystemExit) as stop:
+        called(monkeypatch, *arguments)
+    line = capsys.readouterr().err
+    assert stop.value.code == 2 and line.count("\n") == 1
+    assert line.startswith(f"error: {complaint}") and "--help)" in line
+
+
+def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        called(monkeypatch, "--help")
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert stop.value.code == 0
+    for shown in ("--kind {this,that} Which. (default: this)", "--names {one,two}[,...] Some (default: all).",
+                  "--steps INT How many (default: 7).", "--precision {f32,f64} Floating-point"):  # fmt: skip
+        assert shown in text
+    assert "None" not in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as stop:
+        command(name, name)
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert stop.value.code == 0
+    assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
+    assert "--gif" not in text
+
+
+def test_names_are_taken_apart():
+    assert names_in("--only", "b, a", ("a", "b")) == ["b", "a"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_bar_shows_count_text_and_time_left_whole(width):
+    out = io.StringIO()
+    text = "motions: loss 1.23e-05  validation 1.23e-05"
+    with progress(20_000, console=Console(file=out, force_terminal=True, width=width, color_system=None)) as show:
+        show(5_000, text)
+        show(19_990, text)
+    last = [line for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9?]*[A-Za-z]", "", out.getvalue())) if line][-1]
+    assert len(last) <= width and "19990/20000" in last and text in last and re.search(r"left \d\d:\d\d", last)
+
+
+def test_a_closed_pipe_ends_a_command_without_a_word():
+    """What it prints stays in a buffer that nobody takes, and is flushed as the command ends."""
+    program = (
+        "import sys; sys.argv = ['command']; sys.path.append('tests/command_line'); "
+        "from test_command_line import *; run(say, Arguments, prog='command')"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        said = child.stderr.read()
+    assert said == b"" and child.returncode == 141
+
+
+def test_an_interrupt_during_imports_is_one_word(tmp_path):
+    """The first import of the script waits, so that the interrupt meets it."""
+    (tmp_path / "jax.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    with subprocess.Popen(
+        [sys.executable, "-m", "scripts.make_data"],
+        cwd=ROOT,
+        env={"PYTHONPATH": f"{tmp_path}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        assert child.stdout.readline() == "importing\n"
+        time.sleep(0.05)
+        child.send_signal(signal.SIGINT)
+        said = child.stderr.read()
+    assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
+
+
+@dataclass(frozen=True)
+class Resumable:
+    """Of a command that can continue."""
+
+    resume: bool = False
+    """Continue."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stored", "said"),
+    [
+        (Resumable, True, "interrupted; continue with: command --out {folder} --resume"),
+        (Resumable, False, "interrupted; {folder} is incomplete"),
+        (Arguments, True, "interrupted; {folder} is incomplete"),
+    ],
+)
+def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):
+    folder = tmp_path / "run"
+
+    def main(given):
+        with run_folder(folder, "command"):
+            if stored:
+                (folder / CONFIG).write_text("{}")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["command"])
+    with pytest.raises(SystemExit) as ended:
+        run(main, arguments, prog="command")
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == said.format(folder=folder) + "\n"
+
+
+def test_every_command_has_a_script():
+    scripts = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem != "__init__")
+    assert scripts == COMMANDS
+    for name in scripts:
+        assert f'command("{name}", "python -m scripts.{name}")' in (ROOT / "scripts" / f"{name}.py").read_text()

@@ -1,0 +1,63 @@
+"""Every hard case, the report of missing friction, and the command line."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.commands import stability
+from dln_jax.metrics.misfit import velocity_misfit
+from dln_jax.studies.stability import NAMES, Case, measure
+from dln_jax.types import InputError
+
+STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hard_cases_meet_their_bounds(name):
+    cases = measure(name, steps=STEPS.get(name, 1)).cases
+    assert cases and len({(case.name, case.quantity) for case in cases}) == len(cases)
+    failing = [(case.name, case.quantity, case.got, case.bound) for case in cases if not case.passed]
+    assert not failing
+
+
+def test_a_number_that_is_not_one_meets_no_bound():
+    assert not Case("a", "b", "", math.nan, 1.0).passed and not Case("a", "b", "", math.nan, 1.0, at_least=True).passed
+    assert Case("a", "b", "", 1.0, 1.0).passed and not Case("a", "b", "", 1.0, 2.0, at_least=True).passed
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.05])
+def test_misfit_tells_friction_from_noise(friction):
+    random = np.random.default_rng(0)
+    qd, noise = random.uniform(-3, 3, (500, 2)), 0.1 * random.normal(size=(500, 2))
+    found = velocity_misfit(qd, friction * qd + noise)
+    assert found.missing.tolist() == [friction > 0] * 2
+    assert found.coefficient == pytest.approx(friction, abs=0.02)
+
+
+def test_misfit_is_not_misled_by_a_missing_potential_and_refuses_nonsense():
+    t = np.linspace(0, 40 * np.pi, 2_000)[:, None]
+    assert not velocity_misfit(np.cos(t), np.sin(t)).missing.any()
+    assert velocity_misfit(np.cos(t), np.cos(t), np.arange(2_000) // 100).missing.all()
+    with pytest.raises(InputError, match="expected the same"):
+        velocity_misfit(np.zeros((2, 1)), np.zeros((2, 1)))
+
+
+def test_the_script_writes_its_report_and_figures(tmp_path, capsys):
+    command(stability, "--only", "separatrix", "--steps", "300", "--out", tmp_path / "run")
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert len(report["rows"]) == len(report["conditions"]["expected"]) == 8
+    assert all(row["pass"] for row in report["rows"])
+    assert (tmp_path / "run" / "separatrix.png").read_bytes().startswith(b"\x89PNG")
+    assert "8 of 8 pass" in capsys.readouterr().out
+
+
+def test_the_script_refuses_bad_input(tmp_path, capsys):
+    assert "'nonsense' is unknown; choose from" in refused(
+        capsys, stability, "--only", "nonsense", "--out", tmp_path / "a"
+    )
+    assert "names nothing" in refused(capsys, stability, "--only", ",", "--out", tmp_path / "a")
+    assert "steps is 0" in refused(capsys, stability, "--steps", "0", "--out", tmp_path / "a")
+    assert not (tmp_path / "a").exists()

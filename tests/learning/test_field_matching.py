@@ -1,0 +1,166 @@
+"""Phase models: the energy law, the polynomial's exactness; derivative matching finds the field; mistakes are named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from motions import quick_motion
+
+from dln_jax.datasets import hamiltonian_tasks, phase_samples
+from dln_jax.learning import field_matching
+from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
+from dln_jax.metrics import phase_space as phase_metrics
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian
+from dln_jax.models.phase_field import (
+    from_dynamics,
+    hamiltonian_phase_model,
+    make_dissipative,
+    make_phase_network,
+    phase_field,
+)
+from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.separable import make_separable_hamiltonian
+from dln_jax.types import InputError, Needs
+
+NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
+FREE = NEEDS._replace(friction=False)
+SMALL = {"width": 4, "depth": 1, "dtype": jnp.float64}
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """The pendulum without noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(phase_samples, "reference_motion", quick_motion)
+        return hamiltonian_tasks.pendulum(0, trajectories=6, noise=0.0)
+
+
+def test_friction_takes_energy_and_never_gives_it():
+    """dH/dt = -qdᵀ dD/dqd = -2 D <= 0, for random parameters and states."""
+    model = make_dissipative(make_separable_hamiltonian(FREE, **SMALL), NEEDS, **SMALL)
+    q, p = 3 * jax.random.normal(jax.random.key(0), (2, 40, 2))
+
+    @jax.jit
+    def ask(key):
+        leaves, tree = jax.tree.flatten(model.init(key))
+        keys = jax.random.split(key, len(leaves))
+        drawn = [2 * jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
+        field = model.apply(jax.tree.unflatten(tree, drawn))
+
+        def one(q, p):
+            qd, pd = field.rates(q, p)
+            loss = field.dissipation(q, qd)
+            friction = jax.grad(field.dissipation, argnums=1)(q, qd)
+            return jax.jvp(field.energy, (q, p), (qd, pd))[1], loss, qd @ friction
+
+        return jax.vmap(one)(q, p)
+
+    rate, loss, power = ask(jax.random.key(1))
+    assert (loss > 0).all() and float(loss.max()) > 1e-3
+    np.testing.assert_allclose(rate, -2 * loss, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(power, 2 * loss, rtol=1e-9)
+
+
+def test_what_a_scene_lacks_is_not_built():
+    model = make_separable_hamiltonian(FREE, **SMALL)
+    parameters = jax.eval_shape(model.init, jax.random.key(0))
+    free = make_dissipative(model, FREE, **SMALL)
+    assert jax.tree.structure(jax.eval_shape(free.init, jax.random.key(0))) == jax.tree.structure(parameters)
+    assert phase_field(lambda q, p: jnp.sum(p**2)).dissipation is None
+    baseline = make_phase_network(NEEDS, **SMALL)
+    assert baseline.apply(jax.jit(baseline.init)(jax.random.key(0))).energy is None
+
+
+def test_dynamics_with_friction_become_their_field():
+    """The viscous friction of a model for a scene with friction: pd = -dH/dq - b qd."""
+    model = make_black_box_hamiltonian(NEEDS, **SMALL)
+    q, p = jnp.array([0.3, -0.2]), jnp.array([1.0, 0.5])
+
+    @jax.jit
+    def ask(key):
+        dynamics = model.apply(model.init(key))
+        slope, qd = jax.grad(dynamics.hamiltonian, argnums=(0, 1))(q, p)
+        return from_dynamics(dynamics).rates(q, p), (qd, -slope - dynamics.friction(q, qd)), -slope
+
+    got, expected, frictionless = ask(jax.random.key(0))
+    for one, other in zip(got, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert np.abs(got[1] - frictionless).max() > 1e-4
+
+
+def test_the_polynomial_recovers_the_pendulum(swing):
+    """H = 3 (1 - cos q) + p² has the coefficients -3 and 1, and all others vanish."""
+    model = make_polynomial_hamiltonian(Needs(joints=("revolute",)), degree=2, dtype=jnp.float64)
+    training, errors = match_linear(model, swing.train.data, validation=swing.test.data)
+    coefficients = np.asarray(training.parameters)
+    order = np.argsort(-np.abs(coefficients))
+    np.testing.assert_allclose(coefficients[order[:2]], [-3, 1], rtol=1e-9)
+    np.testing.assert_allclose(coefficients[order[2:]], 0, atol=1e-9)
+    assert len(errors) == len(swing.test.data.t) and errors.max() < 1e-18
+    # Of d = 1 and degree 2: 1, cos, sin, cos 2q, sin 2q times 1, p, p², without the constant and what exceeds it.
+    assert len(coefficients) == 2 + 2 + 1 + 1 + 2
+
+
+@pytest.mark.parametrize(("optimizer", "steps", "below"), [("gauss-newton", 20, 1e-3), ("adam", 400, 0.7)])
+def test_networks_learn_the_field(swing, optimizer, steps, below):
+    model = hamiltonian_phase_model(make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL))
+    training = match_field(model, swing.train.data, Settings(optimizer=optimizer, steps=steps, batch=32))
+    found = phase_metrics.field_errors(model, training.parameters, swing.test)
+    assert found["loss"] == pytest.approx(found["clean_field_mse"])
+    # A field of zero has an error of 5.
+    assert found["clean_field_mse"] < below
+    if optimizer == "adam":
+        return
+    data = swing.test.data
+    predicted = phase_metrics.predict(model, training.parameters, data.q[:1], data.p[:1], swing.t)
+    truth = phase_metrics.Motions(swing.t, data.q[None, :45], data.p[None, :45])
+    errors = phase_metrics.motion_errors(
+        [predicted], [truth], swing.hamiltonian, published_energy=swing.published_energy
+    )
+    assert errors["energy_mse"] < 1e-3 and errors["rollout_mse"] < 1e-2
+    assert np.isnan(errors["energy_mse_standard_error"]) and errors["published_energy_mse"] > 0
+
+
+def test_metrics_by_hand_and_motions_that_end():
+    """Energy q² + p² of given states; a field that reaches infinity in finite time has infinite errors."""
+    truth = phase_metrics.Motions(np.array([0.0, 1.0]), np.zeros((2, 2, 1)), np.ones((2, 2, 1)))
+    off = truth._replace(p=truth.p + np.array([[[0.0], [1.0]], [[0.0], [0.0]]]))
+    found = phase_metrics.motion_errors([off], [truth], lambda q, p: jnp.sum(q**2 + p**2))
+    # Energies are 1 and 4 against 1: errors 0, 9 and 0, 0.
+    assert found["energy_mse"] == pytest.approx(2.25) and found["energy_mse_median"] == pytest.approx(2.25)
+    assert found["energy_mse_standard_error"] == pytest.approx(4.5 / np.sqrt(2) / np.sqrt(2))
+    assert found["rollout_mse"] == pytest.approx(1 / 8)
+    explosive = phase_field(lambda q, p: jnp.sum(q**2 * p))
+    model = make_phase_network(Needs(joints=("prismatic",)), **SMALL)._replace(apply=lambda parameters: explosive)
+    moved = phase_metrics.predict(model, 0.0, np.ones((1, 1)), np.zeros((1, 1)), np.array([0.0, 2.0]))
+    assert np.isinf(phase_metrics.state_errors(moved, phase_metrics.Motions(*(each[:1] for each in truth)))).all()
+
+
+def test_held_out_trajectories_are_the_seeds(swing):
+    train, validation = hold_out(swing.train.data, 0.4, 3)
+    kept, held_out = (set(part.trajectory.tolist()) for part in (train, validation))
+    assert not kept & held_out and kept | held_out == set(swing.train.data.trajectory.tolist())
+    again = hold_out(swing.train.data, 0.4, 3)[1]
+    np.testing.assert_array_equal(again.trajectory, validation.trajectory)
+
+
+def test_mistakes_are_named(swing):
+    data, needs = swing.train.data, Needs(joints=("revolute",))
+    model = make_phase_network(needs, **SMALL)
+    refused = [
+        (lambda: match_field(model, data, Settings(optimizer="newton")), "optimizer is 'newton'"),
+        (lambda: match_field(model, data, Settings(steps=0)), "steps is 0"),
+        (lambda: match_field(model, data, Settings(precision="f32")), "needs f64"),
+        (lambda: match_field(model, data._replace(p=None), Settings()), "no p and pd"),
+        (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
+        (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),
+        (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),
+        (lambda: make_polynomial_hamiltonian(NEEDS), "conserves energy"),
+        (lambda: make_polynomial_hamiltonian(Needs(joints=("prismatic",) * 6), degree=9), "lower the degree"),
+        (lambda: make_dissipative(make_separable_hamiltonian(FREE, **SMALL), NEEDS, width=0), "width is 0"),
+        (lambda: make_phase_network(needs, depth=0), "depth is 0"),
+    ]
+    for call, message in refused:
+        with pytest.raises(InputError, match=message):
+            call()
+    assert field_matching.OPTIMIZERS == ("adam", "gauss-newton")

@@ -1,0 +1,86 @@
+"""What a soft body is made of, found from how it moves; a rest shape, from how it hangs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
+from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
+from dln_jax.softbody.rollout import rollout
+from dln_jax.softbody.scene import initial_state, make_scene
+from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.terms.contact import plane_contact
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.springs import muscles
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.types import InputError
+
+MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
+TRUTH = {"youngs_modulus": 3e4, "poisson_ratio": 0.35, "friction": 0.4, "muscle": 900.0}
+GUESS = {"youngs_modulus": 6e4, "poisson_ratio": 0.2, "friction": 0.2, "muscle": 400.0}
+STEPS = 8
+
+
+@pytest.fixture(scope="module")
+def slider():
+    """A block with one muscle, pushed along a rough floor."""
+    terms = (
+        elastic(MESH, stable_neo_hookean),
+        muscles([[0, 3]], stiffness=1.0),
+        gravity(MESH, (0.0, -9.81)),
+        plane_contact([0, 1], normal=[0.0, 1.0], stiffness=5e4, width=1e-3, friction=0.1, threshold_speed=0.05),
+    )
+    return make_scene(MESH, terms, masses=20.0)
+
+
+def params_of(scene, theta):
+    terms = dict(scene.params.terms)
+    terms["elastic"] = terms["elastic"]._replace(
+        youngs_modulus=theta["youngs_modulus"], poisson_ratio=theta["poisson_ratio"]
+    )
+    terms["ground"] = terms["ground"]._replace(friction=theta["friction"])
+    terms["muscles"] = terms["muscles"]._replace(stiffness=theta["muscle"])
+    return scene.params._replace(terms=terms)
+
+
+def test_material_friction_and_muscle_are_recovered_from_a_motion(slider):
+    step = make_step(slider, 0.02, tolerance=1e-9)
+    state = initial_state(slider, v=[1.5, 0.0])
+    controls = 0.8 + 0.2 * jnp.cos(jnp.arange(STEPS))[:, None]
+    _, (x, converged) = jax.jit(lambda p: rollout(step, state, p, controls))(params_of(slider, TRUTH))
+    assert converged.all()
+    unseen = x.at[3, 2].set(jnp.nan)
+    motions = ObservedMotions(state.x[None], state.v[None], controls[None], unseen[None])
+    scale = jax.tree.map(lambda value: jnp.asarray(float(value)), GUESS)
+    result = identify(
+        step,
+        lambda ratio: params_of(slider, jax.tree.map(lambda r, s: r * s, ratio, scale)),
+        jax.tree.map(jnp.ones_like, scale),
+        motions,
+    )
+    found = {name: float(result.parameters[name] * scale[name]) for name in TRUTH}
+    for name, value in TRUTH.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
+
+
+def test_a_rest_shape_is_found_that_hangs_as_wanted():
+    scene = make_scene(MESH, (elastic(MESH, stable_neo_hookean, youngs_modulus=2e5), gravity(MESH)), held=[0, 2])
+    wanted = jnp.asarray(MESH.vertices)
+    sagging, _ = static_solve(scene, scene.params)
+    assert np.abs(sagging - wanted).max() > 0.02
+
+    def with_rest(free):
+        return scene.params._replace(rest=scene.params.rest.at[np.array([1, 3])].set(free))
+
+    result = design(scene, with_rest, scene.params.rest[np.array([1, 3])], wanted)
+    hanging, info = static_solve(scene, with_rest(result.parameters))
+    assert info.converged
+    np.testing.assert_allclose(hanging, wanted, atol=1e-7)
+
+
+def test_mistakes_name_what_is_wrong(slider):
+    motions = ObservedMotions(*(jnp.zeros((1, *shape)) for shape in ((4, 2), (4, 2), (3, 1), (3, 4, 2))))
+    with pytest.raises(InputError, match="noise is 0"):
+        identify(make_step(slider, 0.02), lambda theta: theta, jnp.zeros(1), motions, noise=0.0)

@@ -1,0 +1,135 @@
+"""Windows and gaps; a noisy oscillator, and a damped one of which only q is known, recovered from their motions."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data import schema
+from dln_jax.learning.engine.second_order import Budget
+from dln_jax.learning.field_matching import match_linear
+from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories, stretches, take
+from dln_jax.models.phase_field import PhaseModel, phase_field
+from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.types import InputError, Needs
+
+NEEDS = Needs(joints=("prismatic",))
+
+
+def motion_of(t, trajectory=None):
+    """Samples of q = t, so that a window shows where it was cut."""
+    t = np.asarray(t, float)
+    arrays = {"t": t, "q": t[:, None], "qd": t[:, None], "qdd": t[:, None], "p": t[:, None]}
+    return schema.from_arrays({**arrays, "trajectory": np.zeros(len(t)) if trajectory is None else trajectory})
+
+
+def test_windows_never_cross_a_gap():
+    t = np.concatenate([np.arange(7), 7.4 + np.arange(5), 20.0 + np.arange(2)]) / 6
+    data = motion_of(t)
+    # 1.4 steps are no gap, 8.6 are one.
+    assert [len(stretch) for stretch in stretches(data)] == [12, 2]
+    assert [len(stretch) for stretch in stretches(data, gap=1.3)] == [7, 5, 2]
+    windows = cut_windows(data, 4)
+    steps = np.diff(windows.t, axis=1)
+    assert steps.max() <= 1.5 * np.median(np.diff(t)) and steps.min() == 0
+    np.testing.assert_array_equal(windows.weight.sum(axis=1), [4, 4, 4, 3, 2])
+    # A window begins where the one before it ends, and t counts from there.
+    np.testing.assert_array_equal(windows.state[1, 0], windows.state[0, -1])
+    np.testing.assert_allclose(windows.t, windows.state[..., 0] - windows.state[:, :1, 0], atol=1e-15)
+    assert windows.rate is None and len(take(windows, [0, 2]).t) == 2
+
+
+def test_windows_never_cross_trajectories():
+    data = motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1])
+    assert [stretch.tolist() for stretch in stretches(data)] == [[0, 1, 2], [3, 4, 5]]
+    assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
+
+
+def test_a_noisy_oscillator_is_recovered_without_the_bias_of_its_noise():
+    """H = q² + p² from states with noise of 0.1: derivative matching flattens it, trajectories do not."""
+    random, t = np.random.default_rng(0), np.linspace(0, 3, 30)
+    angle = 2 * t + random.uniform(0, 2 * np.pi, (12, 1))
+    radius = random.uniform(0.2, 1.0, (12, 1))
+    q, p = ((radius * wave(angle)).reshape(-1, 1) for wave in (np.sin, np.cos))
+    noise = 0.1 * random.standard_normal((2, *q.shape))
+    arrays = {"t": np.tile(t, 12), "trajectory": np.repeat(np.arange(12), 30), "qdd": -4 * q}
+    arrays |= {"q": q + noise[0], "p": p + noise[1], "qd": 2 * p, "pd": -2 * q}
+    data = schema.from_arrays(arrays)
+    model = make_polynomial_hamiltonian(NEEDS, degree=2, dtype=jnp.float64)
+    biased = match_linear(model, data)[0].parameters
+    windows = cut_windows(data, 30)
+    fitted = match_trajectories(
+        model,
+        biased,
+        take(windows, range(10)),
+        take(windows, range(10, 12)),
+        weights=Weights(0.1),
+        budget=Budget(12),
+        free_starts=True,
+    )
+    # Terms in the order p, p², q, qp, q².
+    true = np.array([0, 1, 0, 0, 1.0])
+    error, bias = (np.abs(np.asarray(c) - true).max() for c in (fitted.parameters, biased))
+    assert error < 0.03 < bias
+    assert fitted.validation < 3
+
+
+def damped() -> PhaseModel:
+    """½ p² + ½ k q² with friction ½ b qd²; parameters k, b."""
+
+    def apply(c):
+        return phase_field(
+            lambda q, p: 0.5 * jnp.sum(p**2) + 0.5 * c[0] * jnp.sum(q**2),
+            dissipation=lambda q, qd: 0.5 * c[1] * jnp.sum(qd**2),
+        )
+
+    return PhaseModel(lambda key: jnp.ones(2), apply)
+
+
+def test_a_damped_oscillator_is_recovered_from_its_positions():
+    """Momenta are wrong, and not looked at, by an infinite deviation; or right, and windows start at them."""
+    k, b, t = 4.0, 0.3, np.arange(60) / 6
+    w = np.sqrt(k - b**2 / 4)
+    q = np.exp(-b * t / 2) * np.cos(w * t)
+    p = -np.exp(-b * t / 2) * (b / 2 * np.cos(w * t) + w * np.sin(w * t))
+    arrays = {"t": t, "q": q[:, None], "qd": p[:, None], "qdd": p[:, None], "p": p[:, None] + 0.2}
+    windows = cut_windows(schema.from_arrays({**arrays, "trajectory": np.zeros(60)}), 15)
+    training = match_trajectories(
+        damped(),
+        jnp.array([3.0, 0.0]),
+        windows,
+        windows,
+        weights=Weights((0.01, np.inf)),
+        budget=Budget(15),
+        substeps=8,
+    )
+    np.testing.assert_allclose(training.parameters, [k, b], rtol=1e-4)
+    right = windows._replace(state=windows.state - [0, 0.2])
+    fit = {"weights": Weights(0.01), "budget": Budget(15), "free_starts": False, "substeps": 8}
+    from_measured = match_trajectories(damped(), jnp.array([3.0, 0.0]), right, right, **fit)
+    np.testing.assert_allclose(from_measured.parameters, [k, b], rtol=1e-4)
+
+
+def test_mistakes_are_named():
+    data = motion_of(np.arange(8))
+    windows = cut_windows(data, 4)
+    fit = {"weights": Weights(0.1), "budget": Budget(1)}
+    start = jnp.ones(2)
+    refused = [
+        (lambda: cut_windows(data, 1), "length is 1"),
+        (lambda: cut_windows(data._replace(p=None), 4), "no p"),
+        (lambda: stretches(data, gap=0.9), "gap is 0.9"),
+        (lambda: stretches(motion_of([0, 0], [0, 1])), "no trajectory has two samples"),
+        (lambda: match_trajectories(damped(), start, windows, take(windows, []), **fit), "0 to validate"),
+        (lambda: match_trajectories(damped(), start, windows, windows, substeps=0, **fit), "substeps is 0"),
+        (
+            lambda: match_trajectories(damped(), start, windows, windows, weights=Weights(0.0), budget=Budget(1)),
+            "state_weight is 0",
+        ),
+        (
+            lambda: match_trajectories(damped(), start, windows, windows, weights=Weights(1.0, 1.0), budget=Budget(1)),
+            "which the windows lack",
+        ),
+    ]
+    for call, message in refused:
+        with pytest.raises(InputError, match=message):
+            call()

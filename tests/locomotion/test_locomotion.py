@@ -1,0 +1,293 @@
+"""Locomotion: the task, its environment, and the ways of learning, on a body of six vertices and short episodes."""
+
+import importlib.util
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import refused
+from gymnasium.utils.env_checker import check_env
+
+from dln_jax.commands import train_locomotion
+from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.locomotion import comparison
+from dln_jax.locomotion.environment import CreatureEnvironment
+from dln_jax.locomotion.evolution import EvolutionSettings, centred_ranks, estimate, make_evolution_learner
+from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
+from dln_jax.locomotion.learning import Goal, Record, compile_learner, learn
+from dln_jax.locomotion.policy import make_policy
+from dln_jax.locomotion.ppo import make_actor
+from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, make_task, observe
+from dln_jax.softbody.mesh.builders import lattice
+from dln_jax.softbody.mesh.creatures import Creature
+from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
+from dln_jax.types import InputError
+
+EPISODE, WINDOW = 12, 6
+QUICK = GradientSettings(window=WINDOW, learning_rate=0.05, updates=4)
+
+
+@pytest.fixture(scope="module")
+def task():
+    """A block of two cells that two muscles along its sides bend."""
+    positions, triangles = lattice([(0, 0), (1, 0)])
+    mesh = make_mesh(0.4 * np.asarray(positions, float), triangles)
+    number = {tuple(place): index for index, place in enumerate(np.asarray(positions).tolist())}
+    muscles = np.array([[number[0, 0], number[0, 1]], [number[0, 1], number[1, 1]]])
+    return make_task(Creature("block", mesh, muscles), episode=EPISODE, clock_period=6.0, upright=0.5)
+
+
+@pytest.fixture(scope="module")
+def policy(task):
+    return make_policy(task, width=3)
+
+
+@pytest.fixture(scope="module")
+def compiled(task, policy):
+    return compile_learner(task, make_gradient_learner(task, policy, QUICK))
+
+
+@pytest.fixture(scope="module")
+def environment(task):
+    return CreatureEnvironment(task)
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+
+
+@pytest.mark.filterwarnings("error", "ignore:.*infinity")
+def test_the_environment_passes_gymnasiums_checks(environment):
+    check_env(environment, skip_render_check=True)
+
+
+def test_reward_is_the_displacement_less_the_posture(environment, task):
+    environment.reset(seed=0)
+    rest = task.creature.mesh.vertices
+    x, random = rest, np.random.default_rng(0)
+    for count in range(1, EPISODE + 1):
+        _, reward, terminated, truncated, info = environment.step(random.uniform(-1, 1, 2).astype(np.float32))
+        after = info["x"]
+        # The angle of the nearest rotation by the singular value decomposition (Kabsch), an independent way.
+        u, _, vt = np.linalg.svd((rest - rest.mean(0)).T @ (after - after.mean(0)))
+        rotation = u @ np.diag([1, np.linalg.det(u @ vt)]) @ vt
+        posture = 1 - rotation[0, 0] + 25 * max(0, 0.8 - after[:, 1].mean() / rest[:, 1].mean()) ** 2
+        displacement = (after[:, 0].mean() - x[:, 0].mean()) / task.length
+        np.testing.assert_allclose(reward, displacement - task.upright * posture / EPISODE, rtol=1e-9, atol=1e-12)
+        assert not terminated and truncated == (count == EPISODE) and info["converged"]
+        x = after
+
+
+def test_observations_know_no_place_along_the_ground(task):
+    start = beginning(task)
+    moved = start.state.x * jnp.asarray([1.1, 0.9]) + 0.02
+    place = start._replace(state=start.state._replace(x=moved, v=moved), steps=jnp.asarray(5))
+    there = place._replace(state=place.state._replace(x=moved + jnp.asarray([123.0, 0.0])))
+    higher = place._replace(state=place.state._replace(x=moved + jnp.asarray([0.0, 0.1])))
+    np.testing.assert_allclose(observe(task, there), observe(task, place), rtol=0, atol=1e-11)
+    assert np.abs(observe(task, higher) - observe(task, place)).max() > 0.1
+    assert observe(task, place).shape == (task.observation_size,)
+
+
+def test_what_a_fallen_body_travels_does_not_count(task):
+    start = beginning(task)
+    x = start.state.x + 0.1 * jnp.arange(1, 5)[:, None, None] * jnp.asarray([1.0, 0.0])
+    tilt = jnp.asarray([0.0, 0.9 * FALLEN, -1.1 * FALLEN, 0.0])
+    seen = Walk(x, jnp.ones((4, 2)), jnp.ones(4, bool), jnp.arange(4.0), tilt)
+    episode = judged(task, start, seen)
+    np.testing.assert_allclose(episode.distance, 0.2 / task.length, rtol=1e-12)
+    assert episode.total_reward == 1.0
+    lost = judged(task, start, seen._replace(converged=jnp.asarray([True, True, True, False])))
+    assert np.isnan(lost.distance) and np.isnan(lost.total_reward)
+
+
+def test_actuation_of_commands():
+    np.testing.assert_allclose(actuation_of(np.array([-3.0, -1.0, 0.0, 1.0, 2.0])), [0.25, 0.25, 0.625, 1.0, 1.0])
+
+
+def test_gradients_increase_the_distance_and_the_same_seed_gives_the_same(compiled):
+    first = learn(compiled, seed=0, goal=Goal(20 * compiled.learner.steps))
+    assert first.distance > max(0.01, 4 * first.records[0].distance)
+    assert [record.steps for record in first.records] == [48 * (n + 1) for n in range(20)]
+    assert first.records[-1].skipped == 0
+    assert first.evaluation_steps == 20 * EPISODE
+    again, other = (learn(compiled, seed=seed, goal=Goal(2 * compiled.learner.steps)) for seed in (0, 1))
+    assert [r.distance for r in again.records] == [r.distance for r in first.records[:2]]
+    assert [r.distance for r in other.records] != [r.distance for r in first.records[:2]]
+
+
+def test_a_resumed_run_continues_bit_for_bit(compiled, tmp_path):
+    def run(folder, dispatches, **keywords):
+        folder.mkdir(exist_ok=True)
+        goal = Goal(dispatches * compiled.learner.steps)
+        return learn(compiled, seed=3, goal=goal, directory=folder, settings={"width": 3}, **keywords)
+
+    whole = run(tmp_path / "whole", 4)
+    run(tmp_path / "parts", 2)
+    continued = run(tmp_path / "parts", 4, resume=True)
+    assert [r.distance for r in continued.records] == [r.distance for r in whole.records]
+    assert same(continued.parameters, whole.parameters)
+    with pytest.raises(InputError, match="other settings"):
+        learn(
+            compiled,
+            seed=3,
+            goal=Goal(999),
+            directory=tmp_path / "parts",
+            settings={"width": 4},
+            resume=True,
+        )
+
+
+def test_updates_without_a_gradient_are_skipped_and_counted(compiled):
+    state = compiled.learner.start(0)
+    x = state.lanes.state.x
+    lost = state._replace(lanes=state.lanes._replace(state=state.lanes.state._replace(x=x.at[0, 0, 0].set(jnp.nan))))
+    after = compiled.improve(lost)
+    # The lane is restarted, so that the next updates are usable.
+    assert after.skipped == 1 and after.updates == QUICK.updates
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
+    assert not same(after.parameters, state.parameters)
+
+
+def test_the_evolution_estimate_is_the_gradient_of_a_quadratic():
+    random = np.random.default_rng(0)
+    p, deviation = 5, 0.3
+    curvature = random.normal(size=(p, p))
+    curvature, slope, theta = curvature + curvature.T, random.normal(size=p), random.normal(size=p)
+
+    def fitness(x):
+        return 0.5 * x @ curvature @ x + slope @ x
+
+    def estimated(noise):
+        moves = deviation * noise
+        plus, minus = (jnp.asarray([fitness(theta + sign * move) for move in moves]) for sign in (1, -1))
+        return estimate(plus, minus, jnp.asarray(noise), deviation)
+
+    exact = curvature @ theta + slope
+    # Directions whose mean outer product is the identity leave no sampling error.
+    np.testing.assert_allclose(estimated(np.sqrt(p) * np.eye(p)), exact, rtol=1e-10)
+    sampled = estimated(random.normal(size=(20_000, p)))
+    np.testing.assert_allclose(sampled, exact, atol=0.05 * np.linalg.norm(exact))
+
+
+def test_ranks_are_centred_and_put_what_is_no_number_last():
+    ranks = centred_ranks(jnp.asarray([3.0, jnp.nan, 1e9, -2.0, 0.0]))
+    np.testing.assert_allclose(ranks, [0.25, -0.5, 0.5, -0.25, 0.0])
+
+
+def test_evolution_improves(task, policy, compiled):
+    settings = EvolutionSettings(pairs=4, deviation=0.3, learning_rate=0.1, generations=5)
+    learner = make_evolution_learner(task, policy, settings)
+    evolution = compiled._replace(learner=learner, improve=jax.jit(learner.improve))
+    learned = learn(evolution, seed=0, goal=Goal(6 * evolution.learner.steps))
+    assert evolution.learner.steps == 5 * 8 * EPISODE
+    assert learned.distance > max(0.005, 4 * learned.records[0].distance)
+    assert learned.records[-1].skipped == 0
+
+
+def test_the_actor_is_the_network_of_tanh_layers(task):
+    random = np.random.default_rng(0)
+    sizes = (task.observation_size, 4, 4, 2)
+    layers = tuple(
+        {"w": random.normal(size=(m, n)).astype(np.float32), "b": random.normal(size=m).astype(np.float32)}
+        for n, m in itertools.pairwise(sizes)
+    )
+    seen = random.normal(size=sizes[0])
+    h = np.tanh(layers[1]["w"] @ np.tanh(layers[0]["w"] @ seen + layers[0]["b"]) + layers[1]["b"])
+    expected = 0.625 + 0.375 * np.clip(layers[2]["w"] @ h + layers[2]["b"], -1, 1)
+    np.testing.assert_allclose(make_actor(task).apply(layers, jnp.asarray(seen)), expected, rtol=1e-5)
+
+
+def test_vector_lanes_are_single_environments(task, environment):
+    pytest.importorskip("stable_baselines3")
+    from dln_jax.locomotion.vector_environment import VectorEnvironment
+
+    lanes = VectorEnvironment(task, 2, reward_scale=10.0)
+    random = np.random.default_rng(1)
+    single, _ = environment.reset(seed=0)
+    np.testing.assert_array_equal(lanes.reset()[1], single)
+    for _ in range(EPISODE):
+        actions = random.uniform(-1, 1, (2, 2)).astype(np.float32)
+        seen, rewards, done, infos = lanes.step(actions)
+        single, reward, *_ = environment.step(actions[1])
+        np.testing.assert_allclose(rewards[1], 10.0 * reward, rtol=1e-4, atol=1e-6)
+    assert done.all() and infos[1]["TimeLimit.truncated"]
+    np.testing.assert_allclose(infos[1]["terminal_observation"], single, rtol=1e-3, atol=1e-5)
+    np.testing.assert_array_equal(seen, lanes.reset())
+
+
+def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "stable_baselines3" else find(name))
+    for arguments in (("--method", "ppo"), ("--compare",)):
+        assert "pip install 'dln-jax[rl]'" in refused(capsys, train_locomotion, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--steps", "0"), "steps is 0"),
+        (("--upright", "-1"), "--upright is -1"),
+        (("--method", "ppo", "--resume", "--out", "run"), "holds none"),
+        (("--episode", "50"), "a window has 40 steps"),
+        (("--window", "7"), "a window has 7 steps"),
+        (("--window", "8", "--method", "evolution"), "--window is not used by --method evolution"),
+        (("--seed", "-1"), "seed is -1"),
+        (("--seed", "4294967295", "--seeds", "2"), "and 1 after it"),
+    ],
+)
+def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(capsys, train_locomotion, *arguments)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_medians_and_the_crossover():
+    def records(*pairs):
+        return [Record(steps, steps / 10, distance, 0) for steps, distance in pairs]
+
+    quick = [records((10, 0.1), (20, 1.1)), records((10, 0.3), (20, 0.2), (30, 1.0)), records((10, 0.2), (40, 1.5))]
+    slow = [records((5, 0.4), (100, 1.2)), records((5, 0.5), (100, np.nan))]
+    assert comparison.median_to_reach(quick, 1.0, "steps") == 30
+    assert comparison.median_to_reach(slow, 1.0, "steps") == np.inf
+    places, heights = comparison.median_curve(quick, "steps")
+    np.testing.assert_array_equal(places, [10, 20, 30, 40])
+    np.testing.assert_allclose(heights, [0.2, 0.3, 1.0, 1.1])
+    # Behind from 5 to 20, ahead from 30 on.
+    assert comparison.crossover(quick, slow, "steps") == 30
+    assert comparison.crossover(slow, quick, "steps") is None
+    axes = comparison.comparison_figure({"gradient": quick, "ppo": slow}, distance=1.0, title="").axes
+    assert [axis.get_xscale() for axis in axes] == ["log", "log"]
+    assert {text.get_text() for text in axes[0].get_legend().get_texts()} == {"gradient: 30", "ppo: not reached"}
+
+
+def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):
+    from PIL import Image
+
+    mesh, muscles = task.creature.mesh, task.creature.muscles
+    x = np.stack([mesh.vertices + np.array([0.1 * frame, 0]) for frame in range(5)])
+    t = 0.1 * np.arange(5)
+    write_soft_body_gif(
+        tmp_path / "walk.gif", mesh, x, t, muscles=muscles, actuation=np.full((5, 2), 0.5), title="block", stride=2
+    )
+    assert Image.open(tmp_path / "walk.gif").n_frames == 3
+    axis = soft_body_frame(mesh, x[0], ground=-1.0).axes[0]
+    assert axis.get_ylim()[0] < -1.0 < mesh.vertices[:, 0].max() < axis.get_xlim()[1]
+    box = make_mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]])
+    write_soft_body_gif(tmp_path / "box.gif", box, box.vertices[None], np.zeros(1))
+    assert Image.open(tmp_path / "box.gif").n_frames == 1
+    with pytest.raises(InputError, match="4 times for 5 frames"):
+        write_soft_body_gif(tmp_path / "no.gif", mesh, x, t[:4])
+    with pytest.raises(InputError, match="actuation has shape"):
+        write_soft_body_gif(tmp_path / "no.gif", mesh, x, t, muscles=muscles, actuation=np.ones((5, 3)))
+
+
+def test_the_settings_of_the_methods_are_json():
+    from dln_jax.locomotion.methods import METHODS, SETTINGS, STEPS
+
+    assert set(METHODS) == set(SETTINGS) == set(STEPS)
+    json.dumps({name: settings._asdict() for name, settings in SETTINGS.items()})

@@ -1,0 +1,176 @@
+"""Driven rollouts against closed forms, the balance of energy, and the metrics of predictions by their definitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data import schema
+from dln_jax.data.splits import select
+from dln_jax.datasets import published
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.dynamics import no_energy
+from dln_jax.metrics.rollouts import (
+    Motion,
+    energy_error,
+    follow,
+    normalised_state_error,
+    recorded_motions,
+    rollout_metrics,
+    valid_prediction_time,
+    valid_prediction_times,
+)
+from dln_jax.types import InputError
+
+FRICTION = 0.3
+
+
+def sliding_mass():
+    """A free mass of 1 kg."""
+    return lagrangian.dynamics(lambda q, qd: 0.5 * jnp.sum(qd**2))
+
+
+def damped_oscillator():
+    """1 kg on a spring of 8 N/m, with viscous friction."""
+    return lagrangian.dynamics(
+        lambda q, qd: 0.5 * jnp.sum(qd**2) - 4.0 * jnp.sum(q**2),
+        dissipation=lambda q, qd: 0.5 * FRICTION * jnp.sum(qd**2),
+    )
+
+
+def oscillation(t):
+    """Position and rate of the oscillator that starts from rest at zero under a torque of 1.5, in closed form."""
+    decay, frequency = FRICTION / 2, np.sqrt(8 - FRICTION**2 / 4)
+    envelope, angle = 1.5 / 8 * np.exp(-decay * t), frequency * t
+    q = 1.5 / 8 - envelope * (np.cos(angle) + decay / frequency * np.sin(angle))
+    return q, envelope * (frequency + decay**2 / frequency) * np.sin(angle)
+
+
+def recordings():
+    """Two pushes of different length at uneven times, as trajectories of a free mass under tau = 6 t."""
+    times = [np.array([0.0, 0.2, 0.3, 0.7, 1.0]), np.array([5.0, 5.5, 6.0])]
+    t = np.concatenate(times)
+    tau = 6 * np.concatenate([time - time[0] for time in times])[:, None]
+    elapsed = tau / 6
+    arrays = {"t": t, "q": 1 + 2 * elapsed + elapsed**3, "qd": 2 + 3 * elapsed**2, "qdd": tau, "tau": tau}
+    return schema.from_arrays({**arrays, "trajectory": [0] * 5 + [1] * 3, "label": ["long", "short"]})
+
+
+def test_a_mass_follows_recorded_torques():
+    """RK4 is exact for a torque that is constant or linear in each interval."""
+    data = recordings()
+    motions = recorded_motions(sliding_mass(), data, substeps=2)
+    for index, samples in enumerate((slice(0, 5), slice(5, 8))):
+        exact = motions["interpolated"][index]
+        np.testing.assert_allclose(exact.q, data.q[samples], rtol=1e-13)
+        np.testing.assert_allclose(exact.qd, data.qd[samples], rtol=1e-13)
+        np.testing.assert_allclose(exact.work, 0.5 * (data.qd[samples, 0] ** 2 - 4), atol=1e-12)
+
+        dt, tau = np.diff(data.t[samples]), data.tau[samples][:-1, 0]
+        qd = np.cumsum(np.r_[2, tau * dt])
+        q = np.cumsum(np.r_[1, qd[:-1] * dt + 0.5 * tau * dt**2])
+        held = motions["held"][index]
+        np.testing.assert_allclose(held.qd[:, 0], qd, rtol=1e-13)
+        np.testing.assert_allclose(held.q[:, 0], q, rtol=1e-13)
+        np.testing.assert_allclose(held.work, 0.5 * (qd**2 - 4), atol=1e-12)
+
+
+def test_energy_is_the_work_of_the_torque_less_friction():
+    """A damped oscillator from rest under a held torque: the work is ∫ qd (tau - friction qd) dt."""
+    system = damped_oscillator()
+    t, tau = jnp.linspace(0.0, 2.0, 41), jnp.full((41, 1), 1.5)
+
+    motion = jax.jit(lambda: follow(system, jnp.zeros(1), jnp.zeros(1), tau, t))()
+    q, qd = oscillation(np.asarray(t))
+    np.testing.assert_allclose(motion.q[:, 0], q, atol=1e-9)
+    np.testing.assert_allclose(motion.qd[:, 0], qd, atol=1e-9)
+    assert energy_error(system.energy, [motion]) < 1e-9
+    supplied = 1.5 * motion.q[:, 0]
+    assert float(supplied[-1] - motion.work[-1]) > 0.01  # what friction took
+    wrong = motion._replace(work=supplied)
+    assert energy_error(system.energy, [wrong]) > 1e-3
+    assert energy_error(system.energy, [motion._replace(q=motion.q.at[-1].set(jnp.nan))]) == np.inf
+
+
+T = np.arange(5) * 0.5 + 3.0
+
+
+@pytest.mark.parametrize(
+    "offset, seconds",
+    [
+        ([0, 0, 0, 0, 0], 2.0),
+        ([0, 0.3, 0.4, 0.49, 0.49], 2.0),
+        ([0, 0.3, 0.5, 0, 0], 1.0),
+        ([0, 0, 0, 0, 0.6], 2.0),
+        ([9, 0, 0, 0, 0], 0.0),
+        ([0, np.nan, 0, 0, 0], 0.5),
+        ([0, 0, 0, -np.inf, 0], 1.5),
+        ([0, 1e200, 0, 0, 0], 0.5),
+    ],
+    ids=str,
+)
+def test_valid_prediction_time_is_the_first_time_over_the_threshold(offset, seconds):
+    """Errors relative to variances 4 and 100: an offset of 0.5 in both makes 0.065, one of 0.49 makes 0.0624."""
+    q = np.linspace(0, 1, 10).reshape(5, 2)
+    q_hat = q + np.array(offset, float)[:, None]
+    assert valid_prediction_time(q, q_hat, T, np.array([4.0, 100.0]), threshold=0.0645) == seconds
+
+
+def test_prediction_metrics_follow_their_definitions():
+    data = recordings()
+    groups = slice(0, 5), slice(5, 8)
+    motions = [Motion(data.q[group] + 0.1, data.qd[group] - 0.2, np.zeros(len(data.q[group]))) for group in groups]
+    motions[0].q[:2] -= 0.1
+    variance = np.var(data.q)
+    np.testing.assert_allclose(valid_prediction_times(data, motions, threshold=0.009 / variance), [0.3, 0.0])
+    assert valid_prediction_times(data, motions, threshold=0.011 / variance).tolist() == [1.0, 1.0]
+    expected = np.sqrt((6 / 8 * 0.01 / variance + 0.04 / np.var(data.qd)) / 2)
+    assert normalised_state_error(data, motions) == pytest.approx(expected, rel=1e-12)
+    motions[1].qd[0] = np.nan
+    assert normalised_state_error(data, motions) == np.inf
+
+
+def test_the_true_plant_predicts_its_own_motions_and_another_does_not():
+    data = recordings()
+    truth = rollout_metrics(sliding_mass(), data)
+    assert truth["vpt_interpolated_seconds"] == truth["rollout_seconds"] == 1.0
+    assert 0 < truth["vpt_seconds"] < 1.0  # holding the torque loses a recorded motion
+    assert truth["normalised_state_error"] < 1e-13 and truth["energy_error_j"] < 1e-12
+    # A model without an energy is rolled out as well.
+    other = rollout_metrics(damped_oscillator()._replace(energy=no_energy), data)
+    assert 0 < other["vpt_interpolated_seconds"] < 0.6
+    assert other["normalised_state_error"] > 0.1
+    assert "energy_error_j" not in other
+
+
+def test_recordings_that_cannot_be_followed_are_refused():
+    data = recordings()
+    with pytest.raises(InputError, match="trajectory 'short' has 1 sample; a rollout needs at least 2"):
+        rollout_metrics(sliding_mass(), data._replace(trajectory=np.array([0] * 7 + [1])))
+    with pytest.raises(InputError, match="substeps is 0"):
+        rollout_metrics(sliding_mass(), data, substeps=0)
+    with pytest.raises(InputError, match=r"q\[:, 0\] is the same in all samples"):
+        valid_prediction_times(data._replace(q=np.ones_like(data.q)), [])
+    with pytest.raises(InputError, match="no trajectories"):
+        rollout_metrics(sliding_mass(), select(data, []))
+
+
+def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
+    data = published.uniform_tests()
+    assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
+    np.testing.assert_array_equal(data.tau, 0.0)
+    np.testing.assert_array_equal(data.q[::400], published.STARTS)
+    # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
+    q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
+    for step in range(200):
+        if step % 10 == 0:
+            np.testing.assert_allclose(data.q[step // 10 :: 400].T, q, atol=1e-12)
+        cosine, sine = np.cos(q[1]), np.sin(q[1])
+        a, b, c = 1.3727291666666667 + cosine, 0.5176145833333333 + 0.5 * cosine, 0.5176145833333333
+        first = 0.5 * sine * (2 * qd[0] * qd[1] + qd[1] ** 2) - 2.625 * np.cos(q[0]) - 1.5 * np.cos(q[0] + q[1])
+        second = -0.5 * sine * qd[0] ** 2 - 1.5 * np.cos(q[0] + q[1])
+        qdd = np.array([c * first - b * second, a * second - b * first]) / (a * c - b**2)
+        if step % 10 == 0:
+            np.testing.assert_allclose(data.qdd[step // 10 :: 400].T, qdd, atol=1e-11)
+        qd = qd + 0.002 * qdd
+        q = q + 0.002 * qd

@@ -1,0 +1,173 @@
+"""Time steps of soft bodies: what they keep exactly, what they compile, and what they refuse."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
+from dln_jax.softbody.rollout import rollout
+from dln_jax.softbody.scene import initial_state, make_scene, potential
+from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.springs import springs
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+
+MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
+WEIGHT = gravity(MESH, (0.0, -9.81))
+SOLID = elastic(MESH, stable_neo_hookean, youngs_modulus=1e5)
+INTEGRATORS = ("backward-euler", "bdf2", "midpoint")
+DT = 0.05
+
+
+@functools.cache
+def held_body():
+    """A solid that falls, held at two vertices."""
+    return make_scene(MESH, (SOLID, WEIGHT), held=[0, 1])
+
+
+@functools.cache
+def program(integrator, steps=4, dt=DT):
+    scene = held_body()
+    step = make_step(scene, dt, integrator)
+    return jax.jit(lambda state, params: rollout(step, state, params, steps=steps, observe=lambda s, info: (s, info)))
+
+
+def start(integrator, **given):
+    return initial_state(held_body(), two_steps=integrator == "bdf2", **given)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_held_vertices_move_with_their_velocity(integrator):
+    v = np.zeros((4, 2))
+    v[:2] = 0.3, -0.2
+    _, (states, info) = program(integrator)(start(integrator, v=v), held_body().params)
+    assert info.converged.all() and info.definite.all()
+    t = DT * np.arange(1, 5)
+    np.testing.assert_allclose(states.x[:, :2], MESH.vertices[:2] + t[:, None, None] * v[:2], atol=1e-14)
+    np.testing.assert_array_equal(states.v[:, :2], np.broadcast_to(v[:2], (4, 2, 2)))
+    assert (states.x[:, 2:, 1] < MESH.vertices[2:, 1] - 0.2 * t[:, None]).all()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_body_without_inner_forces_falls_as_the_method_says(integrator):
+    scene = make_scene(MESH, (WEIGHT,))
+    state = initial_state(scene, v=[1.0, 2.0], two_steps=integrator == "bdf2")
+    last, _ = jax.jit(lambda s: rollout(make_step(scene, DT, integrator), s, scene.params, steps=6))(state)
+    n = np.arange(7)
+    parabola = 2.0 * n * DT - 9.81 * (n * DT) ** 2 / 2
+    # Backward Euler falls g h² n/2 further.
+    behind = {"backward-euler": 9.81 * DT**2 * 6 / 2, "midpoint": 0.0}
+    np.testing.assert_allclose(last.x[:, 0] - MESH.vertices[:, 0], 6 * DT, atol=1e-12)
+    fallen = np.asarray(last.x[:, 1] - MESH.vertices[:, 1])
+    if integrator == "bdf2":
+        # The recurrence itself, after a first step of backward Euler.
+        position, velocity = [0.0, 2.0 * DT - 9.81 * DT**2], [2.0, 2.0 - 9.81 * DT]
+        for _ in range(5):
+            velocity.append((4 * velocity[-1] - velocity[-2]) / 3 - 9.81 * 2 * DT / 3)
+            position.append((4 * position[-1] - position[-2]) / 3 + 2 * DT / 3 * velocity[-1])
+        np.testing.assert_allclose(fallen, position[6], atol=1e-12)
+    else:
+        np.testing.assert_allclose(fallen, parabola[6] - behind[integrator], atol=1e-12)
+
+
+def test_elements_given_inverted_move_as_those_given_right():
+    mesh = make_mesh(MESH.vertices, [[0, 2, 1], [1, 3, 2]])
+    assert mesh.turned == 1
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5)
+    scene = make_scene(mesh, (solid, gravity(mesh)), held=[0, 1])
+    step = make_step(scene, DT)
+    last = jax.jit(lambda state: rollout(step, state, scene.params, steps=4)[0])(initial_state(scene))
+    expected, _ = program("backward-euler")(start("backward-euler"), held_body().params)
+    np.testing.assert_allclose(last.x, expected.x, rtol=1e-12)
+    assert np.abs(expected.x - MESH.vertices).max() > 0.05
+
+
+def test_elements_that_meet_at_one_edge_keep_momentum():
+    """Three triangles at an edge: what they do to each other cancels."""
+    mesh = make_mesh([*MESH.vertices, [1.4, 1.2]], [[0, 1, 2], [1, 3, 2], [1, 4, 2]])
+    scene = make_scene(mesh, (elastic(mesh, stable_neo_hookean, youngs_modulus=1e5),))
+    v = np.random.default_rng(0).normal(size=mesh.vertices.shape)
+    step = make_step(scene, DT, tolerance=1e-10)
+    seen = jax.jit(lambda s: rollout(step, s, scene.params, steps=4, observe=lambda s, info: (s.v, info.converged))[1])(
+        initial_state(scene, v=v)
+    )
+    assert seen[1].all()
+    momentum = np.einsum("n,tni->ti", scene.params.masses, seen[0])
+    np.testing.assert_allclose(momentum, np.broadcast_to(scene.params.masses @ v, (4, 2)), rtol=1e-9)
+    assert np.abs(seen[0][-1] - v).max() > 0.1
+
+
+def test_a_hanging_weight_stretches_its_spring_by_its_weight_over_the_stiffness():
+    pairs = [[0, 2], [1, 3]]
+    scene = make_scene(MESH, (springs(pairs, stiffness=200.0), WEIGHT), masses=1.5, held=[2, 3])
+    x, info = jax.jit(lambda params: static_solve(scene, params, x=params.rest.at[:2, 1].add(-0.05)))(scene.params)
+    assert info.converged
+    lengths = np.linalg.norm(np.asarray(x)[[0, 1]] - np.asarray(x)[[2, 3]], axis=1)
+    rest = np.linalg.norm(MESH.vertices[[0, 1]] - MESH.vertices[[2, 3]], axis=1)
+    np.testing.assert_allclose(lengths - rest, 1.5 * 9.81 / 200.0, rtol=1e-9)
+    np.testing.assert_allclose(x[0, 0], x[2, 0], atol=1e-9)
+
+
+def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
+    scene = make_scene(MESH, (springs([[0, 2], [1, 3]], stiffness=200.0),), masses=1.5, held=[0, 1])
+    step = make_step(scene, DT)
+
+    def height(v, segment):
+        state = initial_state(scene)._replace(v=v)
+        last, (x, converged) = rollout(step, state, scene.params, steps=6, segment=segment)
+        return last.x[3, 1] + x[2, 3, 1], (x, converged)
+
+    whole, parts = (jax.jit(jax.grad(functools.partial(height, segment=s), has_aux=True)) for s in (None, 3))
+    v = jnp.ones((4, 2))
+    (gradient, (x, converged)), (again, (x_again, _)) = whole(v), parts(v)
+    assert x.shape == (6, 4, 2) and converged.all()
+    np.testing.assert_allclose(x_again, x, atol=1e-12)
+    assert np.abs(gradient).max() > 0.1
+    np.testing.assert_allclose(again, gradient, rtol=1e-6, atol=1e-12)
+
+
+def test_mapping_over_parameters_equals_one_at_a_time():
+    scene = held_body()
+    moduli = jnp.array([1e4, 1e6])
+
+    def with_modulus(E):
+        return scene.params._replace(
+            terms=scene.params.terms | {"elastic": scene.params.terms["elastic"]._replace(youngs_modulus=E)}
+        )
+
+    run = program("backward-euler")
+    together = jax.jit(jax.vmap(lambda E: run(start("backward-euler"), with_modulus(E))[0].x))(moduli)
+    for E, x in zip(moduli, together, strict=True):
+        np.testing.assert_allclose(x, run(start("backward-euler"), with_modulus(E))[0].x, atol=1e-10)
+
+
+def test_single_precision_follows_double():
+    scene = held_body()
+    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (start("backward-euler"), scene.params))
+    last, (_, info) = program("backward-euler")(*single)
+    assert last.x.dtype == jnp.float32 and info.converged.all()
+    double, _ = program("backward-euler")(start("backward-euler"), scene.params)
+    np.testing.assert_allclose(last.x, double.x, atol=1e-4)
+
+
+def test_what_a_scene_does_not_list_is_not_compiled():
+    def flops(*terms):
+        scene = make_scene(MESH, terms)
+        step = jax.jit(lambda state, params: make_step(scene, DT)(state, params)[0].x)
+        cost = step.lower(initial_state(scene), scene.params).compile().cost_analysis()
+        assert cost is not None
+        return cost["flops"]
+
+    weight, solid, both = flops(WEIGHT), flops(SOLID), flops(SOLID, WEIGHT)
+    assert weight < 0.7 * both
+    assert weight < solid < both
+
+
+def test_the_potential_is_the_sum_of_the_terms():
+    scene = make_scene(MESH, (SOLID, WEIGHT), masses=2.0)
+    height = 9.81 * 2.0 * MESH.vertices[:, 1].sum()
+    np.testing.assert_allclose(potential(scene, scene.params.rest, scene.params), height, rtol=1e-13)

@@ -1,0 +1,252 @@
+"""Minima of element energies against closed forms, finite differences and an independent optimiser."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial import Delaunay
+
+from dln_jax.softbody.mesh.builders import beam, box
+from dln_jax.solvers.elements.conjugate_gradients import conjugate_gradients
+from dln_jax.solvers.elements.element_energies import (
+    ElementEnergy,
+    Pattern,
+    assemble,
+    element_hessians,
+    entries,
+    gradient,
+    lower_triangles,
+    pattern,
+    square,
+    value,
+)
+from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
+from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.elements.projection import project
+from dln_jax.types import InputError
+
+SOLVERS = {"dense": dense, "block-tridiagonal": block_tridiagonal, "matrix-free": matrix_free}
+CHAIN = 12
+LINKS = np.stack([np.arange(CHAIN - 1), np.arange(1, CHAIN)], axis=1)
+
+
+def spring(x, data):
+    squared = sum((b - a) ** 2 for a, b in zip(*x, strict=True))
+    return 0.5 * data["k"] * (jnp.sqrt(squared) - data["length"]) ** 2
+
+
+ENERGIES = (
+    ElementEnergy(spring, LINKS, written_out=True),
+    ElementEnergy(lambda x, weight: weight * x[0][1], np.arange(CHAIN)[:, None], written_out=True),
+)
+FREE = np.ones((CHAIN, 2), bool)
+FREE[0] = FREE[-1] = False
+START = np.stack([np.linspace(0, 1, CHAIN), 0.02 * np.sin(np.arange(CHAIN))], axis=1)
+
+
+def hanging_chain(stiffness, length, ends, linear_solver=by_size, **options):
+    """Positions of a chain of springs between two held ends."""
+    start = jnp.asarray(START).at[-1].set(ends)
+    data = (
+        {"k": jnp.full(CHAIN - 1, stiffness), "length": jnp.full(CHAIN - 1, length)},
+        jnp.full(CHAIN, 0.3),
+    )
+    return minimise(ENERGIES, start, data, free=FREE, linear_solver=linear_solver, **options)
+
+
+@functools.cache
+def solved(name):
+    return jax.jit(functools.partial(hanging_chain, linear_solver=SOLVERS[name]))
+
+
+ARGUMENTS = (50.0, 0.11, jnp.array([1.0, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def sag():
+    """Mean height, compiled: the scalar that the derivatives below are of."""
+    return jax.jit(lambda *arguments: hanging_chain(*arguments)[0][:, 1].mean())
+
+
+# As measured: long bands are factorised, wide ones are not. Corners of the elements, dimension, the least work.
+CLOUD = np.random.default_rng(0).uniform(size=(1000, 3))
+CHOICES = {
+    "a few": (beam(4.0, 1.0, 8, 2).elements, 2, dense),
+    "plane": (beam(4.0, 1.0, 80, 20).elements, 2, block_tridiagonal),
+    "bar": (box((8.0, 1.0, 1.0), (48, 6, 6)).elements, 3, block_tridiagonal),
+    "block": (box((2.0, 1.0, 1.0), (12, 6, 6)).elements, 3, block_tridiagonal),
+    "unordered tetrahedra": (Delaunay(CLOUD).simplices, 3, matrix_free),
+    "chain": (np.stack([np.arange(4000), np.arange(1, 4001)], axis=1), 1, block_tridiagonal),
+}
+
+
+@pytest.mark.parametrize("case", CHOICES)
+def test_the_linear_solver_of_least_work_is_chosen(case):
+    indices, dimension, expected = CHOICES[case]
+    energies = (ElementEnergy(spring, indices),)
+    assert least_work(energies, pattern(energies, int(indices.max()) + 1, dimension)) is expected
+
+
+def test_blocks_that_would_fill_the_memory_are_not_stored():
+    """A star of many springs a spoke: its band is half of it in any order, and products are slow."""
+    n = 8000
+    none = np.zeros(0, int)
+    at = Pattern(n, 1, np.ones((n, 1), bool), np.arange(n), np.zeros(n, int), (), none, ())
+    spokes = ElementEnergy(spring, np.tile(np.stack([np.zeros(n - 1, int), np.arange(1, n)], axis=1), (40, 1)))
+    assert least_work((spokes,), at) is matrix_free
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_linear_solver_finds_the_minimum_of_an_independent_optimiser(name):
+    x, info = solved(name)(*ARGUMENTS)
+    assert info.converged and info.definite and info.residual <= 1e-8
+
+    def energy(unknowns):
+        x = START.copy()
+        x[-1] = ARGUMENTS[2]
+        x[1:-1] = unknowns.reshape(-1, 2)
+        lengths = np.linalg.norm(np.diff(x, axis=0), axis=1)
+        return 25.0 * np.sum((lengths - 0.11) ** 2) + 0.3 * x[:, 1].sum()
+
+    reference = minimize(energy, np.asarray(x)[1:-1].ravel() + 1e-3, method="BFGS", options={"gtol": 1e-9})
+    assert energy(np.asarray(x)[1:-1].ravel()) <= reference.fun + 1e-12
+    np.testing.assert_allclose(np.asarray(x)[1:-1].ravel(), reference.x, atol=2e-5)
+    np.testing.assert_array_equal(x[0], START[0])
+
+
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd], ids=["reverse", "forward"])
+def test_derivatives_are_those_of_the_minimum(sag, mode):
+    derivatives = jax.jit(mode(lambda *arguments: hanging_chain(*arguments)[0][:, 1].mean(), argnums=(0, 1, 2)))
+    found = derivatives(*ARGUMENTS)
+    step = 1e-6
+    for number, scale in ((0, 1e2), (1, 1.0)):
+        moved = [[*ARGUMENTS], [*ARGUMENTS]]
+        moved[0][number] += scale * step
+        moved[1][number] -= scale * step
+        difference = (sag(*moved[0]) - sag(*moved[1])) / (2 * scale * step)
+        np.testing.assert_allclose(found[number], difference, rtol=1e-6)
+    for axis in range(2):
+        e = step * jnp.eye(2)[axis]
+        difference = (sag(*ARGUMENTS[:2], ARGUMENTS[2] + e) - sag(*ARGUMENTS[:2], ARGUMENTS[2] - e)) / (2 * step)
+        np.testing.assert_allclose(found[2][axis], difference, rtol=1e-6)
+
+
+def test_second_derivatives_nest(sag):
+    curvature = jax.jit(jax.hessian(lambda length: hanging_chain(50.0, length, ARGUMENTS[2])[0][:, 1].mean()))(0.11)
+    slope = jax.jit(jax.grad(lambda length: hanging_chain(50.0, length, ARGUMENTS[2])[0][:, 1].mean()))
+    np.testing.assert_allclose(curvature, (slope(0.11 + 1e-5) - slope(0.11 - 1e-5)) / 2e-5, rtol=1e-6)
+
+
+def test_mapping_equals_one_at_a_time():
+    stiffness = jnp.array([5.0, 50.0, 5e4])
+    together, info = jax.jit(jax.vmap(lambda k: hanging_chain(k, *ARGUMENTS[1:])))(stiffness)
+    assert info.converged.all()
+    for k, x in zip(stiffness, together, strict=True):
+        np.testing.assert_allclose(x, solved("dense")(k, *ARGUMENTS[1:])[0], atol=1e-9)
+
+
+def test_an_unfinished_search_says_so_and_has_no_derivative():
+    unfinished = functools.partial(hanging_chain, iterations=1)
+    x, info = jax.jit(unfinished)(*ARGUMENTS)
+    assert not info.converged and info.iterations == 1 and np.isfinite(x).all()
+    slope = jax.jit(jax.grad(lambda length: unfinished(50.0, length, ARGUMENTS[2])[0].sum()))(0.11)
+    assert np.isnan(slope)
+
+
+def test_values_that_are_not_finite_do_not_converge():
+    x, info = solved("dense")(jnp.nan, 0.11, ARGUMENTS[2])
+    assert not info.converged
+    np.testing.assert_array_equal(x[1:-1], START[1:-1])
+
+
+def rosenbrock(x, one):
+    return jnp.sum(100 * (x[1:, 0] - x[:-1, 0] ** 2) ** 2 + (one - x[:-1, 0]) ** 2)
+
+
+def test_a_function_of_all_unknowns_is_minimised_from_where_its_hessian_is_indefinite():
+    start = jnp.array([[0.0], [2.0], [0.5], [-1.0], [3.0]])
+    assert np.linalg.eigvalsh(jax.hessian(lambda x: rosenbrock(x[:, None], 1.0))(start[:, 0]))[0] < 0
+    x, info = jax.jit(lambda start, one: minimise(rosenbrock, start, one))(start, 1.0)
+    np.testing.assert_allclose(x, 1.0, atol=1e-9)
+    assert info.converged and info.definite
+
+
+def test_a_saddle_is_not_definite():
+    # x² - y² has no minimum; its only stationary point is where the search starts.
+    _, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0)
+    assert info.converged and not info.definite
+
+
+def test_convergence_at_the_level_of_rounding_far_below_which_energies_are_blind():
+    # Stiffness 1e12 about lengths of 1: the tolerance asks for 1e-24 m.
+    x, info = jax.jit(lambda x: minimise(lambda x, k: k * jnp.sum((x - 1.0) ** 4 + (x - 1.0) ** 2), x, 1e12))(
+        jnp.full((3, 1), 1.3)
+    )
+    assert info.converged
+    np.testing.assert_allclose(x, 1.0, atol=1e-14)
+
+
+def test_single_precision_stays_single():
+    x, info = jax.jit(lambda x, one: minimise(rosenbrock, x, one, tolerance=1e-3))(
+        jnp.zeros((4, 1), jnp.float32), jnp.float32(1.0)
+    )
+    assert x.dtype == jnp.float32 and info.converged
+    np.testing.assert_allclose(x, 1.0, atol=1e-3)
+
+
+def test_assembly_agrees_with_differentiating_the_sum():
+    data = ({"k": jnp.linspace(1, 2, CHAIN - 1), "length": jnp.full(CHAIN - 1, 0.2)}, jnp.arange(float(CHAIN)))
+    at = pattern(ENERGIES, CHAIN, 2)
+    x = jnp.asarray(START) + 0.1 * jax.random.normal(jax.random.key(0), START.shape)
+    total = jax.jit(lambda x: value(ENERGIES, x, data))
+    np.testing.assert_allclose(gradient(ENERGIES, at, x, data), jax.grad(total)(x), atol=1e-13)
+    whole = np.zeros((at.unknowns, at.unknowns))
+    whole[at.rows, at.columns] = entries(at, element_hessians(ENERGIES, x, data))
+    expected = jax.hessian(total)(x).reshape(at.unknowns, at.unknowns)
+    np.testing.assert_allclose(whole, np.tril(expected), atol=1e-12)
+
+
+def test_the_transpose_of_assembly_reads_where_it_adds():
+    at = pattern(ENERGIES, CHAIN, 2)
+    corners = at.corners[0]
+    components = jax.random.normal(jax.random.key(1), (4, CHAIN - 1))
+    blocks = jax.random.normal(jax.random.key(2), (CHAIN, 2))
+    added, transposed = jax.vjp(lambda c: assemble(corners, c), components)
+    np.testing.assert_allclose(jnp.vdot(added, blocks), jnp.vdot(components, transposed(blocks)[0]), rtol=1e-13)
+
+
+def test_projection_keeps_what_is_positive_and_removes_what_is_not():
+    whole = np.array([[[2.0, 0.0], [0.0, -1.0]], [[1.0, 0.5], [0.5, 3.0]]])
+    (projected,) = project((lower_triangles(jnp.asarray(whole)),), jnp.asarray(0.0))
+    np.testing.assert_allclose(square(projected), [[[2.0, 0.0], [0.0, 0.0]], whole[1]], atol=1e-14)
+
+
+def test_conjugate_gradients_refuse_a_matrix_that_is_not_definite():
+    diagonal = jnp.array([1.0, 2.0, -3.0])
+    solve = functools.partial(conjugate_gradients, precondition=lambda r: r, tolerance=1e-12, iterations=10)
+    b = jnp.array([1.0, 1.0, 1.0])
+    np.testing.assert_allclose(solve(lambda x: jnp.abs(diagonal) * x, b), b / jnp.abs(diagonal), rtol=1e-11)
+    assert np.isnan(solve(lambda x: diagonal * x, b)).all()
+    assert np.isnan(solve(lambda x: jnp.abs(diagonal) * x, b, iterations=1)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"indices": np.array([[0, 3]])}, "element 0 of energy 0"),
+        ({"indices": np.array([[0, 1], [2, 2]])}, "element 1 of energy 0"),
+        ({"free": np.ones((2, 2), bool)}, "free has shape"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"iterations": 0}, "iterations"),
+        ({"x0": jnp.zeros(3)}, "x0 has shape"),
+    ],
+)
+def test_mistakes_name_what_is_wrong(change, message):
+    indices = change.pop("indices", np.array([[0, 1]]))
+    x0 = change.pop("x0", jnp.zeros((3, 2)))
+    energies = (ElementEnergy(lambda x, _: jnp.sum(x**2), indices),)
+    with pytest.raises(InputError, match=message):
+        minimise(energies, x0, (jnp.zeros(len(indices)),), **change)
