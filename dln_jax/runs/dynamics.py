@@ -10,30 +10,29 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import needs_from_option, stored_arguments, with_stored_arguments
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, merged, split
-from dln_jax.zoo.kinds import build, describe
-from dln_jax.learning.objectives import objective_of
-from dln_jax.zoo.load import load_run, save_model
+from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.learning.basis_degrees import choose_degrees
-from dln_jax.learning.linear_fit import fit_linear
-from dln_jax.learning.objectives import TORQUE, Objective
-from dln_jax.learning.engine.runs import Progress, Stop, Training
-from dln_jax.precision import data_type
 from dln_jax.learning.dynamics_fit import Settings, automatic_optimizer, check, check_start, train, validation_errors
-from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.types import InputError, Needs, require_positive, require_seed
-from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
-from dln_jax.command_line.running import needs_from_option, stored_arguments, with_stored_arguments
-from dln_jax.scenes.registry import SCENES, scene_named
-from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.learning.engine.runs import Progress, Stop, Training
+from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.objectives import TORQUE, Objective, objective_of
+from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_results import Task, best_seed, definiteness_of, evaluate, latency_states, results_table
+from dln_jax.scenes.registry import SCENES, scene_named
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
-from dln_jax.command_line.progress import progress
+from dln_jax.types import InputError, Needs, require_positive, require_seed
+from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.load import load_run, save_model
 
 OF_NETWORKS = ("width", "depth", "activation")
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")

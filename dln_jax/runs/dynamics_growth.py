@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import compiled
 from dln_jax.files import write_json
+from dln_jax.learning.dynamics_fit import train
 from dln_jax.learning.engine.runs import Training
 from dln_jax.precision import data_type
-from dln_jax.learning.dynamics_fit import train
 from dln_jax.runs.dynamics_results import Task, latency_of
+from dln_jax.zoo.kinds import build
+from dln_jax.zoo.load import compiled
 
 WIDTHS = (4, 8, 16, 32)
 DEPTHS = (1, 2)

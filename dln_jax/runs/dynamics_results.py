@@ -10,22 +10,22 @@ from rich.table import Table
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, merged
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_run
 from dln_jax.figures import dynamics as figures
-from dln_jax.metrics.definiteness import Definiteness, definiteness
-from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.errors import errors, predictions
-from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.files import write_figure
-from dln_jax.learning.objectives import Objective
-from dln_jax.learning.engine.runs import Training
-from dln_jax.precision import data_type
 from dln_jax.learning.dynamics_fit import Settings
+from dln_jax.learning.engine.runs import Training
+from dln_jax.learning.objectives import Objective
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.latency import Latency, one_step
+from dln_jax.metrics.rollouts import rollout_metrics
+from dln_jax.precision import data_type
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.scene import dynamics as scene_dynamics
 from dln_jax.types import InputError, Needs
+from dln_jax.zoo.kinds import build
+from dln_jax.zoo.load import load_run
 
 
 class Task(NamedTuple):
@@ -202,7 +202,7 @@ def results_table(metrics: dict[str, float], task: Task) -> Table:
     for column in table.columns[1:-1]:
         column.justify = "right"
 
-    def text(key: str, value: float) -> str:
+    def text(key: str, value: int | float) -> str:
         if isinstance(value, int):
             return f"{value:,}"
         tiny = "_mse" in key or "error" in key or "eigenvalue" in key or "condition" in key

@@ -1,30 +1,27 @@
 """What `train_hnn --task pixels` does: from a command line to a trained model of pictures in a run folder."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import stored_arguments
 from dln_jax.datasets.pendulum_frames import FrameSplit
-from dln_jax.zoo.load_latent import save_latent
 from dln_jax.figures import dynamics as figures
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.engine.runs import Checkpoint, Progress, fingerprint
-from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.studies.hamiltonian import pixels as pixel_task
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.command_line.progress import progress
-
-if TYPE_CHECKING:
-    from dln_jax.commands.train_hnn import Arguments
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.load_latent import save_latent
 
 KINDS = {"auto": "hnn", "black-box": "hnn", "baseline": "baseline"}
 TAKEN = ("model", "task", "trajectories", "steps", "seed", "out", "resume", "figures")
 """Options that the task reads."""
 
 
-def run_pixels(given: "Arguments") -> None:
+def run_pixels(given: Any) -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
     check(given)
@@ -34,7 +31,7 @@ def run_pixels(given: "Arguments") -> None:
         train_into(folder, given, kind, data, console)
 
 
-def train_into(folder: Path, given: "Arguments", kind: str, data: FrameSplit, console: Console) -> None:
+def train_into(folder: Path, given: Any, kind: str, data: FrameSplit, console: Console) -> None:
     """Trains, evaluates, and writes the files of the run."""
     write_json(folder / CONFIG, stored_arguments(given))
     console.print(f"pixels: {len(data.train.q)} films to train on, {len(data.validation.q)} to select by; {kind}, f32")
@@ -65,7 +62,7 @@ def train_into(folder: Path, given: "Arguments", kind: str, data: FrameSplit, co
     console.print(f"run folder: {folder}")
 
 
-def check(given: "Arguments") -> None:
+def check(given: Any) -> None:
     """Refuses what the task does not take, before anything is written."""
     if given.model not in KINDS:
         raise InputError(f"model is '{given.model}'; expected one of {', '.join(KINDS)} for pixels")

@@ -4,32 +4,41 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from dln_jax.command_line.arguments import refuse_given, resolved
+from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import needs_from_option, stored_arguments
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.zoo.load import load_phase_field, save_model
-from dln_jax.zoo.phase_kinds import build_phase
 from dln_jax.figures import animations
 from dln_jax.figures import dynamics as figures
-from dln_jax.metrics.latency import one_step
 from dln_jax.figures.phase_space import TRUTH
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
 from dln_jax.learning.engine.runs import Progress
-from dln_jax.types import InputError, require_positive, require_seed
-from dln_jax.command_line.arguments import refuse_given, resolved
-from dln_jax.command_line.running import needs_from_option, stored_arguments
+from dln_jax.metrics.latency import one_step
 from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once
-from dln_jax.studies.hamiltonian.training import KINDS, LEARNING_RATE, MOTIONS, POLYNOMIAL, RATES, Trained, check, description_of, settings_of, stages_of, train
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem, problem_of
+from dln_jax.studies.hamiltonian.training import (
+    KINDS,
+    LEARNING_RATE,
+    MOTIONS,
+    POLYNOMIAL,
+    RATES,
+    Trained,
+    check,
+    description_of,
+    settings_of,
+    stages_of,
+    train,
+)
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
-from dln_jax.command_line.progress import progress
-
-if TYPE_CHECKING:
-    from dln_jax.commands.train_hnn import Arguments
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.load import load_phase_field, save_model
+from dln_jax.zoo.phase_kinds import build_phase
 
 GIF_FRAMES = 80
 LOSSES = {
@@ -41,7 +50,7 @@ OF_TORQUES = ("test", "scene", "target", "batch", "weight_decay", "patience")
 """Options of models of torques, which a task decides itself."""
 
 
-def run_task(given: "Arguments") -> None:
+def run_task(given: Any) -> None:
     """Trains, evaluates, and writes the run folder."""
     console = Console(highlight=False, soft_wrap=True)
     check_options(given)
@@ -63,7 +72,7 @@ def run_task(given: "Arguments") -> None:
 
 def train_into(
     folder: Path,
-    given: "Arguments",
+    given: Any,
     problem: Problem,
     description: dict[str, Any],
     options: dict[str, Any],
@@ -93,7 +102,7 @@ def train_into(
         console.print(trained.stopped)
 
 
-def check_options(given: "Arguments") -> None:
+def check_options(given: Any) -> None:
     """Refuses what no task takes, before anything is written."""
     require_seed(given.seed)
     for name in ("width", "depth", "degree", "steps", "trajectories", "seconds"):
@@ -110,7 +119,7 @@ def check_options(given: "Arguments") -> None:
         refuse_given(given, ["degree"], "for the polynomial model")
 
 
-def check_suited(given: "Arguments", problem: Problem, description: dict[str, Any]) -> None:
+def check_suited(given: Any, problem: Problem, description: dict[str, Any]) -> None:
     """Refuses what this task or its model does not take, before anything is written."""
     build_phase(description)
     if problem.name in PROTOCOLS:

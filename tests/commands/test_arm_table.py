@@ -11,6 +11,7 @@ from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.studies.arm import models as arm_models
+from dln_jax.studies.arm.data import states
 from dln_jax.studies.arm.published import COLUMNS, PUBLISHED, published
 
 NUMBERS = {

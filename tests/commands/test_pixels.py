@@ -20,6 +20,7 @@ from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
 from dln_jax.models.phase_field import PhaseModel, phase_field
 from dln_jax.models.principal_components import compress, principal_components
+from dln_jax.precision import with_float64
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.types import InputError

@@ -257,7 +257,7 @@ def folder(tmp_path):
 
 def command(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["export_c", *map(str, arguments)])
-    run(script.main, script.Arguments)
+    run(script.main, script.Arguments, prog="command")
 
 
 def refused(monkeypatch, capsys, *arguments):
