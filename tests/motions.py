@@ -4,12 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
-from dln_jax.models.phase_field import phase_field
 
 
 def quick_motion(H, q, p, t, *, dissipation=None, tolerance=None):
     """In place of `reference_motion`, which takes seconds to compile: RK4 with fixed steps."""
-    step = rk4(lambda t, state: phase_field(H, dissipation=dissipation).rates(*state))
+    step = rk4(lambda t, state: flow(HamiltonianSystem(H, dissipation)).rates(*state))
     motion = jax.jit(jax.vmap(lambda q, p: rollout(step, (q, p), jnp.asarray(t), substeps=10)))
     return tuple(np.asarray(state) for state in motion(q, p))

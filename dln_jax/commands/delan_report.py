@@ -19,9 +19,10 @@ from dln_jax.data.splits import Split, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.files import run_folder
 from dln_jax.learning.dynamics_fit import Settings, train
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.scenes.scene import closed_form_forward_dynamics, closed_form_inverse_dynamics, dynamics
+from dln_jax.scenes.scene import closed_form_forward_dynamics, closed_form_inverse_dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.report import Row, conditions, write_report
 from dln_jax.studies.report_table import print_report
@@ -105,11 +106,12 @@ def delan_rows(case: str, sets: Split, settings: Settings) -> list[Row]:
             settings,
             report=lambda at: show(min(int(at.step), settings.steps), f"{case}  loss {at.loss:.2e}"),
         )
-    system = compiled(model.apply(training.parameters), jnp.float32)
+    energies = model.energies(training.parameters)
+    system = compiled(dynamics(energies), jnp.float32)
     states = list(zip(*(jnp.asarray(a[:400], jnp.float32) for a in sets.test[1:4]), strict=True))
     latency = one_step(system.inverse_dynamics, states)
     numbers = {
-        **errors(predictions(system, sets.test, jnp.float32), sets.test),
+        **errors(predictions(energies, sets.test, jnp.float32), sets.test),
         "train_seconds": training.train_seconds,
         "compile_seconds": training.compile_seconds,
         "one_step_p50_us": latency.p50_us,
@@ -121,7 +123,7 @@ def delan_rows(case: str, sets: Split, settings: Settings) -> list[Row]:
 def textbook_rows(scene, *, states: int = 1000) -> list[Row]:
     """Largest error of the generic Lagrangian mechanics in float64, relative to the largest value."""
     q, qd, qdd, tau = np.random.default_rng(0).uniform(-np.pi, np.pi, (4, states, scene.needs.degrees_of_freedom))
-    generic = dynamics(scene)
+    generic = dynamics(scene.energies)
     pairs = {
         "inverse": (generic.inverse_dynamics, closed_form_inverse_dynamics, qdd),
         "forward": (generic.forward_dynamics, closed_form_forward_dynamics, tau),

@@ -17,7 +17,7 @@ from jax import Array, export
 
 from dln_jax.deploy.exports import described, read_export, write_exports
 from dln_jax.mechanics.arguments import require_shape
-from dln_jax.mechanics.dynamics import Dynamics, no_energy
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.precision import require_double_precision
 from dln_jax.types import InputError
 
@@ -54,7 +54,7 @@ def export_stablehlo(
 
 
 def export_dynamics(
-    dynamics: Dynamics,
+    dynamics: Dynamics | PlainDynamics,
     degrees_of_freedom: int,
     directory: str | Path,
     *,
@@ -82,7 +82,7 @@ def export_dynamics(
     state = jax.ShapeDtypeStruct((degrees_of_freedom,), dtype)
     files: dict[str, bytes] = {}
     for name, count in _ARGUMENTS.items():
-        if (function := getattr(dynamics, name)) is not no_energy:
+        if (function := getattr(dynamics, name, None)) is not None:
             files |= _artefact(f"{name}{SUFFIX}", function, [state] * count, platforms)
     return [path for path in write_exports(Path(directory), files, overwrite=overwrite) if path.suffix == SUFFIX]
 

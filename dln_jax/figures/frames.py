@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, pictures
 from dln_jax.figures.phase_space import COLOURS
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.flow import Flow
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.frames import decoded, encoded, physical_energy, physical_states
 from dln_jax.metrics.phase_space import Motions, predict
@@ -74,8 +76,8 @@ def inject_energy(
     """
     require_positive(factor=factor, times=times)
     parameters = with_float64(parameters)
-    field = model.field.apply(parameters["field"])
-    if field.energy is None:
+    field = flow(model.field.energies(parameters["field"]))
+    if not isinstance(field, Flow):
         raise InputError("the model has no energy to raise; give one whose latent field is an 'hnn'")
     H = field.energy
     still = np.tile(pictures(np.zeros(1))[0], 2)

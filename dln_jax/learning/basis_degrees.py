@@ -45,7 +45,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         with jax.enable_x64(True):
             model = make_trigonometric(needs, degree=degrees)
             found = fit_linear(model, train)
-            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.apply(parameters), batch))
+            judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
             errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
         return found, np.sum(np.asarray(errors) ** 2, axis=1)
 

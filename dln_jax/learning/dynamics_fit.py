@@ -79,7 +79,7 @@ def check_start(model: Model, sets: Split, settings: Settings, objective: Object
     dtype = data_type(settings.precision)
     scale = objective.scale(sets.train).astype(dtype)
     require_finite_start(
-        lambda parameters, batch: residuals.mean_loss(objective, model.apply(parameters), batch, scale),
+        lambda parameters, batch: residuals.mean_loss(objective, model.energies(parameters), batch, scale),
         model.init,
         settings.seed,
         tuple(map(lambda *parts: jnp.concatenate(parts), *(residuals.arrays(objective, part, dtype) for part in sets))),
@@ -135,7 +135,7 @@ def train(
 
     if settings.optimizer == "gauss-newton":
         trained = train_second_order(
-            lambda parameters, *sample: objective.residual(model.apply(parameters), *sample) / scale,
+            lambda parameters, *sample: objective.residual(model.energies(parameters), *sample) / scale,
             parameters,
             fitted,
             score=score,
@@ -146,7 +146,7 @@ def train(
         )
         return require_start(trained)
     trained = train_first_order(
-        lambda parameters, batch: residuals.mean_loss(objective, model.apply(parameters), batch, scale),
+        lambda parameters, batch: residuals.mean_loss(objective, model.energies(parameters), batch, scale),
         adamw(steps=settings.steps, learning_rate=settings.learning_rate, weight_decay=settings.weight_decay),
         parameters,
         fitted,
@@ -192,5 +192,5 @@ def _numbers(data: Trajectories, objective: Objective):
 
 def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
     """Squared error of each sample of a batch, in the units that the objective selects by."""
-    errors = residuals.residuals(objective, model.apply(parameters), batch)
+    errors = residuals.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

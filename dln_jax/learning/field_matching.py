@@ -37,8 +37,8 @@ from dln_jax.learning.engine.runs import (
     silent,
 )
 from dln_jax.learning.engine.second_order import Budget, train_second_order
-from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import PhaseModel
+from dln_jax.mechanics.equations import flow
+from dln_jax.models.model import Model, Parameters
 from dln_jax.precision import data_type, require_float64
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Scalar, require_positive, require_seed
@@ -87,13 +87,13 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
     return select(data, np.setdiff1d(present, held_out)), select(data, held_out)
 
 
-def residual(model: PhaseModel, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
+def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
     """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d], whose sum of squares is the sample's part of the loss."""
-    velocity, force = model.apply(parameters).rates(q, p)
+    velocity, force = flow(model.energies(parameters)).rates(q, p)
     return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
 
 
-def loss(model: PhaseModel, parameters: Parameters, arrays: tuple[Array, ...]) -> Scalar:
+def loss(model: Model, parameters: Parameters, arrays: tuple[Array, ...]) -> Scalar:
     """Mean square of rates - (qd, pd) over samples and components; arrays are q, p, qd, pd, [N, d] each."""
     each = jax.vmap(functools.partial(residual, model, parameters))(*arrays)
     return jnp.mean(jnp.sum(each**2, axis=1))
@@ -112,14 +112,14 @@ def check(data: Trajectories, settings: Settings) -> None:
         samples(part, settings, dtype)
 
 
-def check_start(model: PhaseModel, data: Trajectories, settings: Settings) -> None:
+def check_start(model: Model, data: Trajectories, settings: Settings) -> None:
     """Raises `InputError` if the loss is not finite where training starts; takes a compilation."""
     arrays = samples(data, settings._replace(samples=len(data.t)), data_type(settings.precision))
     require_finite_start(functools.partial(loss, model), model.init, settings.seed, arrays)
 
 
 def match_field(
-    model: PhaseModel,
+    model: Model,
     data: Trajectories,
     settings: Settings,
     *,
@@ -176,7 +176,7 @@ def match_field(
 
 
 def match_linear(
-    model: PhaseModel, data: Trajectories, *, validation: Trajectories | None = None
+    model: Model, data: Trajectories, *, validation: Trajectories | None = None
 ) -> tuple[Training, Float[np.ndarray, " N"]]:
     """The least-squares fit of a field that is linear in its parameters, and the squared errors of the validation.
 

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.objectives import torque_scale
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
@@ -119,7 +120,7 @@ def _linearised(
     """Phi and tau of one state."""
 
     def torque(parameters: Parameters) -> Vector:
-        return model.apply(parameters).inverse_dynamics(q, qd, qdd)
+        return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)
 
     # Reverse mode: d pull-backs, where forward mode would push all P parameters.
     tau, pull_back = jax.vjp(torque, parameters)

@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from dln_jax.data.magnitudes import on_device, spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import friction_force
+from dln_jax.mechanics.equations import Canonical, System, dynamics, hamiltonian_of
 from dln_jax.types import InputError, Scalar, Vector
 from dln_jax.zoo.kinds import KINDS
 
@@ -24,7 +25,7 @@ class Objective(NamedTuple):
     scale: Callable[[Trajectories], Float[Array, " r"]]
     """Training data -> the unit of each residual. Raises InputError where the data cannot determine the model."""
     residual: Callable[..., Float[Array, " r"]]
-    """(dynamics, *sample) -> residuals of one sample, in SI units."""
+    """(system, *sample) -> residuals of one sample, in SI units."""
     selects_by: str
     """"torque": validation is the mean square of the residual in (N m)², as published; "scaled": in its own units."""
 
@@ -48,7 +49,7 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
 TORQUE = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=torque_scale,
-    residual=lambda dynamics, q, qd, qdd, tau: dynamics.inverse_dynamics(q, qd, qdd) - tau,
+    residual=lambda system, q, qd, qdd, tau: dynamics(system).inverse_dynamics(q, qd, qdd) - tau,
     selects_by="torque",
 )
 """tau_hat(q, qd, qdd) - tau, the published loss of DeLaN."""
@@ -60,12 +61,11 @@ def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
     return jnp.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
-def _canonical_residual(dynamics: Dynamics, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
-    H = dynamics.hamiltonian
-    assert H is not None
+def _canonical_residual(system: Canonical, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
+    H = hamiltonian_of(system)
     pd = tau - jax.grad(H)(q, p)
-    if dynamics.friction is not None:
-        pd -= dynamics.friction(q, qd)
+    if system.dissipation is not None:
+        pd -= friction_force(system.dissipation, q, qd)
     velocity, acceleration = jax.jvp(jax.grad(H, argnums=1), (q, p), (qd, pd))
     return jnp.concatenate([velocity - qd, acceleration - qdd])
 
@@ -87,8 +87,8 @@ def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
 BOTH_WAYS = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=_both_scales,
-    residual=lambda dynamics, q, qd, qdd, tau: jnp.concatenate(
-        [dynamics.inverse_dynamics(q, qd, qdd) - tau, dynamics.forward_dynamics(q, qd, tau) - qdd]
+    residual=lambda system, q, qd, qdd, tau: jnp.concatenate(
+        [dynamics(system).inverse_dynamics(q, qd, qdd) - tau, dynamics(system).forward_dynamics(q, qd, tau) - qdd]
     ),
     selects_by="scaled",
 )
@@ -117,14 +117,14 @@ def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array,
     return tuple(on_device(key, getattr(data, key), dtype) for key in objective.keys)
 
 
-def residuals(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
+def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
-    return vmap(lambda *sample: objective.residual(dynamics, *sample))(*batch)
+    return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
 
 
-def mean_loss(objective: Objective, dynamics: Dynamics, batch: tuple[Array, ...], scale: Float[Array, " r"]) -> Scalar:
+def mean_loss(objective: Objective, system: System, batch: tuple[Array, ...], scale: Float[Array, " r"]) -> Scalar:
     """Mean over samples of the sum of squared residuals in units of `scale` (Lutter et al. 2019)."""
-    return jnp.mean(jnp.sum((residuals(objective, dynamics, batch) / scale) ** 2, axis=-1))
+    return jnp.mean(jnp.sum((residuals(objective, system, batch) / scale) ** 2, axis=-1))
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:

@@ -28,9 +28,10 @@ from dln_jax.learning.engine.first_order import train_first_order
 from dln_jax.learning.engine.optimisers import adamw, check_adamw
 from dln_jax.learning.engine.runs import Checkpoint, Report, Training, silent
 from dln_jax.learning.engine.second_order import Budget, train_second_order
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.integrators import rk4, rollout
-from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import PhaseField, PhaseModel
+from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, require_positive
 
@@ -122,7 +123,7 @@ def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
     return Windows(windows.t[rows], windows.state[rows], rate, windows.weight[rows])
 
 
-def motion(field: PhaseField, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
+def motion(field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
     """States (q, p) at the times t from `start` [2 d], by RK4."""
     d = start.shape[0] // 2
     q, p = rollout(rk4(lambda t, state: field.rates(*state)), (start[:d], start[d:]), t, substeps=substeps)
@@ -130,7 +131,7 @@ def motion(field: PhaseField, start: Array, t: Float[Array, " T"], *, substeps: 
 
 
 def window_residual(
-    field: PhaseField, weights: Weights, start: Array, window: tuple[Array, ...], *, substeps: int
+    field: Flow | PlainFlow, weights: Weights, start: Array, window: tuple[Array, ...], *, substeps: int
 ) -> Array:
     """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
     t, measured, weight, *rate = window
@@ -159,7 +160,7 @@ def check(windows: Windows, validation: Windows, weights: Weights) -> None:
 
 
 def match_trajectories(
-    model: PhaseModel,
+    model: Model,
     parameters: Parameters,
     windows: Windows,
     validation: Windows,
@@ -203,10 +204,10 @@ def match_trajectories(
 
     def residual(unknowns, index: Array, *window: Array) -> Array:
         start = unknowns["starts"][index] if free_starts else window[1][0]
-        return error(model.apply(unknowns["model"]), start=start, window=window)
+        return error(flow(model.energies(unknowns["model"])), start=start, window=window)
 
     def score(unknowns) -> tuple[Scalar, Scalar]:
-        field = model.apply(unknowns["model"])
+        field = flow(model.energies(unknowns["model"]))
 
         def closest(*window: Array) -> Array:
             def from_start(start: Array) -> Array:

@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from dln_jax.mechanics.arguments import vectors
-from dln_jax.types import InputError, Vector, VectorLike
+from dln_jax.types import Dissipation, Vector, VectorLike
 
 
 class Decomposition(NamedTuple):
@@ -22,10 +23,10 @@ class Decomposition(NamedTuple):
 
 
 class Dynamics(NamedTuple):
-    """Functions of one state; `vmap` them over samples. Symbols and units as in `dln_jax.types`.
+    """What an energy answers in coordinates and velocities; functions of one state, which `vmap` takes over samples.
 
-    Analytic systems and learned ones are the same type, so whatever consumes dynamics (losses, metrics,
-    rollouts, controllers) cannot tell them apart. `make_dynamics` makes one, whose functions take arrays, or lists of
+    Symbols and units as in `dln_jax.types`. Analytic systems and learned ones are the same type, so whatever consumes
+    dynamics (losses, metrics, rollouts, controllers) cannot tell them apart. The functions take arrays, or lists of
     numbers, and refuse in one line (InputError) what is no state of one system.
     """
 
@@ -34,37 +35,35 @@ class Dynamics(NamedTuple):
     forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, tau) -> qdd [d]."""
     energy: Callable[[VectorLike, VectorLike], Array]
-    """(q, qd) -> T + V, scalar; raises InputError for a model that comes from no energy (`has_energy` says so)."""
+    """(q, qd) -> T + V, scalar."""
     mass_matrix: Callable[..., Array]
     """(q, qd=None) -> M [d, d], by default at rest, qd = 0: of a natural system M depends on q alone, of any other
-    energy on qd too. Raises as `energy` does."""
+    energy on qd too."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
-    """(q, qd, qdd) -> inertial, Coriolis and gravity force; friction is no part of it where a model knows it apart."""
-    hamiltonian: Callable[[VectorLike, VectorLike], Array] | None = None
-    """(q, p) -> H, scalar; `None` for a model that is not Hamiltonian."""
-    friction: Callable[[VectorLike, VectorLike], Array] | None = None
-    """(q, qd) -> the force dD/dqd [d] that friction takes; `None` without friction, or where it is not known apart."""
-
-    @property
-    def has_energy(self) -> bool:
-        """Whether there are an energy and a mass matrix."""
-        return self.energy is not no_energy
+    """(q, qd, qdd) -> inertial, Coriolis and gravity force, without friction."""
+    friction: Callable[[VectorLike, VectorLike], Array]
+    """(q, qd) -> the force dD/dqd [d] that friction takes; zero without friction."""
 
 
-def no_energy(*state: VectorLike, **named: VectorLike) -> Array:
-    """Energy and mass matrix of a model that comes from no energy: raises InputError."""
-    raise InputError("the model comes from no energy: it has no mass matrix either; take another model to ask for them")
+class PlainDynamics(NamedTuple):
+    """What answers without an energy, and has no mass matrix either; otherwise as `Dynamics`."""
+
+    inverse_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
+    """(q, qd, qdd) -> tau [d]."""
+    forward_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
+    """(q, qd, tau) -> qdd [d]."""
+    decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
+    """(q, qd, qdd) -> inertial, Coriolis and gravity force; friction counts as Coriolis force."""
 
 
 def make_dynamics(
     *,
     inverse_dynamics: Callable[..., Array],
     forward_dynamics: Callable[..., Array],
+    energy: Callable[..., Array],
+    mass_matrix: Callable[..., Array],
     decompose: Callable[..., Decomposition],
-    energy: Callable[..., Array] | None = None,
-    mass_matrix: Callable[..., Array] | None = None,
-    hamiltonian: Callable[..., Array] | None = None,
-    friction: Callable[..., Array] | None = None,
+    dissipation: Dissipation | None = None,
     degrees_of_freedom: int | None = None,
 ) -> Dynamics:
     """Dynamics whose functions convert their arguments or refuse them, from functions of vectors [d] of one type.
@@ -72,31 +71,57 @@ def make_dynamics(
     Args:
         inverse_dynamics: as in `Dynamics`, and so are the others.
         forward_dynamics: (q, qd, tau) -> qdd.
+        energy: (q, qd) -> scalar.
+        mass_matrix: (q, qd) -> M, called with qd = 0 where the caller gives none.
         decompose: (q, qd, qdd) -> parts.
-        energy: (q, qd) -> scalar; `None` for a model that comes from no energy.
-        mass_matrix: (q, qd) -> M, called with qd = 0 where the caller gives none; `None` as above.
-        hamiltonian: (q, p) -> H.
-        friction: (q, qd) -> force.
+        dissipation: (q, qd) -> Rayleigh function; `None` without friction.
         degrees_of_freedom: d; without it the arguments of a call need to agree with one another only.
     """
     d = degrees_of_freedom
 
     def mass_matrix_or_at_rest(q, qd=None):
-        assert mass_matrix is not None
         if qd is None:
             (q,) = vectors(d, q=q)
             return mass_matrix(q, jnp.zeros_like(q))
         return mass_matrix(*vectors(d, q=q, qd=qd))
 
+    def friction(q, qd):
+        q, qd = vectors(d, q=q, qd=qd)
+        return jnp.zeros_like(qd) if dissipation is None else friction_force(dissipation, q, qd)
+
+    plain = make_plain_dynamics(
+        inverse_dynamics=inverse_dynamics,
+        forward_dynamics=forward_dynamics,
+        decompose=decompose,
+        degrees_of_freedom=d,
+    )
     return Dynamics(
+        **plain._asdict(),
+        energy=lambda q, qd: energy(*vectors(d, q=q, qd=qd)),
+        mass_matrix=mass_matrix_or_at_rest,
+        friction=friction,
+    )
+
+
+def make_plain_dynamics(
+    *,
+    inverse_dynamics: Callable[..., Array],
+    forward_dynamics: Callable[..., Array],
+    decompose: Callable[..., Decomposition],
+    degrees_of_freedom: int | None = None,
+) -> PlainDynamics:
+    """Dynamics without an energy; arguments as those of `make_dynamics`."""
+    d = degrees_of_freedom
+    return PlainDynamics(
         inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(*vectors(d, q=q, qd=qd, qdd=qdd)),
         forward_dynamics=lambda q, qd, tau: forward_dynamics(*vectors(d, q=q, qd=qd, tau=tau)),
-        energy=no_energy if energy is None else lambda q, qd: energy(*vectors(d, q=q, qd=qd)),
-        mass_matrix=no_energy if mass_matrix is None else mass_matrix_or_at_rest,
         decompose=lambda q, qd, qdd: decompose(*vectors(d, q=q, qd=qd, qdd=qdd)),
-        hamiltonian=hamiltonian and (lambda q, p: hamiltonian(*vectors(d, q=q, p=p))),
-        friction=friction and (lambda q, qd: friction(*vectors(d, q=q, qd=qd))),
     )
+
+
+def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
+    """Generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
+    return jax.grad(D, argnums=1)(q, qd)
 
 
 def decompose_by_differences(

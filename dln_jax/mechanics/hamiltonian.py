@@ -14,13 +14,13 @@ natural system, whose inverse mass matrix is given by its factor, needs two tria
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
-from dln_jax.mechanics.lagrangian import friction_force
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, friction_force, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Hamiltonian, Scalar, Vector, require_positive
 
@@ -30,6 +30,19 @@ Guess = Callable[[Array, Array], Array]
 """(q, slope [d]) -> where a Newton iteration starts [d]."""
 MOST_STEPS = 30
 """Newton steps after which the Legendre transform is given up, and NaN."""
+
+
+class HamiltonianSystem(NamedTuple):
+    """The energies of any Hamiltonian system, as functions of one state, and how its momenta are found."""
+
+    hamiltonian: Hamiltonian
+    """(q, p) -> H, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar."""
+    iterations: int | None = None
+    """Newton steps to p(q, qd), as for `conjugate`; Hamilton's equations need none."""
+    initial_guess: Guess | None = None
+    """(q, qd) -> p [d] where they start; zero by default."""
 
 
 def velocity(H: Hamiltonian, q: Vector, p: Vector) -> Vector:
@@ -165,18 +178,9 @@ lagrangian_from_hamiltonian = legendre
 """H(q, p) -> L(q, qd), solving dH/dp = qd for p."""
 
 
-def dynamics(
-    H: Hamiltonian,
-    *,
-    dissipation: Dissipation | None = None,
-    iterations: int | None = None,
-    initial_guess: Guess | None = None,
-    degrees_of_freedom: int | None = None,
-) -> Dynamics:
-    """All functions of the system at once, of (q, qd); `iterations` and `initial_guess` as for `conjugate`.
-
-    With `degrees_of_freedom` they refuse states of another size; H itself does not say what it is a function of.
-    """
+def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """All functions of the system at once, of (q, qd); with `degrees_of_freedom` they refuse states of another size."""
+    H, dissipation, iterations, initial_guess = system
     _require_iterations(iterations)
 
     def momentum(q: Vector, qd: Vector) -> Vector:
@@ -205,7 +209,6 @@ def dynamics(
         energy=lambda q, qd: H(q, momentum(q, qd)),
         mass_matrix=lambda q, qd: solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype)),
         decompose=lambda q, qd, qdd: decompose_by_differences(frictionless, q, qd, qdd),
-        hamiltonian=H,
-        friction=dissipation and functools.partial(friction_force, dissipation),
+        dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -8,13 +8,23 @@ A mass matrix that is singular gives non-finite accelerations rather than a regu
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences, make_dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences, friction_force, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
+
+
+class LagrangianSystem(NamedTuple):
+    """The energies of any Lagrangian system, as functions of one state."""
+
+    lagrangian: Lagrangian
+    """(q, qd) -> L, scalar."""
+    dissipation: Dissipation | None = None
+    """(q, qd) -> Rayleigh function D, scalar; friction enters only where there is one."""
 
 
 def momentum(L: Lagrangian, q: Vector, qd: Vector) -> Vector:
@@ -50,18 +60,9 @@ def decompose(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Decompositio
     return decompose_by_differences(functools.partial(inverse_dynamics, L), q, qd, qdd)
 
 
-def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
-    """Generalised force dD/dqd [d] that overcomes friction, for a Rayleigh function D(q, qd)."""
-    return jax.grad(D, argnums=1)(q, qd)
-
-
-def dynamics(
-    L: Lagrangian, *, dissipation: Dissipation | None = None, degrees_of_freedom: int | None = None
-) -> Dynamics:
-    """All functions of the system at once; friction enters only where there is a Rayleigh function.
-
-    With `degrees_of_freedom` they refuse states of another size; L itself does not say what it is a function of.
-    """
+def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
+    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
+    L, dissipation = system
 
     def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
         tau = inverse_dynamics(L, q, qd, qdd)
@@ -77,6 +78,6 @@ def dynamics(
         energy=functools.partial(energy, L),
         mass_matrix=functools.partial(mass_matrix, L),
         decompose=functools.partial(decompose, L),
-        friction=dissipation and functools.partial(friction_force, dissipation),
+        dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

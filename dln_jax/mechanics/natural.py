@@ -6,16 +6,14 @@ The factor makes M definite by construction, gives the momentum without a deriva
 into two triangular solves. The potential is `None` where a scene has none, and is then never traced.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics
-from dln_jax.mechanics.lagrangian import friction_force
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics
 from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
-from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Matrix, Potential, Scalar, Vector
+from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, Matrix, Potential, Scalar, Vector
 
 
 class NaturalSystem(NamedTuple):
@@ -37,6 +35,16 @@ def lagrangian(system: NaturalSystem) -> Lagrangian:
         return kinetic if system.potential is None else kinetic - system.potential(q)
 
     return difference
+
+
+def hamiltonian(system: NaturalSystem) -> Hamiltonian:
+    """H(q, p) = ½ |L⁻¹ p|² + V(q) of a natural system with M = L Lᵀ."""
+
+    def total(q: Vector, p: Vector) -> Scalar:
+        kinetic = 0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2)
+        return kinetic if system.potential is None else kinetic + system.potential(q)
+
+    return total
 
 
 def momentum(system: NaturalSystem, q: Vector, qd: Vector) -> Vector:
@@ -104,7 +112,7 @@ def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) ->
         energy=lambda q, qd: energy(system, q, qd),
         mass_matrix=lambda q, qd: mass_matrix(system, q, qd),
         decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
-        friction=system.dissipation and functools.partial(friction_force, system.dissipation),
+        dissipation=system.dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )
 

@@ -6,15 +6,12 @@ In coordinates and velocities they take triangular solves with the factor, where
 (`mechanics.hamiltonian`) takes a Newton iteration for the momentum. The potential is `None` where a scene has none.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics
-from dln_jax.mechanics.lagrangian import friction_force
-from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics
 from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Potential, Scalar, Vector
 
@@ -90,17 +87,6 @@ def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = Non
         energy=energy,
         mass_matrix=lambda q, qd: jax.vmap(lambda unit: mass_times(q, unit))(jnp.eye(q.shape[0], dtype=q.dtype)),
         decompose=decompose,
-        hamiltonian=hamiltonian(system),
-        friction=system.dissipation and functools.partial(friction_force, system.dissipation),
+        dissipation=system.dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )
-
-
-def from_mass_factor(system: NaturalSystem) -> Hamiltonian:
-    """H(q, p) = ½ |L⁻¹ p|² + V(q) of a natural system with M = L Lᵀ."""
-
-    def total(q: Vector, p: Vector) -> Scalar:
-        kinetic = 0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2)
-        return kinetic if system.potential is None else kinetic + system.potential(q)
-
-    return total

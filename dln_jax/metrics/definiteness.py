@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError
 
 
@@ -22,7 +22,7 @@ class Definiteness(NamedTuple):
 
 
 def definiteness(
-    dynamics: Dynamics, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
+    dynamics: Dynamics | PlainDynamics, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
 ) -> Definiteness:
     """Eigenvalues of the mass matrix at N states. Nothing is repaired: it reports, and the caller decides.
 
@@ -32,7 +32,7 @@ def definiteness(
     Raises:
         InputError: a model without a mass matrix, or no states.
     """
-    if not dynamics.has_energy:
+    if not isinstance(dynamics, Dynamics):
         raise InputError("definiteness: the model has no mass matrix; give one that comes from an energy")
     if len(q) == 0:
         raise InputError("definiteness: q has no states; give at least one row")

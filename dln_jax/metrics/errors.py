@@ -7,33 +7,38 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import Canonical, Driven, dynamics, hamiltonian_of
+from dln_jax.types import Hamiltonian
 
 DECOMPOSITION = ("inertial", "coriolis", "gravity")
 
 
-def predictions(dynamics: Dynamics, data: Trajectories, dtype) -> dict[str, np.ndarray]:
-    """What the model says of every sample: `tau`, `qdd`, and the parts of the torque, each [N, d] in float64.
+def predictions(system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None) -> dict[str, np.ndarray]:
+    """What energies say of every sample: `tau`, `qdd`, and the parts of the torque, each [N, d] in float64.
 
-    Also `tau_from_momenta` = pd + dH/dq + friction, of a Hamiltonian and recorded momenta: as published results of
-    Hamiltonian models were computed.
+    With a Hamiltonian, the given one or that of a system in momenta, and recorded momenta also `tau_from_momenta` =
+    pd + dH/dq + friction: as published results of Hamiltonian models were computed.
     """
-    H = None if data.p is None or data.pd is None else dynamics.hamiltonian
+    functions = dynamics(system)
+    if isinstance(system, Canonical):
+        H = hamiltonian_of(system)
+    recorded = () if data.p is None or data.pd is None or H is None else (data.p, data.pd)
 
     @jax.jit
     @jax.vmap
     def answer(q, qd, qdd, tau, momenta):
-        parts = dynamics.decompose(q, qd, qdd)
+        parts = functions.decompose(q, qd, qdd)
         answers = {
-            "tau": dynamics.inverse_dynamics(q, qd, qdd),
-            "qdd": dynamics.forward_dynamics(q, qd, tau),
+            "tau": functions.inverse_dynamics(q, qd, qdd),
+            "qdd": functions.forward_dynamics(q, qd, tau),
             **{f"tau_{name}": getattr(parts, name) for name in DECOMPOSITION},
         }
-        if H is not None:
-            friction = 0.0 if dynamics.friction is None else dynamics.friction(q, qd)
+        if H is not None and momenta:
+            friction = functions.friction(q, qd) if isinstance(functions, Dynamics) else 0.0
             answers["tau_from_momenta"] = hamiltonian.inverse(H, q, *momenta) + friction
         return answers
 
-    momenta = () if H is None else tuple(jnp.asarray(array, dtype) for array in (data.p, data.pd))
+    momenta = tuple(jnp.asarray(array, dtype) for array in recorded)
     answers = answer(*(jnp.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)), momenta)
     return {key: np.asarray(array, np.float64) for key, array in answers.items()}
 

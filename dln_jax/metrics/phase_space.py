@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.datasets.phase_samples import Part
+from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import adaptive_rollout
-from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import PhaseModel
+from dln_jax.models.model import Model, Parameters
 from dln_jax.types import Hamiltonian
 
 MOST_STEPS = 5_000
@@ -37,14 +37,14 @@ class Motions(NamedTuple):
 
 
 def field_rates(
-    model: PhaseModel, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
+    model: Model, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N d"]]:
     """(qd, pd) of states."""
     qd, pd = _rates(model, parameters, jnp.asarray(q), jnp.asarray(p))
     return np.asarray(qd), np.asarray(pd)
 
 
-def field_errors(model: PhaseModel, parameters: Parameters, part: Part) -> dict[str, float]:
+def field_errors(model: Model, parameters: Parameters, part: Part) -> dict[str, float]:
     """`loss`, against the measured rates, and `clean_field_mse`, against the exact field at the measured states."""
     data = part.data
     assert data.p is not None and data.pd is not None
@@ -57,7 +57,7 @@ def field_errors(model: PhaseModel, parameters: Parameters, part: Part) -> dict[
 
 
 def predict(
-    model: PhaseModel,
+    model: Model,
     parameters: Parameters,
     q: Float[np.ndarray, "K d"],
     p: Float[np.ndarray, "K d"],
@@ -127,13 +127,13 @@ def motion_errors(
 
 # Compiled once for each model, whatever its parameters.
 @functools.partial(jax.jit, static_argnames=("model",))
-def _rates(model: PhaseModel, parameters, q, p):
-    return jax.vmap(model.apply(parameters).rates)(q, p)
+def _rates(model: Model, parameters, q, p):
+    return jax.vmap(flow(model.energies(parameters)).rates)(q, p)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "tolerance"))
-def _motions(model: PhaseModel, parameters, q, p, t, tolerance: float):
-    rates = model.apply(parameters).rates
+def _motions(model: Model, parameters, q, p, t, tolerance: float):
+    rates = flow(model.energies(parameters)).rates
 
     def motion(q, p):
         return adaptive_rollout(lambda t, state: rates(*state), (q, p), t, tolerance=tolerance, max_steps=MOST_STEPS)

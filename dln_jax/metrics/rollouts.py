@@ -19,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.integrators import advance, rk4
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
@@ -36,7 +36,7 @@ class Motion(NamedTuple):
 
 
 def follow(
-    dynamics: Dynamics,
+    dynamics: Dynamics | PlainDynamics,
     q0: Vector,
     qd0: Vector,
     tau: Float[Array, "T d"],
@@ -63,7 +63,7 @@ def follow(
 
 
 def recorded_motions(
-    dynamics: Dynamics,
+    dynamics: Dynamics | PlainDynamics,
     data: Trajectories,
     *,
     torques: Sequence[Torque] = ("held", "interpolated"),
@@ -170,7 +170,7 @@ def energy_error(
 
 
 def rollout_metrics(
-    dynamics: Dynamics,
+    dynamics: Dynamics | PlainDynamics,
     data: Trajectories,
     *,
     substeps: int = 20,
@@ -193,7 +193,7 @@ def rollout_metrics(
         "rollout_seconds": float(np.mean(durations)),
         "normalised_state_error": normalised_state_error(data, interpolated),
     }
-    if dynamics.has_energy:
+    if isinstance(dynamics, Dynamics):
         metrics["energy_error_j"] = energy_error(dynamics.energy, interpolated, dtype=dtype)
     return metrics
 
@@ -209,7 +209,7 @@ def _slopes(tau: Float[Array, "T d"], t: Float[Array, " T"], torque: Torque) -> 
     return jnp.where(durations > 0, changes / jnp.where(durations > 0, durations, 1.0), 0.0)
 
 
-def _drive(dynamics: Dynamics, q0, qd0, tau, slopes, durations, substeps: int) -> Motion:
+def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, substeps: int) -> Motion:
     """RK4 through intervals with torque tau[k] + slopes[k] s, s from the interval's start; work is a third state."""
 
     def interval(state, drive):
@@ -228,9 +228,9 @@ def _drive(dynamics: Dynamics, q0, qd0, tau, slopes, durations, substeps: int) -
     return Motion(*(jnp.concatenate([first[None], rest]) for first, rest in zip(start, later, strict=True)))
 
 
-def _power(dynamics: Dynamics, q: Vector, qd: Vector, tau: Vector) -> Scalar:
+def _power(dynamics: Dynamics | PlainDynamics, q: Vector, qd: Vector, tau: Vector) -> Scalar:
     """qdᵀ (tau - friction), which is dE/dt."""
-    return qd @ tau if dynamics.friction is None else qd @ (tau - dynamics.friction(q, qd))
+    return qd @ (tau - dynamics.friction(q, qd)) if isinstance(dynamics, Dynamics) else qd @ tau
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:

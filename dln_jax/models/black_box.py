@@ -14,8 +14,7 @@ import haiku as hk
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.models.delan import viscous_dissipation
 from dln_jax.models.features import joint_features
 from dln_jax.models.model import Model, Parameters
@@ -54,15 +53,13 @@ def make_black_box_lagrangian(
     )
     q = jnp.zeros(needs.degrees_of_freedom, dtype)
 
-    def apply(parameters: Parameters) -> Dynamics:
+    def energies(parameters: Parameters) -> LagrangianSystem:
         energy, dissipation = networks.apply
-        return lagrangian.dynamics(
-            functools.partial(energy, parameters),
-            dissipation=dissipation and functools.partial(dissipation, parameters),
-            degrees_of_freedom=needs.degrees_of_freedom,
+        return LagrangianSystem(
+            functools.partial(energy, parameters), dissipation and functools.partial(dissipation, parameters)
         )
 
-    return Model(init=lambda key: networks.init(key, q, q), apply=apply)
+    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
 
 
 def energy_networks(

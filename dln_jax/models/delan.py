@@ -17,7 +17,6 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics import natural
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.features import joint_features
 from dln_jax.models.model import Model, Parameters
@@ -54,7 +53,7 @@ def make_delan(
     )
     q = jnp.zeros(needs.degrees_of_freedom, dtype)
 
-    def system(parameters: Parameters) -> NaturalSystem:
+    def energies(parameters: Parameters) -> NaturalSystem:
         cholesky, potential, dissipation = networks.apply
         return NaturalSystem(
             cholesky=functools.partial(cholesky, parameters),
@@ -62,10 +61,7 @@ def make_delan(
             dissipation=dissipation and functools.partial(dissipation, parameters),
         )
 
-    return Model(
-        init=lambda key: networks.init(key, q, q),
-        apply=lambda parameters: natural.dynamics(system(parameters), degrees_of_freedom=needs.degrees_of_freedom),
-    )
+    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
 
 
 def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:

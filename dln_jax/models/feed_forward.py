@@ -12,10 +12,10 @@ import haiku as hk
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, make_dynamics
+from dln_jax.mechanics.plain import InverseForward
 from dln_jax.models.black_box import Scale, per_coordinate
 from dln_jax.models.features import joint_features, unsaturated
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Needs, Vector, require_positive
 
@@ -32,8 +32,6 @@ def make_feed_forward(
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
     """The (init, apply) pair of the two networks.
-
-    The force decomposition is that of differences of the inverse network, so friction counts as Coriolis force.
 
     Args:
         needs: what the scene needs; decides features. Forces are not told apart, so that an absent one leaves
@@ -71,13 +69,7 @@ def make_feed_forward(
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
 
-    def apply(parameters: Parameters) -> Dynamics:
-        inverse, forward = (functools.partial(function, parameters) for function in networks.apply)
-        return make_dynamics(
-            inverse_dynamics=inverse,
-            forward_dynamics=forward,
-            decompose=functools.partial(decompose_by_differences, inverse),
-            degrees_of_freedom=needs.degrees_of_freedom,
-        )
-
-    return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), apply=apply)
+    return Model(
+        init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)),
+        energies=lambda parameters: InverseForward(*(functools.partial(each, parameters) for each in networks.apply)),
+    )

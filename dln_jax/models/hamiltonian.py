@@ -4,8 +4,7 @@ Networks"; the structured one as in Lutter and Peters 2021, who let a network gi
     structured:  H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:   H = network([features(q), p / momentum_scale])
 
-Both answer in coordinates and velocities as every model does; `Dynamics.hamiltonian` is H(q, p) itself, which
-`mechanics.hamiltonian` turns into Hamilton's equations.
+`mechanics.equations.flow` turns both into Hamilton's equations, and `dynamics` into those in velocities.
 """
 
 import functools
@@ -13,9 +12,7 @@ import functools
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics import hamiltonian, natural_hamiltonian
-from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.mechanics.hamiltonian import Guess
+from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.models.black_box import Scale, energy_networks
 from dln_jax.models.delan import structured_networks
@@ -52,16 +49,15 @@ def make_structured_hamiltonian(
     networks = structured_networks(needs, width, depth, activation, diagonal_shift, diagonal_floor)
     q = jnp.zeros(needs.degrees_of_freedom, dtype)
 
-    def apply(parameters: Parameters) -> Dynamics:
+    def energies(parameters: Parameters) -> NaturalHamiltonian:
         factor, potential, dissipation = networks.apply
-        system = NaturalHamiltonian(
+        return NaturalHamiltonian(
             inverse_factor=functools.partial(factor, parameters),
             potential=potential and functools.partial(potential, parameters),
             dissipation=dissipation and functools.partial(dissipation, parameters),
         )
-        return natural_hamiltonian.dynamics(system, degrees_of_freedom=needs.degrees_of_freedom)
 
-    return Model(init=lambda key: networks.init(key, q, q), apply=apply)
+    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
 
 
 def make_black_box_hamiltonian(
@@ -77,8 +73,8 @@ def make_black_box_hamiltonian(
 ) -> Model:
     """The (init, apply) pair of a black-box Hamiltonian network.
 
-    Hamilton's equations, `mechanics.hamiltonian.time_derivative(dynamics.hamiltonian, q, p, tau)`, need no momentum
-    solve and hold for any parameters. The functions of (q, qd) need one, which an untrained network may not have.
+    Hamilton's equations need no momentum solve and hold for any parameters. The functions of (q, qd) need one, which
+    an untrained network may not have.
 
     Args:
         needs: what the scene needs; decides features and friction. One network is the whole Hamiltonian, so that
@@ -100,14 +96,13 @@ def make_black_box_hamiltonian(
     )
     q = jnp.zeros(needs.degrees_of_freedom, dtype)
 
-    def apply(parameters: Parameters) -> Dynamics:
+    def energies(parameters: Parameters) -> HamiltonianSystem:
         energy, dissipation = networks.apply
-        return hamiltonian.dynamics(
+        return HamiltonianSystem(
             functools.partial(energy, parameters),
-            dissipation=dissipation and functools.partial(dissipation, parameters),
-            iterations=iterations,
-            initial_guess=initial_guess,
-            degrees_of_freedom=needs.degrees_of_freedom,
+            dissipation and functools.partial(dissipation, parameters),
+            iterations,
+            initial_guess,
         )
 
-    return Model(init=lambda key: networks.init(key, q, q), apply=apply)
+    return Model(init=lambda key: networks.init(key, q, q), energies=energies)

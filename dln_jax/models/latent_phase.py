@@ -11,7 +11,7 @@ four layers, the hidden ones residual:
 
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
-The rates are those of an energy of one coordinate, or of the baseline's network: any `PhaseModel`. Latent time is
+The rates are those of an energy of one coordinate, or of the baseline's network: any `Model`. Latent time is
 counted in frames. Pictures enter and leave as differences from their mean, by their typical size.
 """
 
@@ -27,18 +27,16 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.flow import Flow, PlainFlow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
-from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import (
-    PhaseField,
-    PhaseModel,
-    hamiltonian_phase_model,
-    make_phase_field,
-    make_phase_network,
-)
+from dln_jax.models.model import Model, Parameters
+from dln_jax.models.phase_network import make_phase_network
 from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
-from dln_jax.types import InputError, Needs, Scalar, require_positive
+from dln_jax.types import InputError, Needs, require_positive
 
 NEEDS = Needs(joints=("prismatic",))
 """Of the latent plane: z_q is a number, not an angle, and nothing is applied to it or lost."""
@@ -55,7 +53,7 @@ class LatentPhase(NamedTuple):
     """Two frames [n] -> (z_q, z_p), each [1]."""
     decode: Callable[[Array, Array], Array]
     """(z_q, z_p) -> two frames [n]."""
-    field: PhaseField
+    field: Flow | PlainFlow
     """(z_q, z_p) -> rates per frame; with an energy for "hnn"."""
 
 
@@ -66,7 +64,7 @@ class LatentModel(NamedTuple):
     """Random key -> parameters: a dictionary of "encoder", "decoder" and "field"."""
     apply: Callable[[Parameters], LatentPhase]
     """Parameters -> functions."""
-    field: PhaseModel
+    field: Model
     """What moves in the latent plane; `parameters["field"]` are its parameters."""
 
 
@@ -78,7 +76,7 @@ def latent_field(
     activation: Activation = tanh,
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
-) -> PhaseModel:
+) -> Model:
     """A black-box energy ("hnn"), or a network for the rates ("baseline"), of one coordinate.
 
     Args:
@@ -96,35 +94,33 @@ def latent_field(
         raise InputError(f"field is '{kind}'; expected one of {', '.join(FIELDS)}")
     size: dict[str, Any] = {"width": width, "depth": depth, "activation": activation, "dtype": dtype}
     if kind == "hnn":
-        return _slowed(hamiltonian_phase_model(make_black_box_hamiltonian(NEEDS, **size)), momentum_scale)
+        return _slowed(make_black_box_hamiltonian(NEEDS, **size), momentum_scale)
     return _slowed(make_phase_network(NEEDS, **size), momentum_scale)
 
 
-def _slowed(model: PhaseModel, rate: float) -> PhaseModel:
+def _slowed(model: Model, rate: float) -> Model:
     """A model whose states and rates are about one, for motions that take 1 / rate frames for what takes it one.
 
     With P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
     """
 
-    def apply(parameters: Parameters) -> PhaseField:
-        inner = model.apply(parameters)
-        H = inner.energy
-
-        def energy(q: Latent, p: Latent) -> Scalar:
-            assert H is not None
-            return rate**2 * H(q, p / rate)
+    def energies(parameters: Parameters) -> HamiltonianSystem | PhaseRates:
+        inner = model.energies(parameters)
+        if isinstance(inner, HamiltonianSystem):
+            return HamiltonianSystem(lambda q, p: rate**2 * inner.hamiltonian(q, p / rate))
+        assert isinstance(inner, PhaseRates)
 
         def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
             qd, pd = inner.rates(q, p / rate)
             return rate * qd, rate**2 * pd
 
-        return make_phase_field(rates, energy if H is not None else None, degrees_of_freedom=1)
+        return PhaseRates(rates)
 
-    return PhaseModel(model.init, apply)
+    return Model(model.init, energies)
 
 
 def make_latent_phase(
-    field: PhaseModel,
+    field: Model,
     mean: Float[np.ndarray, " n"],
     *,
     framewise: bool = False,
@@ -187,7 +183,7 @@ def make_latent_phase(
         return LatentPhase(
             functools.partial(encoder.apply, parameters["encoder"]),
             functools.partial(decoder.apply, parameters["decoder"]),
-            field.apply(parameters["field"]),
+            flow(field.energies(parameters["field"]), degrees_of_freedom=1),
         )
 
     return LatentModel(init, apply, field)

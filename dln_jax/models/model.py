@@ -1,24 +1,22 @@
-"""What every model of the zoo is: a pair of pure functions."""
+"""What every model of the zoo is: parameters, and the energies that they give."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Dynamics
-
 Parameters = Any
 """A pytree of arrays."""
 
 
 class Model(NamedTuple):
-    """An energy with parameters, as an (init, apply) pair.
+    """Energies with parameters, as a pair of pure functions.
 
-    `apply` closes the parameters over, so that a trained model and a textbook system are the same type and run
-    through the same mechanics.
+    `energies` closes the parameters over, so that a trained model and a textbook system are the same type and run
+    through the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
     """
 
     init: Callable[[Array], Parameters]
     """Random key -> parameters."""
-    apply: Callable[[Parameters], Dynamics]
-    """Parameters -> dynamics of one state."""
+    energies: Callable[[Parameters], Any]
+    """Parameters -> a record of energies, one of `mechanics.equations.System`, as functions of one state."""

@@ -20,8 +20,6 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics import natural_hamiltonian
-from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.models.model import Model, Parameters
 from dln_jax.nn.activations import Activation, tanh
@@ -93,11 +91,10 @@ def make_pairwise_hamiltonian(
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
 
-    def apply(parameters: Parameters) -> Dynamics:
-        factor, energy = (functools.partial(function, parameters) for function in networks.apply)
-        system = NaturalHamiltonian(inverse_factor=factor, potential=energy)
-        return natural_hamiltonian.dynamics(system, degrees_of_freedom=bodies * dimension)
+    def energies(parameters: Parameters) -> NaturalHamiltonian:
+        factor, potential = (functools.partial(function, parameters) for function in networks.apply)
+        return NaturalHamiltonian(factor, potential)
 
     # Where the parameters are made all bodies stand apart, so that no feature is infinite.
     start = np.arange(bodies * dimension)
-    return Model(init=lambda key: networks.init(key, jnp.asarray(start, dtype)), apply=apply)
+    return Model(init=lambda key: networks.init(key, jnp.asarray(start, dtype)), energies=energies)

@@ -18,8 +18,8 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from dln_jax.models.model import Parameters
-from dln_jax.models.phase_field import PhaseField, PhaseModel, phase_field
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs, Scalar, Vector
 
 MOST_TERMS = 5_000
@@ -34,7 +34,7 @@ class _Choice(NamedTuple):
     """In the table of that variable's functions."""
 
 
-def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> PhaseModel:
+def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> Model:
     """The (init, apply) pair; parameters are the vector c, and start at zero.
 
     Args:
@@ -82,7 +82,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
             product *= table(False, p[j])[terms[:, d + j]]
         return product
 
-    def apply(parameters: Parameters) -> PhaseField:
-        return phase_field(lambda q, p: jnp.dot(parameters, values(q, p)), degrees_of_freedom=d)
+    def energies(parameters: Array) -> HamiltonianSystem:
+        return HamiltonianSystem(lambda q, p: jnp.dot(parameters, values(q, p)))
 
-    return PhaseModel(init=lambda key: jnp.zeros(len(terms), dtype), apply=apply)
+    return Model(init=lambda key: jnp.zeros(len(terms), dtype), energies=energies)

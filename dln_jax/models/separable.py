@@ -12,9 +12,7 @@ import haiku as hk
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics import hamiltonian
-from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.mechanics.hamiltonian import Guess
+from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.models.black_box import Scale, per_coordinate
 from dln_jax.models.delan import viscous_dissipation
 from dln_jax.models.features import joint_features
@@ -36,8 +34,8 @@ def make_separable_hamiltonian(
 ) -> Model:
     """The (init, apply) pair of T(p) + V(q).
 
-    Hamilton's equations, `mechanics.hamiltonian.time_derivative(dynamics.hamiltonian, q, p, tau)`, need no momentum
-    solve and hold for any parameters. The functions of (q, qd) need one, which an untrained network may not have.
+    Hamilton's equations need no momentum solve and hold for any parameters. The functions of (q, qd) need one, which
+    an untrained network may not have.
 
     Args:
         needs: what the scene needs; decides features, friction, and whether there is a V.
@@ -80,19 +78,14 @@ def make_separable_hamiltonian(
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
 
-    def apply(parameters: Parameters) -> Dynamics:
+    def energies(parameters: Parameters) -> HamiltonianSystem:
         kinetic, potential, dissipation = networks.apply
 
         def total(q: Vector, p: Vector) -> Scalar:
             energy = kinetic(parameters, p)
             return energy if potential is None else energy + potential(parameters, q)
 
-        return hamiltonian.dynamics(
-            total,
-            dissipation=dissipation and functools.partial(dissipation, parameters),
-            iterations=iterations,
-            initial_guess=initial_guess,
-            degrees_of_freedom=needs.degrees_of_freedom,
-        )
+        friction = dissipation and functools.partial(dissipation, parameters)
+        return HamiltonianSystem(total, friction, iterations, initial_guess)
 
-    return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), apply=apply)
+    return Model(init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)), energies=energies)

@@ -22,10 +22,9 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float, Int
 
-from dln_jax.mechanics.dynamics import Decomposition, make_dynamics
+from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.models.model import Model
-from dln_jax.solvers import elimination
-from dln_jax.types import InputError, JointKind, Matrix, Needs, Scalar, Vector
+from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 MOST_COEFFICIENTS = 20_000
 """Of the mass matrix; the basis grows exponentially with the joints, and the fit with its square."""
@@ -98,7 +97,7 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
             friction=jnp.zeros(d, dtype) if needs.friction else None,
         )
 
-    return Model(init, lambda parameters: _dynamics(parameters, entry, mass_basis, potential_basis))
+    return Model(init, lambda parameters: _closed_form(parameters, entry, mass_basis, potential_basis))
 
 
 def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
@@ -141,49 +140,21 @@ def _degrees(degree: int | tuple[int, ...], d: int) -> tuple[int, ...]:
     return degrees
 
 
-def _dynamics(parameters: TrigonometricParameters, entry: Int[np.ndarray, "d d"], mass_basis, potential_basis):
-    """Closed forms: half the time of differentiating the energy, in which M is a second derivative."""
+def _closed_form(
+    parameters: TrigonometricParameters, entry: Int[np.ndarray, "d d"], mass_basis, potential_basis
+) -> ClosedForm:
     coefficients, potential, friction = parameters.mass[entry], parameters.potential, parameters.friction
 
-    def mass_matrix(q: Vector, qd: Vector | None = None) -> Matrix:
-        return coefficients @ mass_basis(q).values
-
-    def coriolis(slopes: Array, qd: Vector) -> Vector:
+    def coriolis(q: Vector, qd: Vector) -> Vector:
+        slopes = mass_basis(q).slopes
         kinetic = 0.5 * jnp.einsum("i,ijl,j->l", qd, coefficients, qd)
         return (coefficients @ (qd @ slopes)) @ qd - slopes @ kinetic
 
-    def gravity(q: Vector) -> Vector:
-        return potential_basis(q).slopes[:, 1:] @ potential
-
-    def inverse_dynamics(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        values, slopes = mass_basis(q)
-        tau = (coefficients @ values) @ qdd + coriolis(slopes, qd)
-        if potential is not None:
-            tau += gravity(q)
-        return tau if friction is None else tau + friction * qd
-
-    def forward_dynamics(q: Vector, qd: Vector, tau: Vector) -> Vector:
-        bias = inverse_dynamics(q, qd, jnp.zeros_like(qd))
-        return elimination.solve(mass_matrix(q), tau - bias)
-
-    def energy(q: Vector, qd: Vector) -> Scalar:
-        kinetic = 0.5 * qd @ mass_matrix(q) @ qd
-        return kinetic if potential is None else kinetic + potential_basis(q).values[1:] @ potential
-
-    def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-        values, slopes = mass_basis(q)
-        return Decomposition(
-            inertial=(coefficients @ values) @ qdd,
-            coriolis=coriolis(slopes, qd),
-            gravity=jnp.zeros_like(q) if potential is None else gravity(q),
-        )
-
-    return make_dynamics(
-        inverse_dynamics=inverse_dynamics,
-        forward_dynamics=forward_dynamics,
-        energy=energy,
-        mass_matrix=mass_matrix,
-        decompose=decompose,
+    return ClosedForm(
+        mass_matrix=lambda q: coefficients @ mass_basis(q).values,
+        coriolis=coriolis,
+        potential=None if potential is None else lambda q: potential_basis(q).values[1:] @ potential,
+        gravity=None if potential is None else lambda q: potential_basis(q).slopes[:, 1:] @ potential,
+        dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
         friction=None if friction is None else lambda q, qd: friction * qd,
-        degrees_of_freedom=len(entry),
     )

@@ -11,6 +11,7 @@ from rich.table import Table
 from dln_jax.files import write_json
 from dln_jax.learning.dynamics_fit import train
 from dln_jax.learning.engine.runs import Training
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_results import Task, latency_of
 from dln_jax.zoo.kinds import build
@@ -68,7 +69,7 @@ def _try(task: Task, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Tr
     training = train(
         model, task.sets, task.settings, objective=task.objective, directory=folder, name=name, resume=resume
     )
-    system = compiled(model.apply(training.parameters), data_type(task.settings.precision))
+    system = compiled(dynamics(model.energies(training.parameters)), data_type(task.settings.precision))
     candidate = Candidate(
         width=wanted["width"],
         depth=wanted["depth"],

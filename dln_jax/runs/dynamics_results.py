@@ -15,17 +15,17 @@ from dln_jax.files import write_figure
 from dln_jax.learning.dynamics_fit import Settings
 from dln_jax.learning.engine.runs import Training
 from dln_jax.learning.objectives import Objective
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.precision import data_type
 from dln_jax.scenes.scene import Scene
-from dln_jax.scenes.scene import dynamics as scene_dynamics
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_run
+from dln_jax.zoo.load import load_run, load_system
 
 
 class Task(NamedTuple):
@@ -48,24 +48,24 @@ class Task(NamedTuple):
 def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
     """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
     dtype = data_type(task.settings.precision)
-    dynamics = load_run(folder)
+    functions = load_run(folder)
     test = task.sets.test
-    predicted = predictions(dynamics, test, dtype)
-    latency = latency_of(dynamics, task)
+    predicted = predictions(load_system(folder), test, dtype)
+    latency = latency_of(functions, task)
     if draw:
         draw_figures(folder, task, training, predicted)
     every = range(seeds) if seeds > 1 else ()
     model = build(task.description)
     of_seeds = [
-        errors(predictions(model.apply(parameters_of(training, index)), test, dtype), test)["torque_mse"]
+        errors(predictions(model.energies(parameters_of(training, index)), test, dtype), test)["torque_mse"]
         for index in every
     ]
     spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items() if seeds > 1}
     return {
         **errors(predicted, test),
         **spread,
-        **definiteness_metrics(dynamics, task),
-        **rollouts(dynamics, task),
+        **definiteness_metrics(functions, task),
+        **rollouts(functions, task),
         **({"validation_error": float(np.min(training.validation))} if training.history else {}),
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
         "steps": training.stop.step,
@@ -94,10 +94,10 @@ def parameters_of(training: Training, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], training.parameters)
 
 
-def latency_of(dynamics: Dynamics, task: Task, *, calls: int = 5000) -> Latency:
+def latency_of(functions: Dynamics | PlainDynamics, task: Task, *, calls: int = 5000) -> Latency:
     """Of one inverse-dynamics call."""
     states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
-    return one_step(dynamics.inverse_dynamics, states, calls=calls)
+    return one_step(functions.inverse_dynamics, states, calls=calls)
 
 
 def latency_states(task: Task) -> tuple[np.ndarray, ...]:
@@ -106,16 +106,16 @@ def latency_states(task: Task) -> tuple[np.ndarray, ...]:
     return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
 
 
-def definiteness_of(dynamics: Dynamics, task: Task, data: Trajectories) -> Definiteness | None:
+def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
     """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
     if not task.kind.startswith(("black-box", "trigonometric")):
         return None
-    return definiteness(dynamics, data.q, data.qd)
+    return definiteness(functions, data.q, data.qd)
 
 
-def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
+def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
     """What the mass matrices of a model without structure are like on the test."""
-    found = definiteness_of(dynamics, task, task.sets.test)
+    found = definiteness_of(functions, task, task.sets.test)
     if found is None:
         return {}
     return {
@@ -125,7 +125,7 @@ def definiteness_metrics(dynamics: Dynamics, task: Task) -> dict[str, float]:
     }
 
 
-def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
+def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
     """Valid prediction times on the test, and the true plant's as their ceiling where the scene is known.
 
     None for independent states, which are no motion.
@@ -134,14 +134,14 @@ def rollouts(dynamics: Dynamics, task: Task) -> dict[str, float]:
     if len(np.unique(test.trajectory)) == len(test.t):
         return {}
     try:
-        found = rollout_metrics(dynamics, test, dtype=data_type(task.settings.precision))
+        found = rollout_metrics(functions, test, dtype=data_type(task.settings.precision))
     except InputError as error:
         # The model is trained: what its test cannot tell is left out, not refused.
         print(f"no rollouts: {error}")
         return {}
     if task.scene is None:
         return found
-    plant = rollout_metrics(scene_dynamics(task.scene), test)
+    plant = rollout_metrics(dynamics(task.scene.energies), test)
     return {**found, **{ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}}
 
 

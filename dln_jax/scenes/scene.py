@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.mechanics.dynamics import Decomposition, friction_force
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import Dissipation, Lagrangian, Needs, Potential, Scalar, Vector
 
 
@@ -39,12 +39,10 @@ class Scene(NamedTuple):
         """The textbook L(q, qd) = ½ qdᵀ M(q) qd - V(q)."""
         return functools.partial(_lagrangian, self)
 
-
-def dynamics(scene: Scene) -> Dynamics:
-    """The scene's dynamics, derived from its energies by the generic mechanics."""
-    return lagrangian.dynamics(
-        scene.lagrangian, dissipation=scene.dissipation, degrees_of_freedom=scene.needs.degrees_of_freedom
-    )
+    @property
+    def energies(self) -> LagrangianSystem:
+        """The record of energies that the mechanics takes, as those of models."""
+        return LagrangianSystem(self.lagrangian, self.dissipation)
 
 
 def closed_form_decomposition(scene: Scene, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
@@ -61,7 +59,7 @@ def closed_form_inverse_dynamics(scene: Scene, q: Vector, qd: Vector, qdd: Vecto
     tau = sum(closed_form_decomposition(scene, q, qd, qdd), jnp.zeros_like(q))
     if scene.dissipation is None:
         return tau
-    return tau + lagrangian.friction_force(scene.dissipation, q, qd)
+    return tau + friction_force(scene.dissipation, q, qd)
 
 
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:

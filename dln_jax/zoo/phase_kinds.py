@@ -12,10 +12,11 @@ import numpy as np
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
+from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.models.phase_field import PhaseModel, hamiltonian_phase_model, make_dissipative, make_phase_network
+from dln_jax.models.phase_network import make_phase_network
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.separable import make_separable_hamiltonian
 from dln_jax.types import InputError, Needs
@@ -35,7 +36,7 @@ class PhaseKind(NamedTuple):
 
     energy: Callable[..., Model] | None
     """(needs, **keywords) -> Hamiltonian model; `None` for a kind that is no network of an energy."""
-    field: Callable[..., PhaseModel] | None
+    field: Callable[..., Model] | None
     """(needs, **keywords) -> phase model, where there is no `energy`."""
     scales: tuple[str, ...] = ()
     """Keywords that are typical sizes, taken from the data."""
@@ -73,7 +74,7 @@ def describe_phase(
     return {"kind": kind, "needs": needs._asdict(), "precision": precision, **keywords, **scales}
 
 
-def build_phase(description: dict[str, Any]) -> PhaseModel:
+def build_phase(description: dict[str, Any]) -> Model:
     """The model that a description stands for.
 
     Raises:
@@ -82,11 +83,11 @@ def build_phase(description: dict[str, Any]) -> PhaseModel:
     return build_by(description, PHASE_KINDS, _make)
 
 
-def _make(kind: PhaseKind, needs: Needs, *, dtype: Any, friction_width: int = 0, **keywords: Any) -> PhaseModel:
+def _make(kind: PhaseKind, needs: Needs, *, dtype: Any, friction_width: int = 0, **keywords: Any) -> Model:
     if kind.energy is None:
         assert kind.field is not None
         return kind.field(needs, dtype=dtype, **keywords)
     if needs.friction and friction_width:
         conservative = kind.energy(needs._replace(friction=False), dtype=dtype, **keywords)
         return make_dissipative(conservative, needs, width=friction_width, dtype=dtype)
-    return hamiltonian_phase_model(kind.energy(needs, dtype=dtype, **keywords))
+    return kind.energy(needs, dtype=dtype, **keywords)

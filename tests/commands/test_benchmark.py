@@ -11,6 +11,8 @@ from calls import command, refused
 
 from dln_jax.commands import benchmark
 from dln_jax.figures.benchmarks import curves, panels, points
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.natural import lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.delan import make_delan
@@ -31,9 +33,10 @@ from dln_jax.zoo.load import save_model
 
 def test_the_full_hessian_way_gives_the_same_torques(d=2):
     model = make_delan(chain(d).needs, width=3, depth=1, dtype=jnp.float64)
-    system = model.apply(model.init(jax.random.key(0)))
+    energies = model.energies(model.init(jax.random.key(0)))
+    system = dynamics(energies)
     state = tuple(jnp.asarray(row) for row in np.random.default_rng(0).standard_normal((3, d)))
-    reference = benchmark_throughput.by_full_hessian(benchmark_throughput.lagrangian_of(system))
+    reference = benchmark_throughput.by_full_hessian(lagrangian(energies))
     np.testing.assert_allclose(jax.jit(reference)(*state), system.inverse_dynamics(*state), rtol=1e-11, atol=1e-12)
 
 

@@ -12,6 +12,8 @@ from dln_jax.commands import hnn_table, train_hnn
 from dln_jax.commands.hnn_table import TASKS
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
+from dln_jax.mechanics.equations import Energies, hamiltonian_of
+from dln_jax.mechanics.flow import Flow
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.studies.hamiltonian import measures as hnn_measures
 from dln_jax.studies.hamiltonian import pixels as pixel_task
@@ -34,10 +36,10 @@ KINDS = {
 
 
 def quick_prediction(model, parameters, q, p, t):
-    field = model.apply(parameters)
+    energies = model.energies(parameters)
     return (
-        Motions(t, *quick_motion(field.energy, q, p, t, dissipation=field.dissipation))
-        if field.energy
+        Motions(t, *quick_motion(hamiltonian_of(energies), q, p, t, dissipation=energies.dissipation))
+        if isinstance(energies, Energies)
         else Motions(t, *(np.tile(state[:, None], (1, len(t), 1)) for state in (q, p)))
     )
 
@@ -205,7 +207,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     again = load_file(folder / "model.safetensors")
     assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
     field = load_phase_field(folder)
-    assert field.energy is not None and field.dissipation is None
+    assert isinstance(field, Flow)
     qd, pd = field.rates(np.ones(1), np.ones(1))
     assert np.isfinite(qd).all() and np.isfinite(pd).all()
 
@@ -255,4 +257,4 @@ def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch
     command(train_hnn, *options, "hurried", "--seconds", "1e-6")
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
-    assert load_phase_field(positions.parent / "hurried").energy is not None
+    assert isinstance(load_phase_field(positions.parent / "hurried"), Flow)

@@ -14,11 +14,13 @@ from dln_jax.figures import animations
 from dln_jax.figures import frames as frame_figures
 from dln_jax.learning import frame_matching
 from dln_jax.learning.frame_matching import Settings, Weights, match_frames, terms, windows
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, make_latent_phase, through_components
-from dln_jax.models.phase_field import PhaseModel, phase_field
+from dln_jax.models.model import Model
 from dln_jax.models.principal_components import compress, principal_components
 from dln_jax.precision import with_float64
 from dln_jax.scenes.scene import closed_form_forward_dynamics
@@ -47,7 +49,7 @@ def quick_motions(scene, q, qd, t):
 
 def quick_predict(model, parameters, q, p, t):
     """In place of `predict`, for the same reason: RK4."""
-    step = rk4(lambda t, state: model.apply(parameters).rates(*state))
+    step = rk4(lambda t, state: flow(model.energies(parameters)).rates(*state))
     motion = jax.jit(jax.vmap(lambda q, p: rollout(step, (q, p), jnp.asarray(t), substeps=4)))
     return Motions(t, *(np.asarray(state) for state in motion(jnp.asarray(q), jnp.asarray(p))))
 
@@ -135,8 +137,8 @@ def test_estimator_recovers_states(shown, data):
 
 def oscillator(scale=1.0):
     """H = ½ p² + ½ w² q², w = 0.2 per frame, without a network; frames of one pixel are q times `scale`."""
-    H = phase_field(lambda q, p: jnp.sum(p**2 + 0.04 * q**2) / 2)
-    field = PhaseModel(lambda key: {"factor": jnp.ones(1)}, lambda parameters: H)
+    H = HamiltonianSystem(lambda q, p: jnp.sum(p**2 + 0.04 * q**2) / 2)
+    field = Model(lambda key: {"factor": jnp.ones(1)}, lambda parameters: H)
 
     def apply(parameters):
         factor = parameters["factor"]
@@ -231,12 +233,12 @@ def test_latent_motions_keep_the_energy(untrained, data):
     model, parameters = untrained
     moved = frame_metrics.predict_frames(model, parameters, data.pairs[:2, 0], 30)
     assert moved.pairs.shape == (2, 30, 2 * PIXELS) and moved.frames.shape == (2, 30, PIXELS)
-    H = model.field.apply(with_float64(parameters["field"])).energy
+    H = flow(model.field.energies(with_float64(parameters["field"]))).energy
     levels = jax.jit(jax.vmap(jax.vmap(H)))(jnp.asarray(moved.latent.q), jnp.asarray(moved.latent.p))
     assert np.ptp(levels, axis=1).max() < 1e-9 and np.ptp(moved.latent.q, axis=1).min() > 1e-3
     # The rates are those of the energy, for all that both are scaled.
     q, p = jnp.array([0.3]), jnp.array([0.1])
-    field = model.field.apply(with_float64(parameters["field"]))
+    field = flow(model.field.energies(with_float64(parameters["field"])))
     slopes = jax.jit(jax.grad(field.energy, argnums=(0, 1)))(q, p)
     rates = jax.jit(field.rates)(q, p)
     np.testing.assert_allclose(rates[0], slopes[1], rtol=1e-9)

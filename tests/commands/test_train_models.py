@@ -18,10 +18,14 @@ from dln_jax.data.splits import split
 from dln_jax.datasets import generators
 from dln_jax.learning.dynamics_fit import Settings, train
 from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
+from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.equations import hamiltonian_of
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.runs import dynamics_growth
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.studies.speed import low_latency_calls
 from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.load import load_system
 
 QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
 
@@ -103,14 +107,14 @@ def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     metrics = metrics_of(workplace / "black-box")
     assert 0 <= metrics["share_not_definite"] <= 1 and "smallest_mass_eigenvalue" in metrics
     command(train_delan, *QUICK, "--model", "feed-forward", "--out", "feed-forward")
-    assert not load_run(workplace / "feed-forward").has_energy
+    assert isinstance(load_run(workplace / "feed-forward"), PlainDynamics)
 
 
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     command(train_hnn, *QUICK, "--out", "hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
-    system = load_run(workplace / "hamiltonian")
-    assert np.isfinite(system.hamiltonian(np.ones(1), np.ones(1)))
+    H = hamiltonian_of(load_system(workplace / "hamiltonian"))
+    assert np.isfinite(H(np.ones(1), np.ones(1)))
     command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--out", "bare")
     assert "no momenta p in the data" in capsys.readouterr().out
 
@@ -179,7 +183,7 @@ def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
     from dln_jax.mechanics import hamiltonian
 
     H = hamiltonian.hamiltonian_from_lagrangian(pendulum().lagrangian)
-    plant = hamiltonian.dynamics(H, dissipation=pendulum(friction=0.2).dissipation)
+    plant = HamiltonianSystem(H, pendulum(friction=0.2).dissipation)
     errors = residuals(CANONICAL, plant, arrays(CANONICAL, data, jnp.float64))
     assert errors.shape == (120, 2) and float(jnp.abs(errors).max()) < 1e-12
 

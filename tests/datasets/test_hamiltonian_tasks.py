@@ -13,10 +13,11 @@ from dln_jax.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.datasets.phase_samples import reference_motion
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.henon_heiles import henon_heiles
 from dln_jax.scenes.mass_spring import mass_spring
 from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.scene import closed_form_inverse_dynamics, dynamics
+from dln_jax.scenes.scene import closed_form_inverse_dynamics
 from dln_jax.types import InputError
 
 SCENES = [
@@ -40,7 +41,7 @@ def test_scenes_in_closed_form_equal_the_generic_mechanics(scene):
 
     @jax.jit
     def ask():
-        system = dynamics(scene)
+        system = dynamics(scene.energies)
         return (
             (jax.grad(scene.potential)(q), scene.gravity(q)),
             (system.inverse_dynamics(q, qd, third), closed_form_inverse_dynamics(scene, q, qd, third)),

@@ -15,9 +15,11 @@ import pytest
 from dln_jax.command_line.running import run
 from dln_jax.commands import export_c as script
 from dln_jax.deploy.c import interface as c_interface
-from dln_jax.deploy.c.load import FLAGS, CFunction, compile_c, load_c
+from dln_jax.deploy.c.load import FLAGS, CDynamics, CFunction, CPlainDynamics, compile_c, load_c
 from dln_jax.deploy.c.source import export_c, source_files
 from dln_jax.deploy.exports import described, read_export, write_exports
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics, hamiltonian_of
 from dln_jax.nn import activations, differential_mlp
 from dln_jax.types import InputError
 from dln_jax.zoo.kinds import build
@@ -75,12 +77,12 @@ def relative_error(got, expected):
     return np.abs(np.asarray(got) - expected).max() / np.abs(expected).max()
 
 
-def random_states(dynamics, case, d):
+def random_states(energies, case, d):
     """q, qd and a third vector; velocities of a general Hamiltonian are those of random momenta."""
     states = np.random.default_rng(1).uniform(-1, 1, (STATES, 3, d)) * np.array([3.0, 1.0, 2.0])[:, None]
     if not case.startswith("black-box-hnn"):
         return states
-    velocity = jax.jit(jax.vmap(jax.grad(dynamics.hamiltonian, argnums=1)))
+    velocity = jax.jit(jax.vmap(jax.grad(hamiltonian_of(energies), argnums=1)))
     states[:, 1] = velocity(states[:, 0], 0.5 * states[:, 1])
     return states
 
@@ -89,15 +91,16 @@ def random_states(dynamics, case, d):
 @pytest.mark.parametrize("case", CASES)
 def test_c_equals_jax_on_random_states(case, tmp_path):
     description, parameters = random_model(case)
-    dynamics = build(description).apply(parameters)
-    states = random_states(dynamics, case, len(CASES[case][1]))
+    energies = build(description).energies(parameters)
+    model = dynamics(energies)
+    states = random_states(energies, case, len(CASES[case][1]))
 
     @jax.jit
     @jax.vmap
     def everything(state):
         q, qd, x = state
-        motion = dynamics.inverse_dynamics(q, qd, x), dynamics.forward_dynamics(q, qd, x)
-        return motion if not dynamics.has_energy else (*motion, dynamics.energy(q, qd), dynamics.mass_matrix(q, qd))
+        motion = model.inverse_dynamics(q, qd, x), model.forward_dynamics(q, qd, x)
+        return (*motion, model.energy(q, qd), model.mass_matrix(q, qd)) if isinstance(model, Dynamics) else motion
 
     expected = [np.asarray(array) for array in everything(states)]
     assert all(np.isfinite(array).all() and array.std() > 0 for array in expected[:2])
@@ -107,8 +110,8 @@ def test_c_equals_jax_on_random_states(case, tmp_path):
         flags = FLAGS if case == "delan-2-shared" else ("-O0",)
         system = load_c(tmp_path / precision, flags=(*flags, *STRICT))
         calls = [system.inverse_dynamics, system.forward_dynamics]
-        assert system.has_energy == dynamics.has_energy
-        if system.has_energy:
+        assert isinstance(system, CDynamics if isinstance(model, Dynamics) else CPlainDynamics)
+        if isinstance(system, CDynamics):
             calls += [lambda q, qd, _, f=f: f(q, qd) for f in (system.energy, system.mass_matrix)]
         for function, wanted in zip(calls, expected, strict=True):
             got = [function(*state) for state in states]

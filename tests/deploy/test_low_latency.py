@@ -12,8 +12,8 @@ import pytest
 from dln_jax.deploy import export_stablehlo as stablehlo
 from dln_jax.deploy.exports import described
 from dln_jax.deploy.low_latency import low_latency
-from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.dynamics import Decomposition
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import save_tree
@@ -95,7 +95,7 @@ def test_examples_are_needed_and_of_one_type():
 
 def test_artefacts_give_the_same_results_and_state_what_they_are(tmp_path):
     pytest.importorskip("flatbuffers", reason="jax.export writes artefacts with flatbuffers")
-    system = lagrangian.dynamics(pendulum().lagrangian)
+    system = dynamics(pendulum().energies)
     paths = stablehlo.export_dynamics(system, 1, tmp_path / "swing", dtype=jnp.float64)
     assert [path.stem for path in paths] == ["inverse_dynamics", "forward_dynamics", "energy", "mass_matrix"]
     state = np.array([0.3]), np.array([1.2]), np.array([-0.4])
@@ -170,7 +170,7 @@ def test_arguments_of_another_shape_or_type_are_refused(doubled):
 
 
 def test_an_export_refuses_what_makes_none_and_writes_nothing(doubled, tmp_path):
-    system = lagrangian.dynamics(pendulum().lagrangian)
+    system = dynamics(pendulum().energies)
     place = doubled.parent
     for wrong in ({"platforms": "cpu"}, {"platforms": ("tpux",)}, {"platforms": ()}):
         with pytest.raises(InputError, match="platforms is"):

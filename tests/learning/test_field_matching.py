@@ -9,15 +9,13 @@ from motions import quick_motion
 from dln_jax.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.learning import field_matching
 from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.flow import PlainFlow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
+from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
-from dln_jax.models.phase_field import (
-    from_dynamics,
-    hamiltonian_phase_model,
-    make_dissipative,
-    make_phase_network,
-    phase_field,
-)
+from dln_jax.models.phase_network import make_phase_network
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.separable import make_separable_hamiltonian
 from dln_jax.types import InputError, Needs
@@ -45,12 +43,13 @@ def test_friction_takes_energy_and_never_gives_it():
         leaves, tree = jax.tree.flatten(model.init(key))
         keys = jax.random.split(key, len(leaves))
         drawn = [2 * jax.random.normal(k, leaf.shape) for k, leaf in zip(keys, leaves, strict=True)]
-        field = model.apply(jax.tree.unflatten(tree, drawn))
+        energies = model.energies(jax.tree.unflatten(tree, drawn))
+        field, dissipation = flow(energies), energies.dissipation
 
         def one(q, p):
             qd, pd = field.rates(q, p)
-            loss = field.dissipation(q, qd)
-            friction = jax.grad(field.dissipation, argnums=1)(q, qd)
+            loss = dissipation(q, qd)
+            friction = jax.grad(dissipation, argnums=1)(q, qd)
             return jax.jvp(field.energy, (q, p), (qd, pd))[1], loss, qd @ friction
 
         return jax.vmap(one)(q, p)
@@ -66,9 +65,8 @@ def test_what_a_scene_lacks_is_not_built():
     parameters = jax.eval_shape(model.init, jax.random.key(0))
     free = make_dissipative(model, FREE, **SMALL)
     assert jax.tree.structure(jax.eval_shape(free.init, jax.random.key(0))) == jax.tree.structure(parameters)
-    assert phase_field(lambda q, p: jnp.sum(p**2)).dissipation is None
     baseline = make_phase_network(NEEDS, **SMALL)
-    assert baseline.apply(jax.jit(baseline.init)(jax.random.key(0))).energy is None
+    assert isinstance(flow(baseline.energies(jax.jit(baseline.init)(jax.random.key(0)))), PlainFlow)
 
 
 def test_dynamics_with_friction_become_their_field():
@@ -78,9 +76,9 @@ def test_dynamics_with_friction_become_their_field():
 
     @jax.jit
     def ask(key):
-        dynamics = model.apply(model.init(key))
-        slope, qd = jax.grad(dynamics.hamiltonian, argnums=(0, 1))(q, p)
-        return from_dynamics(dynamics).rates(q, p), (qd, -slope - dynamics.friction(q, qd)), -slope
+        energies = model.energies(model.init(key))
+        slope, qd = jax.grad(energies.hamiltonian, argnums=(0, 1))(q, p)
+        return flow(energies).rates(q, p), (qd, -slope - dynamics(energies).friction(q, qd)), -slope
 
     got, expected, frictionless = ask(jax.random.key(0))
     for one, other in zip(got, expected, strict=True):
@@ -103,7 +101,7 @@ def test_the_polynomial_recovers_the_pendulum(swing):
 
 @pytest.mark.parametrize(("optimizer", "steps", "below"), [("gauss-newton", 20, 1e-3), ("adam", 400, 0.7)])
 def test_networks_learn_the_field(swing, optimizer, steps, below):
-    model = hamiltonian_phase_model(make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL))
+    model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)
     training = match_field(model, swing.train.data, Settings(optimizer=optimizer, steps=steps, batch=32))
     found = phase_metrics.field_errors(model, training.parameters, swing.test)
     assert found["loss"] == pytest.approx(found["clean_field_mse"])
@@ -130,8 +128,8 @@ def test_metrics_by_hand_and_motions_that_end():
     assert found["energy_mse"] == pytest.approx(2.25) and found["energy_mse_median"] == pytest.approx(2.25)
     assert found["energy_mse_standard_error"] == pytest.approx(4.5 / np.sqrt(2) / np.sqrt(2))
     assert found["rollout_mse"] == pytest.approx(1 / 8)
-    explosive = phase_field(lambda q, p: jnp.sum(q**2 * p))
-    model = make_phase_network(Needs(joints=("prismatic",)), **SMALL)._replace(apply=lambda parameters: explosive)
+    explosive = HamiltonianSystem(lambda q, p: jnp.sum(q**2 * p))
+    model = make_phase_network(Needs(joints=("prismatic",)), **SMALL)._replace(energies=lambda parameters: explosive)
     moved = phase_metrics.predict(model, 0.0, np.ones((1, 1)), np.zeros((1, 1)), np.array([0.0, 2.0]))
     assert np.isinf(phase_metrics.state_errors(moved, phase_metrics.Motions(*(each[:1] for each in truth)))).all()
 

@@ -16,7 +16,6 @@ from dln_jax.learning.objectives import TORQUE, arrays, mean_loss, torque_scale
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.scene import dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
 
@@ -151,7 +150,7 @@ def test_torque_scale_never_divides_by_zero():
 def test_the_textbook_has_no_torque_residual():
     data = generators.uniform(two_link_arm(), samples=100)
     scale = torque_scale(data)
-    assert mean_loss(TORQUE, dynamics(two_link_arm()), arrays(TORQUE, data, jnp.float64), scale) < 1e-24
+    assert mean_loss(TORQUE, two_link_arm().energies, arrays(TORQUE, data, jnp.float64), scale) < 1e-24
 
 
 @pytest.fixture(scope="module")

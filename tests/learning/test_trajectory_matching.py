@@ -8,7 +8,8 @@ from dln_jax.data import schema
 from dln_jax.learning.engine.second_order import Budget
 from dln_jax.learning.field_matching import match_linear
 from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories, stretches, take
-from dln_jax.models.phase_field import PhaseModel, phase_field
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.types import InputError, Needs
 
@@ -73,16 +74,15 @@ def test_a_noisy_oscillator_is_recovered_without_the_bias_of_its_noise():
     assert fitted.validation < 3
 
 
-def damped() -> PhaseModel:
+def damped() -> Model:
     """½ p² + ½ k q² with friction ½ b qd²; parameters k, b."""
-
-    def apply(c):
-        return phase_field(
+    return Model(
+        lambda key: jnp.ones(2),
+        lambda c: HamiltonianSystem(
             lambda q, p: 0.5 * jnp.sum(p**2) + 0.5 * c[0] * jnp.sum(q**2),
             dissipation=lambda q, qd: 0.5 * c[1] * jnp.sum(qd**2),
-        )
-
-    return PhaseModel(lambda key: jnp.ones(2), apply)
+        ),
+    )
 
 
 def test_a_damped_oscillator_is_recovered_from_its_positions():

@@ -11,14 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.deploy.c.load import load_c
+from dln_jax.deploy.c.load import CDynamics, load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.deploy.export_stablehlo import export_stablehlo
-from dln_jax.mechanics import hamiltonian, lagrangian, natural, natural_hamiltonian
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.flow import PlainFlow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.models.phase_field import from_dynamics, phase_field
-from dln_jax.scenes import scene as textbook
+from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.types import InputError
 from dln_jax.zoo.kinds import build
@@ -54,7 +58,11 @@ def H(q, p):
 
 
 def network(kind):
-    return lambda folder: build(description(kind)).apply(parameters_of(build, kind))
+    return lambda folder: dynamics(energies(kind), degrees_of_freedom=2)
+
+
+def energies(kind, build=build):
+    return build(description(kind)).energies(parameters_of(build, kind))
 
 
 def loaded(kind):
@@ -66,11 +74,11 @@ def loaded(kind):
 
 
 ORIGINS = {
-    "scene": lambda folder: textbook.dynamics(SCENE),
-    "lagrangian": lambda folder: lagrangian.dynamics(SCENE.lagrangian),
-    "natural": lambda folder: natural.dynamics(NaturalSystem(lambda q: jnp.cos(q[0]) * FACTOR)),
-    "hamiltonian": lambda folder: hamiltonian.dynamics(H),
-    "natural hamiltonian": lambda folder: natural_hamiltonian.dynamics(NaturalHamiltonian(lambda q: FACTOR + 0 * q[0])),
+    "scene": lambda folder: dynamics(SCENE.energies, degrees_of_freedom=2),
+    "lagrangian": lambda folder: dynamics(SCENE.energies),
+    "natural": lambda folder: dynamics(NaturalSystem(lambda q: jnp.cos(q[0]) * FACTOR)),
+    "hamiltonian": lambda folder: dynamics(HamiltonianSystem(H)),
+    "natural hamiltonian": lambda folder: dynamics(NaturalHamiltonian(lambda q: FACTOR + 0 * q[0])),
     **{kind: network(kind) for kind in ("structured-delan", "black-box-delan", "structured-hnn", "feed-forward")},
     **{
         f"loaded {kind}": loaded(kind)
@@ -84,7 +92,6 @@ FUNCTIONS = {
     "energy": ("q", "qd"),
     "mass_matrix": ("q", "qd"),
     "decompose": ("q", "qd", "qdd"),
-    "hamiltonian": ("q", "p"),
     "friction": ("q", "qd"),
 }
 MALFORMED = {
@@ -105,9 +112,8 @@ MALFORMED = {
 def asked(system):
     """The functions that a system has, with the names of their arguments."""
     for name, names in FUNCTIONS.items():
-        function = getattr(system, name)
-        if function is not None and (system.has_energy or name not in ("energy", "mass_matrix")):
-            yield name, function, names
+        if hasattr(system, name):
+            yield name, getattr(system, name), names
 
 
 @pytest.mark.parametrize("origin", ORIGINS)
@@ -131,7 +137,7 @@ def test_what_is_no_state_is_refused_by_name(origin, tmp_path):
 
 
 def test_sizes_that_differ_are_refused_where_none_is_known():
-    system = lagrangian.dynamics(lambda q, qd: jnp.sum(qd**2))
+    system = dynamics(LagrangianSystem(lambda q, qd: jnp.sum(qd**2)))
     with pytest.raises(InputError, match=r"qd has shape \(3,\); expected \(2,\)"):
         system.energy([0.1, 0.2], [1, 2, 3])
     with pytest.raises(InputError, match=r"tau has shape \(1,\); expected \(2,\)"):
@@ -148,7 +154,7 @@ def test_whole_numbers_lists_and_mixed_types_are_converted(origin, tmp_path):
 
     arrays = {key: jnp.asarray(value, jnp.float64) for key, value in given.items()}
     assert jax.eval_shape(lambda: answers(given)) == jax.eval_shape(answers, arrays)
-    if not system.has_energy or origin == "hamiltonian":  # it takes seconds to compile
+    if not isinstance(system, Dynamics) or origin == "hamiltonian":  # it takes seconds to compile
         return
     q, qd = arrays["q"], arrays["qd"]
 
@@ -160,14 +166,16 @@ def test_whole_numbers_lists_and_mixed_types_are_converted(origin, tmp_path):
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-12), *numbers())
 
 
-def test_what_a_model_without_energy_is_asked_for_is_refused(tmp_path):
+def test_what_a_system_cannot_do_is_absent_from_its_type(tmp_path):
     for origin in ("feed-forward", "loaded feed-forward"):
         system = ORIGINS[origin](tmp_path)
-        assert not system.has_energy and system.hamiltonian is None
-        for ask in (system.energy, system.mass_matrix):
-            with pytest.raises(InputError, match="comes from no energy"):
-                ask([0.1, 0.2], [0.3, 0.4])
-    assert textbook.dynamics(SCENE).has_energy
+        assert isinstance(system, PlainDynamics) and not hasattr(system, "energy")
+    rates = PhaseRates(lambda q, p: (p, -q))
+    assert isinstance(flow(rates), PlainFlow)
+    with pytest.raises(InputError, match="dynamics got a PhaseRates; expected one of NaturalSystem, "):
+        dynamics(rates)
+    with pytest.raises(InputError, match="flow got a InverseForward; expected one of NaturalSystem, "):
+        flow(energies("feed-forward"))
 
 
 def test_the_edge_leaves_no_trace_in_a_program():
@@ -175,14 +183,15 @@ def test_the_edge_leaves_no_trace_in_a_program():
     for dtype in (np.float32, np.float64):
         state = [np.ones(2, dtype)] * 3
         plain = jax.make_jaxpr(functools.partial(lagrangian.forward_dynamics, SCENE.lagrangian))(*state)
-        assert str(jax.make_jaxpr(lagrangian.dynamics(SCENE.lagrangian).forward_dynamics)(*state)) == str(plain)
+        checked = dynamics(LagrangianSystem(SCENE.lagrangian)).forward_dynamics
+        assert str(jax.make_jaxpr(checked)(*state)) == str(plain)
 
 
 FIELDS = {
-    "energy": lambda folder: phase_field(H, dissipation=lambda q, qd: jnp.sum(qd**2)),
-    "dynamics": lambda folder: from_dynamics(network("structured-hnn")(folder)),
+    "energy": lambda folder: flow(HamiltonianSystem(H, lambda q, qd: jnp.sum(qd**2))),
+    "structured": lambda folder: flow(energies("structured-hnn")),
     **{
-        kind: lambda folder, kind=kind: build_phase(description(kind)).apply(parameters_of(build_phase, kind))
+        kind: lambda folder, kind=kind: flow(energies(kind, build_phase))
         for kind in ("separable-hamiltonian", "polynomial-hamiltonian", "phase-network")
     },
 }
@@ -198,9 +207,8 @@ def loaded_field(folder):
 def test_a_phase_field_refuses_and_converts_likewise(origin, tmp_path):
     field = {**FIELDS, "loaded": loaded_field}[origin](tmp_path)
     fine = np.array([0.3, 0.1])
-    for function, names in ((field.rates, ("q", "p")), (field.energy, ("q", "p")), (field.dissipation, ("q", "qd"))):
-        if function is None:
-            continue
+    names = ("q", "p")
+    for function in field:
         for value, message in (MALFORMED[fault] for fault in ("batch", "number", "too few", "too many", "complex")):
             with pytest.raises(InputError, match=f"^{names[1]} {message}"):
                 function(fine, value)
@@ -222,13 +230,10 @@ def test_exported_c_takes_and_refuses_what_the_model_does(kind, tmp_path):
     np.testing.assert_allclose(system.inverse_dynamics(q, qd, x), expected, rtol=1e-10)
     np.testing.assert_allclose(system.inverse_dynamics(*map(np.asarray, (q, qd, x))), expected, rtol=1e-10)
     calls = {"inverse_dynamics": ("q", "qd", "qdd"), "forward_dynamics": ("q", "qd", "tau")}
-    assert system.has_energy == model.has_energy
-    if model.has_energy:
+    assert isinstance(system, CDynamics) == isinstance(model, Dynamics)
+    if isinstance(model, Dynamics):
         np.testing.assert_allclose(system.mass_matrix(q), jax.jit(model.mass_matrix)(q), rtol=1e-10)
         calls |= {"energy": ("q", "qd"), "mass_matrix": ("q", "qd")}
-    else:
-        with pytest.raises(InputError, match="comes from no energy"):
-            system.mass_matrix(q)
     for name, names in calls.items():
         for fault, (value, message) in MALFORMED.items():
             message = message if "has shape" in message else "(has type|makes no array)"

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import hamiltonian, natural_hamiltonian
-from dln_jax.mechanics.hamiltonian import conjugate, legendre
+from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.scenes import scene as textbook
@@ -77,12 +78,12 @@ def cholesky(M):
 
 
 def from_inverse_factor(scene):
-    """The scene's dynamics by the factor of its inverse mass matrix."""
+    """The scene's energies by the factor of its inverse mass matrix."""
 
     def inverse_factor(q):
         return cholesky(solve(scene.mass_matrix(q), jnp.eye(q.shape[0])))
 
-    return natural_hamiltonian.dynamics(NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation))
+    return NaturalHamiltonian(inverse_factor, scene.potential, scene.dissipation)
 
 
 def states(d, count=3):
@@ -101,7 +102,8 @@ CASES = [cart_pole(friction=0.3), chain(3)._replace(potential=None, gravity=None
 @pytest.mark.parametrize("scene", CASES, ids=lambda scene: scene.name)
 def test_natural_dynamics_equals_the_textbook(scene):
     q, qd, third = states(scene.needs.degrees_of_freedom)
-    system = from_inverse_factor(scene)
+    energies = from_inverse_factor(scene)
+    system, H = dynamics(energies), flow(energies).energy
     natural = NaturalSystem(lambda q: cholesky(scene.mass_matrix(q)), scene.potential)
 
     @jax.jit
@@ -113,8 +115,8 @@ def test_natural_dynamics_equals_the_textbook(scene):
             system.energy(q, qd),
             system.mass_matrix(q, qd),
             system.decompose(q, qd, third),
-            system.hamiltonian(q, scene.mass_matrix(q) @ qd),
-            natural_hamiltonian.from_mass_factor(natural)(q, scene.mass_matrix(q) @ qd),
+            H(q, scene.mass_matrix(q) @ qd),
+            flow(natural).energy(q, scene.mass_matrix(q) @ qd),
         )
 
     @jax.jit
@@ -131,7 +133,7 @@ def test_natural_dynamics_equals_the_textbook(scene):
 
 @pytest.mark.parametrize("scene", [two_link_arm(), cart_pole(friction=0.3), chain(3)], ids=lambda scene: scene.name)
 def test_the_hamiltonian_of_a_lagrangian_moves_as_the_textbook(scene):
-    system = hamiltonian.dynamics(legendre(scene.lagrangian), dissipation=scene.dissipation)
+    system = dynamics(HamiltonianSystem(legendre(scene.lagrangian), scene.dissipation))
     q, qd, tau = states(scene.needs.degrees_of_freedom)
     expected = jax.jit(jax.vmap(functools.partial(textbook.closed_form_forward_dynamics, scene)))(q, qd, tau)
     assert_equal(jax.jit(jax.vmap(system.forward_dynamics))(q, qd, tau), expected)
@@ -207,7 +209,7 @@ def test_a_relativistic_particle():
 
     q, qd, qdd = jnp.array([[0.4], [0.6], [-0.7]])
     gamma = 1.25
-    system = hamiltonian.dynamics(H, iterations=8, initial_guess=lambda q, qd: qd + 0.1)
+    system = dynamics(HamiltonianSystem(H, iterations=8, initial_guess=lambda q, qd: qd + 0.1))
     ask = jax.jit(
         lambda tau: (
             system.inverse_dynamics(q, qd, qdd),
@@ -234,7 +236,7 @@ def test_the_default_transform_is_right_without_a_choice():
     inverse_mass = np.eye(2) * (1 + size * square)[:, None] + 2 * size[:, None] * p[:, :, None] * p[:, None]
     drift = 2 * square * p * np.sum(q * qd, axis=1)[:, None]
     qdd = drift + np.einsum("nij,nj->ni", inverse_mass, tau - 0.5 * square**2 * q)
-    system = hamiltonian.dynamics(H)
+    system = dynamics(HamiltonianSystem(H))
     got = jax.jit(
         jax.vmap(
             lambda q, qd, x: (
@@ -272,7 +274,7 @@ def test_a_charged_particle_in_a_magnetic_field():
         return 0.5 * jnp.sum((p - 0.85 * jnp.array([-q[1], q[0]])) ** 2)
 
     q, qd = jnp.array([[0.2, 0.9], [1.0, -0.5]])
-    system = hamiltonian.dynamics(H)
+    system = dynamics(HamiltonianSystem(H))
     acceleration = 1.7 * jnp.array([qd[1], -qd[0]])
     np.testing.assert_allclose(jax.jit(system.forward_dynamics)(q, qd, jnp.zeros(2)), acceleration, rtol=1e-13)
     inertial, coriolis, gravity = jax.jit(system.decompose)(q, qd, q)
@@ -283,7 +285,7 @@ def test_a_charged_particle_in_a_magnetic_field():
 
 def test_a_singular_hamiltonian_is_not_hidden():
     """H_pp = diag(1, 0): the second coordinate has an infinite mass, and no momentum makes it move."""
-    system = hamiltonian.dynamics(lambda q, p: 0.5 * p[0] ** 2 + jnp.sum(q**2))
+    system = dynamics(HamiltonianSystem(lambda q, p: 0.5 * p[0] ** 2 + jnp.sum(q**2)))
     rest = jnp.zeros(2)
     tau, mass = jax.jit(lambda: (system.inverse_dynamics(rest, rest + 1, rest), system.mass_matrix(rest, rest)))()
     assert not jnp.isfinite(tau).all() and not jnp.isfinite(mass).all()
@@ -291,6 +293,6 @@ def test_a_singular_hamiltonian_is_not_hidden():
 
 def test_no_iterations_are_refused():
     with pytest.raises(InputError, match="iterations is 0"):
-        hamiltonian.dynamics(lambda q, p: jnp.sum(p**2), iterations=0)
+        dynamics(HamiltonianSystem(lambda q, p: jnp.sum(p**2), iterations=0))
     with pytest.raises(InputError, match="iterations is -1"):
         conjugate(lambda q, p: jnp.sum(p**2), jnp.zeros(1), jnp.zeros(1), iterations=-1)

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 
 from dln_jax.mechanics import lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
@@ -21,7 +23,6 @@ from dln_jax.scenes.scene import (
     closed_form_decomposition,
     closed_form_forward_dynamics,
     closed_form_inverse_dynamics,
-    dynamics,
 )
 from dln_jax.scenes.two_link_arm import two_link_arm
 
@@ -77,7 +78,7 @@ def answers(request):
     # Two programs: batched LAPACK calls that run side by side in one can deadlock on two cores.
     paths = (
         jax.jit(jax.vmap(lambda *state, system=system: ask(system, *state)))
-        for system in (dynamics(scene), natural_twin(scene))
+        for system in (dynamics(scene.energies), natural_twin(scene))
     )
     return scene, (q, qd, qdd, tau), *(path(q, qd, qdd, tau) for path in paths)
 
@@ -139,7 +140,7 @@ def round_trip(d):
 
         system = natural.NaturalSystem(cholesky, lambda q: jnp.sum(jnp.sin(q) ** 2))
         L = natural.lagrangian(system)
-        paths = natural.dynamics(system), lagrangian.dynamics(L)
+        paths = natural.dynamics(system), lagrangian.dynamics(LagrangianSystem(L))
         residuals = [path.inverse_dynamics(q, qd, path.forward_dynamics(q, qd, tau)) - tau for path in paths]
         return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.momentum(system, q, qd)])
 

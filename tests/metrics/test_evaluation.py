@@ -10,11 +10,10 @@ import pytest
 from dln_jax.datasets import generators
 from dln_jax.figures import dynamics as figures
 from dln_jax.learning.engine.runs import Progress, one_after_the_other
-from dln_jax.mechanics.hamiltonian import hamiltonian_from_lagrangian
+from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.scene import dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.report import Row, conditions, write_report
 
@@ -25,13 +24,13 @@ def data():
 
 
 def test_the_textbook_makes_no_error(data):
-    result = errors(predictions(dynamics(two_link_arm()), data, jnp.float64), data)
+    result = errors(predictions(two_link_arm().energies, data, jnp.float64), data)
     assert set(result) == {f"{k}_mse" for k in ("torque", "forward", "power", "inertial", "coriolis", "gravity")}
     assert max(result.values()) < 1e-20
 
 
 def test_errors_are_sums_over_joints_and_means_over_samples(data):
-    predicted = predictions(dynamics(two_link_arm()), data, jnp.float64)
+    predicted = predictions(two_link_arm().energies, data, jnp.float64)
     off = {**predicted, "tau": predicted["tau"] + np.array([0.3, -0.4]), "qdd": predicted["qdd"] + 2.0}
     result = errors(off, data)
     assert result["torque_mse"] == pytest.approx(0.25)
@@ -45,14 +44,14 @@ def test_torques_from_momenta_are_as_wrong_as_recorded_rates():
     """The true plant, damped: exact momenta give exact torques, and difference quotients their own error."""
     scene = pendulum(friction=0.3)
     data = generators.free_swing(scene, trajectories=1, steps=50)
-    plant = dynamics(scene)._replace(hamiltonian=hamiltonian_from_lagrangian(scene.lagrangian))
-    assert errors(predictions(plant, data, jnp.float64), data)["torque_from_momenta_mse"] < 1e-20
+    plant, H = scene.energies, legendre(scene.lagrangian)
+    assert errors(predictions(plant, data, jnp.float64, H=H), data)["torque_from_momenta_mse"] < 1e-20
     assert data.p is not None and data.pd is not None
     quotients = np.gradient(data.p, data.t, axis=0)
-    result = errors(predictions(plant, data._replace(pd=quotients), jnp.float64), data)
+    result = errors(predictions(plant, data._replace(pd=quotients), jnp.float64, H=H), data)
     assert result["torque_from_momenta_mse"] == pytest.approx(np.mean((quotients - data.pd) ** 2), rel=1e-9)
     assert result["torque_from_momenta_mse"] > 1e-6 > 1e-20 > result["torque_mse"]
-    without = errors(predictions(plant, data._replace(p=None), jnp.float64), data)
+    without = errors(predictions(plant, data._replace(p=None), jnp.float64, H=H), data)
     assert "torque_from_momenta_mse" not in without
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.delan import make_delan
 from dln_jax.models.features import joint_features
 from dln_jax.types import Needs
@@ -30,7 +31,7 @@ def checks(d):
 
     @jax.jit
     def evaluate(seed, q, qd, tau):
-        system = model.apply(model.init(jax.random.key(seed)))
+        system = dynamics(model.energies(model.init(jax.random.key(seed))))
         qdd = system.forward_dynamics(q, qd, tau)
         again = system.inverse_dynamics(q, qd, qdd)
         rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
@@ -64,7 +65,7 @@ def test_dissipation_takes_power_away():
     @jax.jit
     def power():
         parameters = model.init(jax.random.key(0))
-        system = model.apply(parameters)
+        system = dynamics(model.energies(parameters))
         qdd = system.forward_dynamics(q, qd, jnp.zeros(2))
         coefficients = jax.nn.softplus(next(iter(parameters["~"].values())))
         return jax.jvp(system.energy, (q, qd), (qd, qdd))[1], -coefficients @ qd**2
@@ -79,7 +80,9 @@ def flops(**kinds):
     model = small(3, **kinds)
     parameters = jax.eval_shape(model.init, jax.random.key(0))
     states = (jax.ShapeDtypeStruct((3,), jnp.float64),) * 3
-    compiled = jax.jit(lambda p, *s: model.apply(p).inverse_dynamics(*s)).lower(parameters, *states).compile()
+    compiled = (
+        jax.jit(lambda p, *s: dynamics(model.energies(p)).inverse_dynamics(*s)).lower(parameters, *states).compile()
+    )
     return compiled.cost_analysis()["flops"], sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
 
@@ -97,7 +100,7 @@ def test_prismatic_joints_take_no_trigonometry():
     def text(**kinds):
         model = small(2, **kinds)
         q = jnp.zeros(2)
-        return str(jax.make_jaxpr(model.apply(model.init(jax.random.key(0))).mass_matrix)(q))
+        return str(jax.make_jaxpr(dynamics(model.energies(model.init(jax.random.key(0)))).mass_matrix)(q))
 
     assert " cos" in text() and " sin" in text()
     assert " cos" not in text(prismatic=True) and " sin" not in text(prismatic=True)
@@ -106,7 +109,7 @@ def test_prismatic_joints_take_no_trigonometry():
 
 
 def test_a_full_turn_changes_nothing():
-    system = small(2).apply(small(2).init(jax.random.key(1)))
+    system = dynamics(small(2).energies(small(2).init(jax.random.key(1))))
     q, qd, qdd = jnp.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]])
     turned = q + 2 * jnp.pi * jnp.array([1.0, -3.0])
     np.testing.assert_allclose(
@@ -116,7 +119,7 @@ def test_a_full_turn_changes_nothing():
 
 def test_the_forward_model_is_a_diffrax_vector_field():
     model = small(2)
-    system = model.apply(model.init(jax.random.key(2)))
+    system = dynamics(model.energies(model.init(jax.random.key(2))))
 
     def field(t, state, args):
         q, qd = state

@@ -5,7 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import hamiltonian, lagrangian
+from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.dynamics import PlainDynamics
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import structured_networks
@@ -34,16 +38,16 @@ def test_structured_hamiltonian_holds_for_random_parameters():
     @jax.jit
     def evaluate(key):
         parameters = model.init(key)
-        system = model.apply(parameters)
+        system, H = dynamics(model.energies(parameters)), flow(model.energies(parameters)).energy
         L = factor(parameters, q)
         mass = system.mass_matrix(q)
         qdd = system.forward_dynamics(q, qd, tau)
         rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
         # Hamilton's equations by differentiating H alone, at the momentum that M gives.
-        field = hamiltonian.time_derivative(system.hamiltonian, q, mass @ qd, tau - friction(parameters, qd))
+        field = hamiltonian.time_derivative(H, q, mass @ qd, tau - friction(parameters, qd))
         momentum_rate = jax.jvp(lambda q, qd: system.mass_matrix(q) @ qd, (q, qd), (qd, qdd))[1]
         parts = sum(system.decompose(q, qd, qdd)) + friction(parameters, qd)
-        hessian = jax.hessian(system.hamiltonian, argnums=1)(q, p)
+        hessian = jax.hessian(H, argnums=1)(q, p)
         return (
             (hessian, L @ L.T),
             (mass @ L @ L.T, jnp.eye(d)),
@@ -51,7 +55,7 @@ def test_structured_hamiltonian_holds_for_random_parameters():
             (parts, tau),
             (rate, qd @ (tau - friction(parameters, qd))),
             (field, (qd, momentum_rate)),
-            (system.energy(q, qd), system.hamiltonian(q, mass @ qd)),
+            (system.energy(q, qd), H(q, mass @ qd)),
         )
 
     for got, expected in evaluate(jax.random.key(0)):
@@ -65,7 +69,7 @@ def test_black_box_lagrangian_follows_its_energy():
     @jax.jit
     def evaluate(key):
         parameters = model.init(key)
-        system = model.apply(parameters)
+        system = dynamics(model.energies(parameters))
         qdd = system.forward_dynamics(q, qd, tau)
         rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
         return system.inverse_dynamics(q, qd, qdd) - tau, rate - qd @ (tau - friction(parameters, qd))
@@ -84,11 +88,11 @@ def test_black_box_hamiltonian_follows_its_energy():
 
     @jax.jit
     def evaluate(parameters, qd):
-        system = model.apply(parameters)
+        system = dynamics(model.energies(parameters))
         qdd = system.forward_dynamics(q, qd, tau)
         return system.energy(q, qd), system.inverse_dynamics(q, qd, qdd)
 
-    H = model.apply(parameters).hamiltonian
+    H = flow(model.energies(parameters)).energy
     expected, qd = jax.jit(lambda: (H(q, p), hamiltonian.velocity(H, q, p)))()
     energy, again = evaluate(parameters, qd)
     assert float(energy) == pytest.approx(float(expected), rel=1e-12)
@@ -97,7 +101,7 @@ def test_black_box_hamiltonian_follows_its_energy():
     @jax.jit
     def loss(step):
         moved = jax.tree.map(lambda leaf: leaf + step * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), parameters)
-        return jnp.sum(model.apply(moved).forward_dynamics(q, qd, tau) * direction)
+        return jnp.sum(dynamics(model.energies(moved)).forward_dynamics(q, qd, tau) * direction)
 
     difference = (loss(1e-5) - loss(-1e-5)) / 2e-5
     assert float(jax.jit(jax.grad(loss))(0.0)) == pytest.approx(float(difference), rel=1e-6)
@@ -108,14 +112,13 @@ def test_scales_divide_what_enters_and_multiply_what_leaves():
     scales = (4.0, 0.5)
     for make, name in ((make_black_box_lagrangian, "rate_scale"), (make_black_box_hamiltonian, "momentum_scale")):
         parameters = make(MIXED, **SMALL).init(jax.random.key(0))
-        scaled, plain = (make(MIXED, **SMALL, **given).apply(parameters) for given in ({name: scales}, {}))
-        function = "hamiltonian" if make is make_black_box_hamiltonian else "energy"
-        got = jax.jit(getattr(scaled, function))(q, rate * jnp.array(scales))
-        np.testing.assert_allclose(got, jax.jit(getattr(plain, function))(q, rate), rtol=1e-13)
+        scaled, plain = (make(MIXED, **SMALL, **given).energies(parameters)[0] for given in ({name: scales}, {}))
+        got = jax.jit(scaled)(q, rate * jnp.array(scales))
+        np.testing.assert_allclose(got, jax.jit(plain)(q, rate), rtol=1e-13)
 
     sizes = {"rate_scale": 3.0, "acceleration_scale": (2.0, 5.0), "tau_scale": scales}
     parameters = make_feed_forward(MIXED, **SMALL).init(jax.random.key(0))
-    scaled, plain = (make_feed_forward(MIXED, **SMALL, **given).apply(parameters) for given in (sizes, {}))
+    scaled, plain = (make_feed_forward(MIXED, **SMALL, **given).energies(parameters) for given in (sizes, {}))
     acceleration, force = jnp.array([2.0, 5.0]), jnp.array(scales)
     got = scaled.inverse_dynamics(q, 3 * rate, acceleration * x)
     np.testing.assert_allclose(got, force * plain.inverse_dynamics(q, rate, x), rtol=1e-13)
@@ -125,11 +128,11 @@ def test_scales_divide_what_enters_and_multiply_what_leaves():
 
 def test_feed_forward_has_no_energy():
     system = make_feed_forward(MIXED, **SMALL)
-    system = system.apply(system.init(jax.random.key(0)))
-    assert not system.has_energy and system.hamiltonian is None
+    system = dynamics(system.energies(system.init(jax.random.key(0))))
+    assert isinstance(system, PlainDynamics)
     q, qd, qdd = jax.random.normal(jax.random.key(8), (3, 2))
     jitted = compiled(system, jnp.float64)
-    assert not jitted.has_energy and jitted.hamiltonian is None
+    assert isinstance(jitted, PlainDynamics)
     parts = jitted.decompose(q, qd, qdd)
     rest = jnp.zeros(2)
     tau = system.inverse_dynamics
@@ -147,7 +150,9 @@ def flops(gravity, friction):
     model = make_structured_hamiltonian(needs, **SMALL)
     parameters = jax.eval_shape(model.init, jax.random.key(0))
     states = (jax.ShapeDtypeStruct((2,), jnp.float64),) * 3
-    compiled = jax.jit(lambda p, *s: model.apply(p).forward_dynamics(*s)).lower(parameters, *states).compile()
+    compiled = (
+        jax.jit(lambda p, *s: dynamics(model.energies(p)).forward_dynamics(*s)).lower(parameters, *states).compile()
+    )
     return compiled.cost_analysis()["flops"], sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
 
@@ -167,13 +172,17 @@ def test_the_type_of_the_parameters_is_that_of_the_answers(make):
     state = (jax.ShapeDtypeStruct((2,), jnp.float32),) * 3
     assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {jnp.dtype(jnp.float32)}
     for name in ("inverse_dynamics", "forward_dynamics"):
-        answer = jax.eval_shape(lambda p, *s, name=name: getattr(model.apply(p), name)(*s), shapes, *state)
+        answer = jax.eval_shape(lambda p, *s, name=name: getattr(dynamics(model.energies(p)), name)(*s), shapes, *state)
         assert (answer.shape, answer.dtype) == ((2,), jnp.float32)
+
+
+def plain_dynamics():
+    return dynamics(make_feed_forward(MIXED).energies({}))
 
 
 def of_mass(diagonal):
     """The dynamics of L = ½ Σ m(q) qd²."""
-    return lagrangian.dynamics(lambda q, qd: 0.5 * jnp.sum(diagonal(q) * qd**2))
+    return dynamics(LagrangianSystem(lambda q, qd: 0.5 * jnp.sum(diagonal(q) * qd**2)))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +204,7 @@ def test_definiteness_is_reported(diagonal, expected):
 def test_definiteness_of_networks():
     q, qd = np.asarray(jax.random.normal(jax.random.key(0), (2, 50, 2)))
     structured, black_box = (
-        model.apply(jax.jit(model.init)(jax.random.key(0)))
+        dynamics(model.energies(jax.jit(model.init)(jax.random.key(0))))
         for model in (make_structured_hamiltonian(MIXED, **SMALL), make_black_box_lagrangian(MIXED, **SMALL))
     )
     masses = np.asarray(jax.jit(jax.vmap(black_box.mass_matrix))(q, qd))
@@ -205,7 +214,7 @@ def test_definiteness_of_networks():
     assert report.smallest_eigenvalue == pytest.approx(eigenvalues.min())
     assert report.largest_condition_number == pytest.approx(np.linalg.cond(masses).max(), rel=1e-6)
     assert definiteness(structured, q, qd).share_not_definite == 0
-    singular = hamiltonian.dynamics(lambda q, p: 0.5 * p[0] ** 2)
+    singular = dynamics(HamiltonianSystem(lambda q, p: 0.5 * p[0] ** 2))
     report = definiteness(singular, q, qd)
     assert np.isnan(report.smallest_eigenvalue)
     assert (report.share_not_definite, report.largest_condition_number) == (1.0, np.inf)
@@ -222,7 +231,10 @@ def test_definiteness_of_networks():
         (lambda: make_structured_hamiltonian(MIXED, width=0), "width is 0"),
         (lambda: make_black_box_lagrangian(MIXED, depth=0), "depth is 0"),
         (lambda: definiteness(of_mass(jnp.ones_like), np.zeros((0, 2)), np.zeros((0, 2))), "no states"),
-        (lambda: definiteness(make_feed_forward(MIXED).apply({}), np.zeros((1, 2)), np.zeros((1, 2))), "no mass"),
+        (
+            lambda: definiteness(plain_dynamics(), np.zeros((1, 2)), np.zeros((1, 2))),
+            "no mass",
+        ),
     ],
 )
 def test_wrong_use_raises_one_clear_line(call, message):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.separable import make_separable_hamiltonian
 from dln_jax.scenes.n_body import n_body
@@ -44,7 +45,7 @@ def rotation(dimension):
 @pytest.mark.parametrize(("alike", "dimension"), [(True, 3), (False, 2)])
 def test_only_distances_matter(alike, dimension):
     model, parameters, x, p = bodies(alike, dimension)
-    H = jax.jit(lambda x, p: model.apply(parameters).hamiltonian(x.ravel(), p.ravel()))
+    H = jax.jit(lambda x, p: flow(model.energies(parameters)).energy(x.ravel(), p.ravel()))
     energy = float(H(x, p))
     turn, order = rotation(dimension), np.array([2, 0, 1])
     assert abs(turn - np.eye(dimension)).max() > 0.3
@@ -65,7 +66,7 @@ def test_momentum_and_angular_momentum_are_conserved(alike, dimension):
 
     @jax.jit
     def field(q, p):
-        return hamiltonian.time_derivative(model.apply(parameters).hamiltonian, q, p, jnp.zeros_like(q))
+        return hamiltonian.time_derivative(flow(model.energies(parameters)).energy, q, p, jnp.zeros_like(q))
 
     xd, pd = (np.asarray(rate).reshape(3, dimension) for rate in field(x.ravel(), p.ravel()))
     assert np.abs(pd).max() > 1e-2
@@ -95,9 +96,10 @@ def test_gravity_is_one_set_of_parameters(alike):
 
     @jax.jit
     def ask():
-        system = model.apply(parameters)
+        system = dynamics(model.energies(parameters))
+        H = flow(model.energies(parameters)).energy
         return (
-            (system.hamiltonian(q, p), jnp.sum(p**2 / each) / 2 + scene.potential(q)),
+            (H(q, p), jnp.sum(p**2 / each) / 2 + scene.potential(q)),
             (system.forward_dynamics(q, p / each, tau), (tau - scene.gravity(q)) / each),
         )
 
@@ -107,7 +109,7 @@ def test_gravity_is_one_set_of_parameters(alike):
 
 def test_nothing_is_softened():
     model, parameters, x, p = bodies(True, 3)
-    H = jax.jit(jax.value_and_grad(lambda q: model.apply(parameters).hamiltonian(q, p.ravel())))
+    H = jax.jit(jax.value_and_grad(lambda q: flow(model.energies(parameters)).energy(q, p.ravel())))
     for gap, finite in ((1e-6, True), (0.0, False)):
         close = np.array(x)
         close[1] = close[0] + gap
@@ -120,7 +122,8 @@ def test_the_scale_divides_distances():
     energies = []
     for scale in (1.0, 2.5):
         model = make_pairwise_hamiltonian(3, 3, distance_scale=scale, **SMALL)
-        energies.append(float(jax.jit(model.apply(bodies(True, 3)[1]).hamiltonian)(scale * x.ravel(), p.ravel())))
+        H = flow(model.energies(bodies(True, 3)[1])).energy
+        energies.append(float(jax.jit(H)(scale * x.ravel(), p.ravel())))
     assert energies[0] == pytest.approx(energies[1], rel=1e-13)
 
 
@@ -128,7 +131,7 @@ def test_absent_features_and_terms_cost_nothing():
     def seen(features):
         model = make_pairwise_hamiltonian(2, 2, features=features, **SMALL)
         parameters = jax.eval_shape(model.init, jax.random.key(0))
-        text = str(jax.make_jaxpr(lambda p, q: model.apply(p).hamiltonian(q, q))(parameters, jnp.ones(4)))
+        text = str(jax.make_jaxpr(lambda p, q: flow(model.energies(p)).energy(q, q))(parameters, jnp.ones(4)))
         return "= log" in text, sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
     # A mass, w, and a network of five units; each feature adds a w and five weights.
@@ -147,7 +150,7 @@ def test_absent_features_and_terms_cost_nothing():
     def trigonometry(joints):
         model = make_separable_hamiltonian(Needs(joints), **SMALL)
         parameters = jax.eval_shape(model.init, jax.random.key(0))
-        text = str(jax.make_jaxpr(lambda p, q: model.apply(p).hamiltonian(q, q))(parameters, jnp.ones(2)))
+        text = str(jax.make_jaxpr(lambda p, q: flow(model.energies(p)).energy(q, q))(parameters, jnp.ones(2)))
         return " cos" in text or " sin" in text
 
     assert trigonometry(("revolute", "prismatic")) and not trigonometry(("prismatic", "prismatic"))
@@ -164,8 +167,8 @@ def test_separable_follows_its_energy_without_a_mixed_derivative():
 
     @jax.jit
     def ask():
-        system = model.apply(parameters)
-        H = system.hamiltonian
+        system = dynamics(model.energies(parameters))
+        H = flow(model.energies(parameters)).energy
         qd = hamiltonian.velocity(H, q, p)
         qdd = system.forward_dynamics(q, qd, tau)
         friction = jax.nn.softplus(parameters["~"]["viscous_friction"]) * qd
@@ -186,7 +189,7 @@ def test_the_momentum_scale_divides_momenta():
     scale = (4.0, 0.5)
     scaled, plain = (make_separable_hamiltonian(MIXED, **SMALL, **given) for given in ({"momentum_scale": scale}, {}))
     parameters = parameters_of(plain)
-    first, second = (jax.jit(model.apply(parameters).hamiltonian) for model in (scaled, plain))
+    first, second = (jax.jit(flow(model.energies(parameters)).energy) for model in (scaled, plain))
     np.testing.assert_allclose(first(q, p * np.array(scale)), second(q, p), rtol=1e-13)
 
 

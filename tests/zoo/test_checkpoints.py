@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.types import InputError
 from dln_jax.zoo.kinds import build
 from dln_jax.zoo.load import load_run, save_model
@@ -60,7 +61,7 @@ def run_folder(tmp_path):
 
 def test_a_loaded_run_answers_as_the_model_does(run_folder):
     model = build(DESCRIPTION)
-    system = model.apply(model.init(jax.random.key(0)))
+    system = dynamics(model.energies(model.init(jax.random.key(0))))
     loaded = load_run(run_folder)
     state = np.array([[0.1, 0.2], [0.3, -1.0], [2.0, 0.5]])
     tau = loaded.inverse_dynamics(*state)

@@ -15,7 +15,6 @@ import numpy as np
 from dln_jax.deploy.c.interface import read_interface
 from dln_jax.deploy.c.text import PRECISIONS, check_name
 from dln_jax.deploy.host_arrays import as_shaped
-from dln_jax.mechanics.dynamics import no_energy
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
@@ -35,14 +34,18 @@ class CDynamics(NamedTuple):
     forward_dynamics: Callable[[Any, Any, Any], np.ndarray]
     """(q, qd, tau) -> qdd [d]."""
     energy: Callable[[Any, Any], Any]
-    """(q, qd) -> T + V; raises InputError for a model that comes from no energy (`has_energy` says so)."""
+    """(q, qd) -> T + V."""
     mass_matrix: Callable[..., Any]
-    """(q, qd=None) -> M [d, d], by default at rest, qd = 0; raises as `energy` does."""
+    """(q, qd=None) -> M [d, d], by default at rest, qd = 0."""
 
-    @property
-    def has_energy(self) -> bool:
-        """Whether there are an energy and a mass matrix."""
-        return self.energy is not no_energy
+
+class CPlainDynamics(NamedTuple):
+    """As `CDynamics`, of a model that comes from no energy."""
+
+    inverse_dynamics: Callable[[Any, Any, Any], np.ndarray]
+    """(q, qd, qdd) -> tau [d]."""
+    forward_dynamics: Callable[[Any, Any, Any], np.ndarray]
+    """(q, qd, tau) -> qdd [d]."""
 
 
 class CFunction(NamedTuple):
@@ -56,7 +59,7 @@ class CFunction(NamedTuple):
 
 def load_c(
     directory: str | Path, *, name: str = "model", compiler: str | None = None, flags: Sequence[str] = FLAGS
-) -> CDynamics | CFunction:
+) -> CDynamics | CPlainDynamics | CFunction:
     """Compiles an exported model in a temporary folder, and loads it.
 
     What is there is compiled and run: take a folder only from whom you trust. The digests in the description tell that
@@ -103,13 +106,17 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
         raise InputError(f"{found} could not compile the model: {complaint}; export it again, or name other flags")
 
 
-def _dynamics(functions: dict[str, Any], d: int, numpy_type, with_velocity: bool) -> CDynamics:
-    has_energy = "energy" in functions
-    return CDynamics(
+def _dynamics(functions: dict[str, Any], d: int, numpy_type, with_velocity: bool) -> CDynamics | CPlainDynamics:
+    plain = CPlainDynamics(
         inverse_dynamics=_of_three(functions["inverse_dynamics"], ("q", "qd", "qdd"), d, numpy_type),
         forward_dynamics=_of_three(functions["forward_dynamics"], ("q", "qd", "tau"), d, numpy_type),
-        energy=_scalar(functions["energy"], d, numpy_type) if has_energy else no_energy,
-        mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity) if has_energy else no_energy,
+    )
+    if "energy" not in functions:
+        return plain
+    return CDynamics(
+        *plain,
+        energy=_scalar(functions["energy"], d, numpy_type),
+        mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity),
     )
 
 

@@ -15,14 +15,15 @@ from dln_jax.learning.dynamics_fit import Settings, train
 from dln_jax.learning.engine.runs import Training
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.objectives import TORQUE, objective_of
-from dln_jax.mechanics.dynamics import Dynamics
-from dln_jax.mechanics.hamiltonian import hamiltonian_from_lagrangian
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import Driven, dynamics
+from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.metrics.errors import errors, mean_square, predictions
 from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
-from dln_jax.scenes.scene import Scene, dynamics
+from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import Needs
 from dln_jax.zoo.kinds import build, describe
@@ -89,9 +90,9 @@ def plant_rows(scene: Scene, sets: Split) -> Measured:
 
     The mean square of the torques over the whole circle is what a model that answers zero would be wrong by.
     """
-    plant = dynamics(scene)._replace(hamiltonian=hamiltonian_from_lagrangian(scene.lagrangian))
+    plant, H = dynamics(scene.energies), legendre(scene.lagrangian)
     return {
-        **errors(predictions(plant, sets.test, jnp.float64), sets.test),
+        **errors(predictions(scene.energies, sets.test, jnp.float64, H=H), sets.test),
         **rollout_metrics(plant, sets.test),
         "free_motion_inside_seconds": free_motion_inside_seconds(scene, sets),
         "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
@@ -111,10 +112,11 @@ def measure_trigonometric(sets: Split) -> Measured:
     seconds = time.perf_counter() - began
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
     noisy = fit_linear(model, sets.train._replace(tau=sets.train.tau + noise))
-    system = compiled(model.apply(fitted.parameters), jnp.float64)
+    energies = model.energies(fitted.parameters)
+    system = compiled(dynamics(energies), jnp.float64)
     numbers = {
-        **errors(predictions(system, sets.test, jnp.float64), sets.test),
-        "noisy_torque_mse": torque_mse(model.apply(noisy.parameters), sets.test),
+        **errors(predictions(energies, sets.test, jnp.float64), sets.test),
+        "noisy_torque_mse": torque_mse(dynamics(model.energies(noisy.parameters)), sets.test),
         "whole_circle_torque_mse": torque_mse(system, whole_circle()),
         **rollout_metrics(system, sets.test),
         "rank": float(fitted.rank),
@@ -128,16 +130,17 @@ def measure_trigonometric(sets: Split) -> Measured:
 
 def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Gauss-Newton on several seeds in one program; medians over them, and the spread of the torque error."""
-    training, systems = trained(kind, sets, seeds=seeds, steps=steps)
+    training, energies = trained(kind, sets, seeds=seeds, steps=steps)
+    systems = [compiled(dynamics(each), jnp.float64) for each in energies]
     seconds = training.compile_seconds + training.train_seconds
     of_seeds = [
         {
-            **errors(predictions(system, sets.test, jnp.float64), sets.test),
+            **errors(predictions(of_seed, sets.test, jnp.float64), sets.test),
             "whole_circle_torque_mse": torque_mse(system, whole_circle()),
             **rollout_metrics(system, sets.test),
             **definite(kind, system, sets),
         }
-        for system in systems
+        for of_seed, system in zip(energies, systems, strict=True)
     ]
     medians = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
     torques = [each["torque_mse"] for each in of_seeds]
@@ -154,22 +157,22 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
     return numbers, curve(kind, sets, training, numbers, seeds)
 
 
-def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Dynamics]]:
-    """Gauss-Newton on several seeds in one program, and the model of each."""
+def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Driven]]:
+    """Gauss-Newton on several seeds in one program, and the energies of each."""
     model, settings = prepared(kind, sets, SIZES[kind], steps)
     training = train(model, sets, settings, objective=objective_of(kind, sets.train), seeds=tuple(range(seeds)))
     each = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
-    return training, [compiled(model.apply(parameters), jnp.float64) for parameters in each]
+    return training, [model.energies(parameters) for parameters in each]
 
 
 def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Test torque errors of one more split, trained as the published one: median and largest over seeds."""
     if kind == "trigonometric":
         model = linear_model(sets)
-        systems = [model.apply(fit_linear(model, sets.train).parameters)]
+        energies = [model.energies(fit_linear(model, sets.train).parameters)]
     else:
-        _, systems = trained(kind, sets, seeds=seeds, steps=steps)
-    torques = [torque_mse(system, sets.test) for system in systems]
+        _, energies = trained(kind, sets, seeds=seeds, steps=steps)
+    torques = [torque_mse(dynamics(each), sets.test) for each in energies]
     return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, None
 
 
@@ -178,9 +181,10 @@ def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
     description = describe(kind, sets.train, needs_of(sets), precision="f32", width=64, depth=2, activation="tanh")
     model = build(description)
     training = train(model, sets, Settings(steps=steps), objective=objective_of(kind, sets.train))
-    system = compiled(model.apply(training.parameters), jnp.float32)
+    energies = model.energies(training.parameters)
+    system = compiled(dynamics(energies), jnp.float32)
     numbers = {
-        **errors(predictions(system, sets.test, jnp.float32), sets.test),
+        **errors(predictions(energies, sets.test, jnp.float32), sets.test),
         **rollout_metrics(system, sets.test, dtype=jnp.float32),
         "compile_seconds": training.compile_seconds,
         "train_seconds": training.compile_seconds + training.train_seconds,
@@ -205,7 +209,7 @@ def gauss_newton_rows(sets: Split, *, seeds: int, steps: int | None) -> Measured
         for target in TARGETS:
             reached = [at.seconds for at in training.history if at.monitor <= target]
             times[target].append(training.compile_seconds + reached[0] if reached else float("inf"))
-        final.append(torque_mse(model.apply(training.parameters), sets.test))
+        final.append(torque_mse(dynamics(model.energies(training.parameters)), sets.test))
         singles.append(training.compile_seconds + training.train_seconds)
     jax.clear_caches()
     ten = train(model, sets, settings, seeds=tuple(range(10)))
@@ -234,20 +238,20 @@ def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float],
     return Curve(seconds, np.minimum.accumulate(best).tolist())
 
 
-def definite(kind: str, system: Dynamics, sets: Split) -> dict[str, float]:
+def definite(kind: str, system: Dynamics | PlainDynamics, sets: Split) -> dict[str, float]:
     """The share of test states whose learned mass matrix is not definite, for models without structure."""
     if not kind.startswith("black-box"):
         return {}
     return {"share_not_definite": definiteness(system, sets.test.q, sets.test.qd).share_not_definite}
 
 
-def torque_mse(dynamics: Dynamics, data: Trajectories) -> float:
+def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:
     """Mean squared torque error in float64, summed over joints."""
     predicted = jax.jit(jax.vmap(dynamics.inverse_dynamics))(data.q, data.qd, data.qdd)
     return mean_square(np.asarray(predicted) - data.tau)
 
 
-def latency(system: Dynamics, sets: Split, dtype=jnp.float64) -> dict[str, float]:
+def latency(system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64) -> dict[str, float]:
     """Of one inverse-dynamics call."""
     states = list(zip(*(jnp.asarray(a[:400], dtype) for a in sets.test[1:4]), strict=True))
     return {"one_step_p50_us": one_step(system.inverse_dynamics, states, calls=2000).p50_us}

@@ -20,7 +20,7 @@ from dln_jax.command_line.running import run
 from dln_jax.deploy.c.load import FLAGS, WARNINGS, CDynamics, compile_c, load_c
 from dln_jax.deploy.c.source import export_run
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.latency import one_step
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.types import InputError
@@ -82,7 +82,7 @@ def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arg
     return found
 
 
-def jitted(system: Dynamics) -> dict[str, Callable]:
+def jitted(system: Dynamics | PlainDynamics) -> dict[str, Callable]:
     """The functions by name, closed over their parameters."""
     return {"inverse": jax.jit(system.inverse_dynamics), "forward": jax.jit(system.forward_dynamics)}
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import panels
 from dln_jax.mechanics import integrators
+from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.studies.hamiltonian.tasks import Problem, problem_of
@@ -64,9 +65,7 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
     """
     options = {"optimizer": "adam", "steps": 50} if quick else {}
     trained = train(problem, description_of(problem, "hnn"), seed=0, **options)
-    energy = build_phase(trained.description).apply(trained.result.parameters).energy
-    assert energy is not None
-    return energy
+    return hamiltonian_of(build_phase(trained.description).energies(trained.result.parameters))
 
 
 def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:

@@ -21,7 +21,7 @@ from dln_jax.studies.arm.models import SIZES, needs_of
 from dln_jax.studies.report import Row
 from dln_jax.types import InputError
 from dln_jax.zoo.kinds import build, describe
-from dln_jax.zoo.load import load_run, save_model
+from dln_jax.zoo.load import load_system, save_model
 
 WIDE = "structured-delan-64x64"
 SMALL = "structured-delan"
@@ -94,7 +94,7 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
 
 def torque_mse(folder: Path, sets: Split) -> float:
     """On the test, as the stored model gives it."""
-    return errors(predictions(load_run(folder), sets.test, jnp.float64), sets.test)["torque_mse"]
+    return errors(predictions(load_system(folder), sets.test, jnp.float64), sets.test)["torque_mse"]
 
 
 def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures.benchmarks import points
 from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.two_link_arm import two_link_arm
@@ -36,7 +37,7 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
         narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), initial(model["f32"], kind, data))
         wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), narrow)
         for precision, parameters, dtype in (("f32", narrow, jnp.float32), ("f64", wide, jnp.float64)):
-            system = compiled(model[precision].apply(parameters), dtype)
+            system = compiled(dynamics(model[precision].energies(parameters)), dtype)
             programs = {name: jax.jit(jax.vmap(getattr(system, f"{name}_dynamics"))) for name in ("inverse", "forward")}
             inputs = {"inverse": states[:3], "forward": (*states[:2], states[3])}
             for name, program in programs.items():

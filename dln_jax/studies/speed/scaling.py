@@ -9,6 +9,7 @@ import optax
 from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import curves
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
@@ -49,12 +50,12 @@ def cost(d: int, *, calls: int, repetitions: int) -> list[tuple[str, float, str]
     parameters = jax.jit(model.init)(jax.random.key(0))
     arrays = jax.random.normal(jax.random.key(1), (4, BATCH, d), jnp.float32)
     states = [tuple(arrays[:3, index]) for index in range(64)]
-    single = one_step(jax.jit(model.apply(parameters).inverse_dynamics), states, calls=calls)
+    single = one_step(jax.jit(dynamics(model.energies(parameters)).inverse_dynamics), states, calls=calls)
     optimiser = optax.adam(1e-3)
 
     def step(parameters, moments, arrays):
         def loss(parameters):
-            tau = jax.vmap(model.apply(parameters).inverse_dynamics)(*arrays[:3])
+            tau = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*arrays[:3])
             return jnp.mean((tau - arrays[3]) ** 2)
 
         changes, moments = optimiser.update(jax.grad(loss)(parameters), moments)

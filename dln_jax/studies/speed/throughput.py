@@ -6,7 +6,8 @@ from jax import Array
 from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import curves
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
@@ -25,7 +26,8 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
     rows: list[Row] = []
     speeds: dict[str, tuple[list[float], list[float]]] = {}
     for batch in QUICK if quick else BATCHES:
-        model, states = structured(2, batch)
+        energies, states = structured(2, batch)
+        model = dynamics(energies)
         programs = {
             "inverse": jax.jit(jax.vmap(model.inverse_dynamics)),
             "inverse_again": jax.jit(jax.vmap(model.inverse_dynamics)),
@@ -46,31 +48,22 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
 
 def hessian_row(d: int, repetitions: int) -> Row:
     """How many times the states per second of the full-Hessian way."""
-    model, states = structured(d, HESSIAN_BATCH)
+    energies, states = structured(d, HESSIAN_BATCH)
     ways = {
-        "ours": jax.jit(jax.vmap(model.inverse_dynamics)),
-        "full": jax.jit(jax.vmap(by_full_hessian(lagrangian_of(model)))),
+        "ours": jax.jit(jax.vmap(dynamics(energies).inverse_dynamics)),
+        "full": jax.jit(jax.vmap(by_full_hessian(lagrangian(energies)))),
     }
     seconds = medians_in_turns(ways, states, repetitions=repetitions)
     bound = 4.0 if d == 2 else None
     return Row(f"full-hessian/d-{d}", "speedup", seconds["full"] / seconds["ours"], "1", None, bound, at_least=True)
 
 
-def structured(d: int, batch: int) -> tuple[Dynamics, tuple[Array, ...]]:
-    """A structured DeLaN of two layers of 64, and states (q, qd, qdd), float32."""
+def structured(d: int, batch: int) -> tuple[NaturalSystem, tuple[Array, ...]]:
+    """The energies of a structured DeLaN of two layers of 64, and states (q, qd, qdd), float32."""
     model = make_delan(chain(d).needs, width=64, depth=2)
     keys = jax.random.split(jax.random.key(0), 4)
     states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
-    return model.apply(model.init(keys[0])), states
-
-
-def lagrangian_of(model: Dynamics) -> Lagrangian:
-    """L = T - V of a natural system: qdᵀ M(q) qd - E, since E = T + V."""
-
-    def L(q: Array, qd: Array) -> Array:
-        return qd @ model.mass_matrix(q) @ qd - model.energy(q, qd)
-
-    return L
+    return model.energies(model.init(keys[0])), states
 
 
 def by_full_hessian(L: Lagrangian):

@@ -8,6 +8,7 @@ from dln_jax.data.splits import Split
 from dln_jax.figures.dynamics import error_against_time
 from dln_jax.learning.dynamics_fit import train
 from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import (
     SIZES,
@@ -60,7 +61,7 @@ def linear_alone(sets: Split) -> Measured:
     began = time.perf_counter()
     parameters = fit_linear(model, sets.train).parameters
     seconds = time.perf_counter() - began
-    numbers = {"torque_mse": torque_mse(model.apply(parameters), sets.test), "train_seconds": seconds}
+    numbers = {"torque_mse": torque_mse(dynamics(model.energies(parameters)), sets.test), "train_seconds": seconds}
     return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
 
 
@@ -69,5 +70,6 @@ def gauss_newton_alone(sets: Split, *, steps: int) -> Measured:
     model, settings = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
     training = train(model, sets, settings)
     seconds = training.compile_seconds + training.train_seconds
-    numbers = {"torque_mse": torque_mse(model.apply(training.parameters), sets.test), "train_seconds": seconds}
+    trained = dynamics(model.energies(training.parameters))
+    numbers = {"torque_mse": torque_mse(trained, sets.test), "train_seconds": seconds}
     return numbers, curve(QUICK, sets, training, numbers, 1)

@@ -16,11 +16,13 @@ import numpy as np
 
 from dln_jax.mechanics import lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
-from dln_jax.scenes.scene import closed_form_decomposition, dynamics
+from dln_jax.scenes.scene import closed_form_decomposition
 from dln_jax.studies.case import Case, Findings, largest
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import Needs
@@ -76,7 +78,7 @@ def sizes() -> Findings:
         scene = chain(d)
         q, qd, qdd = _states(4, d)
         # One state at a time: batched library calls within one program may wait for each other.
-        found, accelerations = _mapped(dynamics(scene), q, qd, qdd)
+        found, accelerations = _mapped(dynamics(scene.energies), q, qd, qdd)
         parts, mass = jax.jit(
             lambda *states, scene=scene: jax.lax.map(
                 lambda state: (closed_form_decomposition(scene, *state), scene.mass_matrix(state[0])), states
@@ -92,7 +94,7 @@ def sizes() -> Findings:
         cases.append(_round_trip(f"d-{d}/chain", qdd, accelerations, np.asarray(mass), found))
     for d in SIZES:
         model = make_delan(Needs(joints=("revolute",) * d), width=8, dtype=jnp.float64)
-        system = model.apply(random_parameters(model))
+        system = dynamics(model.energies(random_parameters(model)))
         q, qd, qdd = _states(4, d)
         tau, accelerations = _mapped(system, q, qd, qdd)
         mass = np.asarray(jax.jit(jax.vmap(system.mass_matrix))(q))
@@ -114,7 +116,8 @@ def _structured(factor) -> Dynamics:
 
 
 def _general(factor) -> Dynamics:
-    return lagrangian.dynamics(natural.lagrangian(NaturalSystem(lambda q: (1 + _SWING * jnp.sin(q[0])) * factor)))
+    energies = NaturalSystem(lambda q: (1 + _SWING * jnp.sin(q[0])) * factor)
+    return lagrangian.dynamics(LagrangianSystem(natural.lagrangian(energies)))
 
 
 def _solve(system: Dynamics, q, qd, qdd):
@@ -144,7 +147,7 @@ def _reported_condition(name: str, condition: float, mass: np.ndarray) -> Case:
 
 
 def _constant(mass: np.ndarray) -> Dynamics:
-    return lagrangian.dynamics(lambda q, qd: 0.5 * qd @ jnp.asarray(mass) @ qd)
+    return lagrangian.dynamics(LagrangianSystem(lambda q, qd: 0.5 * qd @ jnp.asarray(mass) @ qd))
 
 
 def _singular() -> list[Case]:

@@ -12,14 +12,14 @@ from dln_jax.datasets import generators
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units
-from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import make_delan
 from dln_jax.models.feed_forward import make_feed_forward
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.scene import dynamics
 from dln_jax.studies.case import Case, Findings, largest
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import InputError, Needs
@@ -108,7 +108,7 @@ def not_finite() -> Findings:
     return Findings(cases)
 
 
-def _systems() -> dict[str, Dynamics]:
+def _systems() -> dict[str, Dynamics | PlainDynamics]:
     needs, cart = Needs(joints=("revolute", "revolute")), Needs(joints=("prismatic", "revolute"))
     models = {
         "structured-delan": make_delan(needs, width=WIDTH, dtype=jnp.float64),
@@ -117,12 +117,12 @@ def _systems() -> dict[str, Dynamics]:
         "feed-forward": make_feed_forward(needs, width=WIDTH, dtype=jnp.float64),
     }
     return {
-        **{name: model.apply(random_parameters(model)) for name, model in models.items()},
-        "double-pendulum": dynamics(double_pendulum()),
+        **{name: dynamics(model.energies(random_parameters(model))) for name, model in models.items()},
+        "double-pendulum": dynamics(double_pendulum().energies),
     }
 
 
-def _answers(system: Dynamics) -> Callable[..., list[np.ndarray]]:
+def _answers(system: Dynamics | PlainDynamics) -> Callable[..., list[np.ndarray]]:
     """tau and qdd of a batch."""
     compiled = jax.jit(jax.vmap(lambda *state: (system.inverse_dynamics(*state), system.forward_dynamics(*state))))
     return lambda *states: [np.asarray(leaf) for leaf in compiled(*states)]

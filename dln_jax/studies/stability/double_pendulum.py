@@ -18,10 +18,11 @@ import numpy as np
 
 from dln_jax.mechanics import hamiltonian, natural
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_order
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.scene import Scene, dynamics
+from dln_jax.scenes.scene import Scene
 from dln_jax.studies.case import Case, Findings, largest
 
 DT = 0.002
@@ -50,7 +51,7 @@ class Chaos(NamedTuple):
 def lyapunov_time(steps: int) -> Findings:
     """How long predictions last, as a multiple of what the Lyapunov exponent allows."""
     scene = double_pendulum()
-    system, rewritten = dynamics(scene), natural.dynamics(_factored(scene))
+    system, rewritten = dynamics(scene.energies), natural.dynamics(_factored(scene))
     chaos = _motions(system, steps)
     t = DT * np.arange(1, steps + 1)
     exponents = chaos.tangent.mean(axis=0) / DT

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.studies.case import Case, Findings
@@ -20,11 +22,11 @@ def indefinite_hessians() -> Findings:
         return 0.5 * (qd[0] ** 2 + q[0] * qd[1] ** 2)
 
     q = np.array([[1.0, 0.0], [0.5, 0.0], [0.0, 0.0], [-1.0, 0.0], [np.nan, 0.0]])
-    report = definiteness(lagrangian.dynamics(known), q, np.zeros_like(q))
-    clean = definiteness(lagrangian.dynamics(known), q[:4], np.zeros((4, 2)))
+    report = definiteness(lagrangian.dynamics(LagrangianSystem(known)), q, np.zeros_like(q))
+    clean = definiteness(lagrangian.dynamics(LagrangianSystem(known)), q[:4], np.zeros((4, 2)))
     needs = Needs(joints=("revolute", "revolute"))
     model = make_black_box_lagrangian(needs, width=16, dtype=jnp.float64)
-    system = model.apply(random_parameters(model))
+    system = dynamics(model.energies(random_parameters(model)))
     states = [np.random.default_rng(0).uniform(-1, 1, (64, 2)) * size for size in (np.pi, 2.0)]
     network = definiteness(system, *states)
     mass = np.asarray(jax.jit(jax.vmap(system.mass_matrix))(*states))

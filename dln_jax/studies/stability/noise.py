@@ -13,6 +13,7 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.datasets import generators
 from dln_jax.learning.linear_fit import LinearFit, fit_linear
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
 from dln_jax.metrics.misfit import velocity_misfit
 from dln_jax.models.model import Model
@@ -105,4 +106,5 @@ def _fit(model: Model, data: Trajectories, **noisy: np.ndarray) -> tuple[LinearF
 
 
 def _torque(model: Model, fit: LinearFit, data: Trajectories) -> np.ndarray:
-    return np.asarray(jax.jit(jax.vmap(model.apply(fit.parameters).inverse_dynamics))(data.q, data.qd, data.qdd))
+    torque = jax.jit(jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics))
+    return np.asarray(torque(data.q, data.qd, data.qdd))

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import make_delan
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.nn.activations import activation
 from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.scene import dynamics
 from dln_jax.studies.case import Case, Findings, largest
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import Needs
@@ -116,7 +116,7 @@ def turned_angles() -> Findings:
             _initialised(make_structured_hamiltonian(needs, width=WIDTH, dtype=jnp.float64)),
             np.float64,
         ),
-        ("double-pendulum", dynamics(scene), np.float64),
+        ("double-pendulum", dynamics(scene.energies), np.float64),
     ]
     text = (
         f"tau after {TURNS} turns differs by |dtau/dq| times the rounding of the angle, 1.25 eps 2 pi k for the sum, "
@@ -143,8 +143,8 @@ def single_precision() -> Findings:
     parameters = random_parameters(model)
     wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), parameters)
     pairs = [
-        ("structured-delan", model.apply(parameters), model.apply(wide)),
-        ("double-pendulum", dynamics(double_pendulum()), dynamics(double_pendulum())),
+        ("structured-delan", dynamics(model.energies(parameters)), dynamics(model.energies(wide))),
+        ("double-pendulum", dynamics(double_pendulum().energies), dynamics(double_pendulum().energies)),
     ]
     roundings = LAYERS * WIDTH
     cases = []
@@ -202,7 +202,7 @@ def _curvature_curves() -> dict:
 
 
 def _initialised(model: Model) -> Dynamics:
-    return model.apply(random_parameters(model))
+    return dynamics(model.energies(random_parameters(model)))
 
 
 def _states(samples: int, d: int, dtype) -> list[np.ndarray]:

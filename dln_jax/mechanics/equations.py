@@ -1,0 +1,103 @@
+"""Equations of motion of any record of energies: `dynamics` in coordinates and velocities, `flow` in a phase space.
+
+| record | energies | found in |
+|---|---|---|
+| `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
+| `ClosedForm` | M, V, D, and the forces that follow | `mechanics.closed_form` |
+| `LagrangianSystem` | L, D | `mechanics.lagrangian` |
+| `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural_hamiltonian` |
+| `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
+| `InverseForward` | none: tau and qdd | `mechanics.plain` |
+| `PhaseRates` | none: (qd, pd) | `mechanics.plain` |
+
+Each energy gives both; `InverseForward` has dynamics only, and `PhaseRates` a flow only.
+"""
+
+from typing import Any, overload
+
+from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.flow import Flow, PlainFlow, make_flow, make_plain_flow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.types import Hamiltonian, InputError
+
+Canonical = NaturalHamiltonian | HamiltonianSystem
+"""Energies that are given in momenta."""
+Energies = NaturalSystem | ClosedForm | LagrangianSystem | Canonical
+Driven = Energies | InverseForward
+"""Systems on which forces act."""
+System = Driven | PhaseRates
+
+_DYNAMICS: dict[type, Any] = {
+    NaturalSystem: natural.dynamics,
+    ClosedForm: closed_form.dynamics,
+    LagrangianSystem: lagrangian.dynamics,
+    NaturalHamiltonian: natural_hamiltonian.dynamics,
+    HamiltonianSystem: hamiltonian.dynamics,
+    InverseForward: plain.dynamics,
+}
+
+
+@overload
+def dynamics(system: Energies, *, degrees_of_freedom: int | None = None) -> Dynamics: ...
+@overload
+def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics: ...
+def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
+    """The functions of a system in coordinates and velocities.
+
+    Args:
+        system: a record of energies, or of what is known in their place.
+        degrees_of_freedom: d, by which states of another size are refused; without it the arguments of a call need to
+            agree with one another only.
+
+    Raises:
+        InputError: the rates of a phase space, which say nothing of forces, or no record.
+    """
+    make = _DYNAMICS.get(type(system))
+    if make is None:
+        raise InputError(f"dynamics got a {type(system).__name__}; expected one of {_names(*_DYNAMICS)}")
+    return make(system, degrees_of_freedom=degrees_of_freedom)
+
+
+@overload
+def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ...
+@overload
+def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> PlainFlow: ...
+def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
+    """The functions of a system in coordinates and momenta, without applied forces; arguments as for `dynamics`.
+
+    Raises:
+        InputError: two functions that are no flow, or no record.
+    """
+    if isinstance(system, PhaseRates):
+        return make_plain_flow(system.rates, degrees_of_freedom=degrees_of_freedom)
+    if not isinstance(system, Energies):
+        known = [*_DYNAMICS, PhaseRates]
+        known.remove(InverseForward)
+        raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(*known)}")
+    H = hamiltonian_of(system)
+    return make_flow(H, dissipation=system.dissipation, degrees_of_freedom=degrees_of_freedom)
+
+
+def hamiltonian_of(system: Energies) -> Hamiltonian:
+    """H(q, p) of any energies; of a Lagrangian by the Legendre transform, which takes a Newton iteration in general."""
+    match system:
+        case HamiltonianSystem():
+            return system.hamiltonian
+        case NaturalHamiltonian():
+            return natural_hamiltonian.hamiltonian(system)
+        case NaturalSystem():
+            return natural.hamiltonian(system)
+        case ClosedForm():
+            return hamiltonian.legendre(closed_form.lagrangian(system), iterations=1)
+        case LagrangianSystem():
+            return hamiltonian.legendre(system.lagrangian)
+
+
+def _names(*types: type) -> str:
+    return ", ".join(each.__name__ for each in types)
