@@ -11,6 +11,7 @@ FLOORS = {
     "files": -2,
     "precision": -2,
     "compilation": -2,
+    "rollout": 1,  # many steps of anything
     "nn": 1,
     "solvers": 1,
     "mechanics": 2,

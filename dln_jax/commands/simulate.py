@@ -10,12 +10,13 @@ by default those of least x). Inverted elements are turned, and it says how many
 """
 
 import dataclasses
+import functools
 import inspect
 import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,15 +29,15 @@ from dln_jax.command_line.running import stored_arguments
 from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.rollout import rollout
 from dln_jax.runs.simulation_results import Motion, draw, results, results_table, warn
-from dln_jax.softbody.driven import Example, beginning, drive, driven_step
+from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
-from dln_jax.softbody.mesh.simplicial_mesh import overlaps
-from dln_jax.softbody.rollout import rollout
+from dln_jax.softbody.mesh.mesh import overlaps
 from dln_jax.softbody.scene import Params, State
-from dln_jax.softbody.step import Integrator, Step
+from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.solvers.elements.minimise import Info
+from dln_jax.solvers.info import Info
 from dln_jax.studies.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
 
@@ -61,7 +62,7 @@ class Arguments:
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
     """What to simulate; all: each in a folder of its own, with one picture of them."""
-    integrator: Integrator = "backward-euler"
+    integrator: Literal["backward-euler", "bdf2", "midpoint"] = "backward-euler"
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
     dt: Unstated[float] = None
     """Time step in s."""
@@ -98,7 +99,7 @@ class Prepared(NamedTuple):
 
     given: Arguments
     example: Example
-    step: Step
+    stepper: Stepper
     dt: float
     """In s."""
     steps: int
@@ -134,8 +135,8 @@ def prepare(given: Arguments) -> Prepared:
     require_positive(dt=dt, seconds=seconds)
     if not dt <= seconds < math.inf:
         raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
-    step = driven_step(example, dt, cast(Integrator, given.integrator))
-    return Prepared(given, example, step, dt, round(seconds / dt))
+    stepper = driven_step(example, dt, INTEGRATORS[given.integrator])
+    return Prepared(given, example, stepper, dt, round(seconds / dt))
 
 
 def simulate(prepared: Prepared, folder: Path, console: Console) -> Moments:
@@ -199,9 +200,8 @@ def example_of(given: Arguments) -> Example:
     if "seed" in known:
         choices["seed"] = given.seed
     example = scene(**choices)
-    precision = PRECISIONS[given.precision]
-    params = in_precision(example.scene.params, precision)
-    return example._replace(scene=example.scene._replace(params=params), state=in_precision(example.state, precision))
+    params = in_precision(example.scene.params, PRECISIONS[given.precision])
+    return example._replace(scene=example.scene._replace(params=params))
 
 
 def in_precision(tree: Any, precision: Any) -> Any:
@@ -211,17 +211,17 @@ def in_precision(tree: Any, precision: Any) -> Any:
 
 def run_motion(prepared: Prepared) -> Motion:
     """The motion, in chunks of one compiled program; compilation is timed apart, and results are waited for."""
-    given, example, step, dt, steps = prepared
+    given, example, (init, step), dt, steps = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params
-    state = beginning(example, cast(Integrator, given.integrator))
+    start = state = in_precision(init(), PRECISIONS[given.precision])
 
     def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
         # Whether the Hessian is definite is not asked for: it would cost a factorisation.
-        return state.x, state.v, info._replace(definite=info.converged)
+        return state.x, state.v, info._replace(definite=None)
 
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
-        return rollout(step, state, params, driven, observe=observe)
+        return rollout(functools.partial(step, params), state, driven, observe=observe)
 
     with progress(steps) as show:
         began = time.perf_counter()
@@ -237,6 +237,5 @@ def run_motion(prepared: Prepared) -> Motion:
             seen.append(jax.tree.map(np.asarray, chunk))
             show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
     x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
-    start = example.state
     x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
     return Motion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from dln_jax.data import archive
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, make_mesh
+from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError
 
 KEYS = ("vertices", "elements", "held")

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from dln_jax.metrics.soft_body_energies import KINETIC, TOTAL
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, boundary
+from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError
 
 COLOURS = {

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dln_jax.figures.gifs import DPI, write_gif
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, boundary
+from dln_jax.softbody.mesh.mesh import Mesh, boundary
 from dln_jax.types import InputError, require_positive
 
 _WIDTH = 8.0

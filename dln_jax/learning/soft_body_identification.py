@@ -18,9 +18,9 @@ import optimistix
 from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import Params, SoftScene, State
-from dln_jax.softbody.step import Step, static_solve
+from dln_jax.rollout import rollout
+from dln_jax.softbody.scene import Params, SoftScene
+from dln_jax.softbody.step import Stepper, static_solve
 from dln_jax.types import require_positive
 
 
@@ -49,7 +49,7 @@ class Fitted(NamedTuple):
 
 
 def identify(
-    step: Step,
+    stepper: Stepper,
     params_of: Callable[[Any], Params],
     guess: Any,
     motions: ObservedMotions,
@@ -60,7 +60,7 @@ def identify(
     """theta at which the simulated motions are nearest to the observed ones.
 
     Args:
-        step: of `make_step`, of a method of one step.
+        stepper: of `make_step`.
         params_of: theta -> the scene's parameters.
         guess: theta to start from, float64 arrays.
         motions: what was observed.
@@ -71,10 +71,12 @@ def identify(
         InputError: numbers that are not positive.
     """
     require_positive(noise=noise, iterations=iterations)
+    init, step = stepper
 
     def residual(theta: Any, x0: Array, v0: Array, controls: Array, observed: Array) -> Array:
         given = controls if controls.shape[1] else None
-        _, (x, _) = rollout(step, State(x0, v0), params_of(theta), given, steps=observed.shape[0])
+        advance = functools.partial(step, params_of(theta))
+        _, x = rollout(advance, init(x0, v0), given, steps=observed.shape[0], observe=lambda state, info: state.x)
         seen = jnp.isfinite(observed)
         return jnp.where(seen, x - jnp.where(seen, observed, 0), 0) / noise
 

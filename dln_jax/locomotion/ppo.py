@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from dln_jax.locomotion.learning import Goal, Learned, Record, Report, compile_evaluation, reached
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, actuation_of
-from dln_jax.softbody.terms.creature_terms import TIME_STEP
+from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError
 
 _ACTOR = ("mlp_extractor.policy_net.0", "mlp_extractor.policy_net.2", "action_net")

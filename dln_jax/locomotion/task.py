@@ -14,15 +14,16 @@ go far by rolling.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.rollout import rollout
+from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
-from dln_jax.softbody.scene import SoftScene, State, initial_state, make_scene
-from dln_jax.softbody.step import Step, make_step
-from dln_jax.softbody.terms.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.scene import SoftScene, State
+from dln_jax.softbody.step import Stepper, make_step
+from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive
 
 CREATURES: dict[str, Callable[[], Creature]] = {"crawler": crawler, "biped": biped, "quadruped": quadruped}
@@ -50,7 +51,7 @@ class Task(NamedTuple):
 
     creature: Creature
     scene: SoftScene
-    step: Step
+    stepper: Stepper
     length: float
     """Body length in m."""
     episode: int
@@ -97,9 +98,8 @@ def make_task(
 ) -> Task:
     """The task of a creature of the "creature" preset, stepped at its published time step."""
     require_positive(episode=episode, clock_period=clock_period)
-    scene = make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles), masses=MASS)
-    step = make_step(scene, TIME_STEP)
-    return Task(creature, scene, step, body_length(creature), episode, clock_period, upright)
+    scene = creature_scene(creature)
+    return Task(creature, scene, make_step(scene, TIME_STEP), body_length(creature), episode, clock_period, upright)
 
 
 def creature_named(name: str) -> Creature:
@@ -111,7 +111,7 @@ def creature_named(name: str) -> Creature:
 
 def beginning(task: Task) -> Place:
     """The creature's rest shape at rest."""
-    return Place(initial_state(task.scene), jnp.asarray(0))
+    return Place(task.stepper.init(), jnp.asarray(0))
 
 
 def observe(task: Task, place: Place) -> Float[Array, " o"]:
@@ -126,7 +126,7 @@ def observe(task: Task, place: Place) -> Float[Array, " o"]:
 
 def advance(task: Task, place: Place, actuation: Float[Array, " k"]) -> tuple[Place, Walk]:
     """The place after one step, and what is seen of the step."""
-    state, info = task.step(place.state, task.scene.params, actuation)
+    state, info = task.stepper.step(task.scene.params, place.state, actuation)
     after = Place(state, place.steps + 1)
     cost, angle = _posture(task, state.x)
     reward = travelled(task, place, after) - task.upright * cost / task.episode
@@ -139,7 +139,7 @@ def walk(task: Task, act: Act, start: Place, steps: int) -> tuple[Place, Walk]:
     def one(place: Place, _: None) -> tuple[Place, Walk]:
         return advance(task, place, act(observe(task, place)))
 
-    return jax.lax.scan(one, start, length=steps)
+    return rollout(one, start, steps=steps, observe=lambda place, seen: seen)
 
 
 def travelled(task: Task, start: Place, end: Place) -> Float[Array, ""]:

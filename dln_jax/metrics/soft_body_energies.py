@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, SoftScene, element_energies, prepare
-from dln_jax.softbody.terms.term import Context
-from dln_jax.solvers.elements.element_energies import value
+from dln_jax.solvers.elements.energies import value
 
 KINETIC, TOTAL = "kinetic", "total"
 # So many moments at a time.
@@ -29,8 +28,7 @@ def motion_energies(
 
     def of_moment(moment: tuple[Array, Array, Array | None]) -> dict[str, Array]:
         x, v, control = moment
-        context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
-        data = prepare(scene, params, context)
+        data = prepare(scene, params, x, control=control)
         stored = {
             term.name: value([energy], x, [of]) for term, energy, of in zip(scene.terms, energies, data, strict=True)
         }

@@ -14,9 +14,9 @@ from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
+from dln_jax.softbody.mesh.mesh import Mesh, volumes
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, volumes
-from dln_jax.solvers.elements.minimise import Info
+from dln_jax.solvers.info import Info
 from dln_jax.studies.report import Row
 
 TITLES = {

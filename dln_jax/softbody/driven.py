@@ -4,16 +4,17 @@ A path is followed exactly: in each step a held vertex has the velocity (p(t + d
 a rotation would spiral outwards.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.scene import Params, Previous, SoftScene, State
-from dln_jax.softbody.step import Integrator, Step, make_step
-from dln_jax.solvers.elements.minimise import Info
+from dln_jax.softbody.scene import Params, SoftScene, State
+from dln_jax.softbody.step import BACKWARD_EULER, Integrator, Stepper, make_step
+from dln_jax.solvers.info import Info
 
 Path = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k dim"]]
 Signal = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k"]]
@@ -23,11 +24,12 @@ class Example(NamedTuple):
     """A scene, how it begins, and what drives it."""
 
     scene: SoftScene
-    state: State
     dt: float
     """Time step that suits it, in s."""
     seconds: float
     """Length of a motion that shows it, in s."""
+    v: Any = 0.0
+    """Velocities at the start in m/s, [n, dim] or one for all; positions are the rest shape's."""
     ground: float | None = None
     """Rise of the ground over its run; it passes through the origin. `None` where there is none."""
     control: Signal | None = None
@@ -57,25 +59,19 @@ def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
     Held vertices get the velocities that take them from each point of their path to the next: they stay on it exactly.
     """
     t = dt * np.arange(first, first + steps + 1)
-    dtype = example.state.x.dtype
+    dtype = example.scene.params.rest.dtype
     control = None if example.control is None else jnp.asarray(example.control(t[1:]), dtype)
     velocity = None if example.held_path is None else jnp.asarray(np.diff(example.held_path(t), axis=0) / dt, dtype)
     return Drive(jnp.asarray(t[1:], dtype), control, velocity)
 
 
-def driven_step(example: Example, dt: float, integrator: Integrator = "backward-euler") -> Step:
-    """step(state, params, Drive) -> (state, Info)."""
-    step = make_step(example.scene, dt, integrator)
+def driven_step(example: Example, dt: float, integrator: Integrator = BACKWARD_EULER) -> Stepper:
+    """(init, step) of an example: init() is its start, and step(params, state, Drive) -> (state, Info)."""
+    init, step = make_step(example.scene, dt, integrator)
 
-    def advance(state: State, params: Params, driven: Drive) -> tuple[State, Info]:
+    def advance(params: Params, state: State, driven: Drive) -> tuple[State, Info]:
         if driven.held_velocity is not None:
             state = state._replace(v=state.v.at[example.scene.held].set(driven.held_velocity))
-        return step(state, params, driven.control)
+        return step(params, state, driven.control)
 
-    return advance
-
-
-def beginning(example: Example, integrator: Integrator = "backward-euler") -> State:
-    """The state at the start, with room for the state before where the integrator needs it."""
-    x, v, _ = example.state
-    return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator == "bdf2" else None)
+    return Stepper(functools.partial(init, v=example.v), advance)

@@ -9,7 +9,7 @@
 | creature | crawler with muscles | crawls, by a wave that runs from its head to its tail |
 
 The last axis points up. Materials are elastic (E in Pa, Poisson's ratio, a density of `strain_energies`); densities are
-1000 kg/m³. The creature is the published preset of `creature_terms`.
+1000 kg/m³. The creature is the published preset of `terms.creature`.
 """
 
 import math
@@ -20,13 +20,13 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from dln_jax.softbody.driven import Example
-from dln_jax.softbody.mesh.builders import beam as beam_mesh
-from dln_jax.softbody.mesh.builders import box, disc
-from dln_jax.softbody.mesh.creatures import body_length, crawler
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, lumped_masses, vertices_where
-from dln_jax.softbody.scene import initial_state, make_scene
+from dln_jax.softbody.mesh.creatures import Creature, body_length, crawler
+from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses, vertices_where
+from dln_jax.softbody.mesh.shapes import beam as beam_mesh
+from dln_jax.softbody.mesh.shapes import box, disc
+from dln_jax.softbody.scene import SoftScene, make_scene
 from dln_jax.softbody.terms.contact import plane_contact
-from dln_jax.softbody.terms.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.terms.creature import MASS, TIME_STEP, creature_terms
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, stable_neo_hookean
@@ -77,7 +77,7 @@ def beam(
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
     terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh)]
     scene = make_scene(mesh, terms, density=DENSITY, held=held)
-    return Example(scene, initial_state(scene), dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
+    return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
 
 def twist(
@@ -104,7 +104,7 @@ def twist(
         return np.stack([0.5 + across, np.broadcast_to(y, angle.shape), 0.5 + up], axis=-1)
 
     moments = (0.0, TURNING / 2, TURNING)
-    return Example(scene, initial_state(scene), dt=1 / 60, seconds=TURNING + 1.0, held_path=path, moments=moments)
+    return Example(scene, dt=1 / 60, seconds=TURNING + 1.0, held_path=path, moments=moments)
 
 
 def slope(
@@ -123,9 +123,7 @@ def slope(
     ground = _ground(mesh, friction, height=0.5, normal=normal)
     terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
     scene = make_scene(mesh, terms, density=DENSITY)
-    return Example(
-        scene, initial_state(scene), dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0)
-    )
+    return Example(scene, dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0))
 
 
 def drop(
@@ -160,15 +158,18 @@ def drop(
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
     v *= random.uniform(-1.0, 1.0)
     v[:, 0] += DROP_SPEED
-    return Example(
-        scene, initial_state(scene, v=v), dt=1 / 200, seconds=2.5, ground=0.0, moments=(0.0, 0.3, 0.52, 0.9, 1.25)
-    )
+    return Example(scene, dt=1 / 200, seconds=2.5, v=v, ground=0.0, moments=(0.0, 0.3, 0.52, 0.9, 1.25))
+
+
+def creature_scene(creature: Creature) -> SoftScene:
+    """A creature of the preset above its ground."""
+    return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles), masses=MASS)
 
 
 def creature() -> Example:
     """The crawler, whose muscles shorten in a wave from its head to its tail, which pushes it forwards."""
     body = crawler()
-    scene = make_scene(body.mesh, creature_terms(body.mesh, body.muscles), masses=MASS)
+    scene = creature_scene(body)
     x, y = body.mesh.vertices[body.muscles].mean(axis=1).T
     phase = 2 * np.pi * x / (WAVE_LENGTH * body_length(body)) - WAVE_DELAY * (y > 0.75 * body.mesh.vertices[:, 1].max())
     mean, amplitude = (LONGEST + SHORTEST) / 2, (LONGEST - SHORTEST) / 2
@@ -178,7 +179,6 @@ def creature() -> Example:
 
     return Example(
         scene,
-        initial_state(scene),
         dt=TIME_STEP,
         seconds=6.0,
         ground=0.0,

@@ -3,16 +3,17 @@
 What a scene does not list is never traced. Everything in `Params` is differentiable and can be mapped over.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, lumped_masses
+from dln_jax.softbody.mesh.mesh import Mesh, lumped_masses
 from dln_jax.softbody.terms.term import Context, Term
-from dln_jax.solvers.elements.element_energies import ElementEnergy, value
+from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.types import InputError
 
 
@@ -62,7 +63,7 @@ class State(NamedTuple):
     v: Float[Array, "n dim"]
     """In m/s; of held vertices, the velocity they are moved with."""
     previous: Previous | None = None
-    """For "bdf2"."""
+    """For methods of two steps."""
 
 
 def make_scene(
@@ -109,25 +110,26 @@ def make_scene(
     return SoftScene(mesh, terms, held, params)
 
 
-def initial_state(scene: SoftScene, *, x: Any = None, v: Any = None, two_steps: bool = False) -> State:
-    """The rest shape at rest, or the positions and velocities given ([n, dim], or one [dim] for all vertices).
+def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
+    """The parameters with some of some terms replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
-        scene: whose state this is.
-        x: positions in m.
-        v: velocities in m/s.
-        two_steps: make room for the state before, which "bdf2" needs.
+        params: of a scene.
+        terms: for the name of a term, new values by the names of its parameters; numbers or arrays, traced or not.
 
     Raises:
-        InputError: a value that is not finite.
+        InputError: a term or a parameter that the scene does not have.
     """
-    shape = scene.mesh.vertices.shape
-    given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
-    for name, values in given.items():
-        if len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), shape)))):
-            raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
-    x, v = (jnp.broadcast_to(jnp.asarray(values, float), shape) for values in given.values())
-    return State(x, v, Previous(x, v, jnp.asarray(False)) if two_steps else None)
+    replaced = dict(params.terms)
+    for name, values in terms.items():
+        if name not in replaced:
+            raise InputError(f"the scene has no term '{name}'; expected one of {', '.join(replaced)}")
+        if unknown := [field for field in values if field not in replaced[name]._fields]:
+            fields = ", ".join(replaced[name]._fields)
+            raise InputError(f"term '{name}' has no parameter '{unknown[0]}'; expected one of {fields}")
+        arrays = jax.tree.map(lambda value: jnp.asarray(value, params.rest.dtype), dict(values))
+        replaced[name] = replaced[name]._replace(**arrays)
+    return params._replace(terms=replaced)
 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
@@ -135,12 +137,14 @@ def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     return tuple(ElementEnergy(term.energy, term.indices, written_out=True) for term in scene.terms)
 
 
-def prepare(scene: SoftScene, params: Params, context: Context) -> tuple[Any, ...]:
-    """Data of the elements of every term for one step."""
+def prepare(
+    scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf, control: Array | None = None
+) -> tuple[Any, ...]:
+    """Data of the elements of every term for a step of dt in s that starts at x, or, by default, for bodies at rest."""
+    context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), control)
     return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
 
 
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
     """V(x) in J: what the scene stores, for energy plots; a term that dissipates counts as it would from rest at x."""
-    context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
-    return value(element_energies(scene), x, prepare(scene, params, context))
+    return value(element_energies(scene), x, prepare(scene, params, x, control=control))

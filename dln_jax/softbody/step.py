@@ -13,7 +13,7 @@ order and does not damp, so that it is for smooth motions.
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,14 +21,57 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
-from dln_jax.softbody.terms.term import Context
-from dln_jax.solvers.elements.element_energies import Corners, ElementEnergy, pattern, value
+from dln_jax.solvers.elements.assembly import pattern
+from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
-from dln_jax.solvers.elements.minimise import Info, minimise
+from dln_jax.solvers.elements.minimise import minimise
+from dln_jax.solvers.info import Info
 from dln_jax.types import InputError, require_positive
 
-Integrator = Literal["backward-euler", "bdf2", "midpoint"]
-Step = Callable[[State, Params, Any], tuple[State, Info]]
+Step = Callable[[Params, State, Any], tuple[State, Info]]
+
+
+class Integrator(NamedTuple):
+    """A line of the table."""
+
+    span: float
+    """Time from the state to the minimum, in units of dt."""
+    target: Callable[[State, Any], tuple[Any, Array]]
+    """(state, dt) -> h, y."""
+    finish: Callable[[State, Array, Any], tuple[Array, Array]]
+    """(state, x of the minimum, dt) -> x_{n+1}, v_{n+1}."""
+    two_steps: bool = False
+    """Whether it needs the state before."""
+
+
+def _bdf2_target(state: State, dt: Any) -> tuple[Array, Array]:
+    x, v, previous = state
+    if previous is None:
+        raise InputError("the state has no room for the state before; make it by the `init` beside this step")
+    h = jnp.where(previous.known, 2 / 3 * dt, dt).astype(x.dtype)
+    y = (4 * x - previous.x + h * (4 * v - previous.v)) / 3
+    return h, jnp.where(previous.known, y, x + dt * v)
+
+
+def _bdf2_finish(state: State, x: Array, dt: Any) -> tuple[Array, Array]:
+    assert state.previous is not None  # as the target has seen
+    v = (3 * x - 4 * state.x + state.previous.x) / (2 * dt)
+    return x, jnp.where(state.previous.known, v, (x - state.x) / dt)
+
+
+BACKWARD_EULER = Integrator(
+    span=1.0,
+    target=lambda state, dt: (dt, state.x + dt * state.v),
+    finish=lambda state, x, dt: (x, (x - state.x) / dt),
+)
+BDF2 = Integrator(span=1.0, target=_bdf2_target, finish=_bdf2_finish, two_steps=True)
+MIDPOINT = Integrator(
+    span=0.5,
+    target=lambda state, dt: (dt / 2, state.x + dt / 2 * state.v),
+    finish=lambda state, x, dt: (2 * x - state.x, 4 / dt * (x - state.x) - state.v),
+)
+INTEGRATORS = {"backward-euler": BACKWARD_EULER, "bdf2": BDF2, "midpoint": MIDPOINT}
+"""By the names that command lines and tables call them."""
 
 TOLERANCE = 1e-6
 """Default largest force that is left over, per mass, in m/s²; Newton's last step usually takes it far below."""
@@ -49,45 +92,62 @@ def incremental_potential(scene: SoftScene) -> tuple[ElementEnergy, ...]:
     )
 
 
+class Stepper(NamedTuple):
+    """A time step, and the states that fit it."""
+
+    init: Callable[..., State]
+    """init(x=None, v=None): the rest shape at rest, or the positions in m and velocities in m/s given, [n, dim] or one
+    [dim] for all vertices. `InputError` for a known value that is not finite."""
+    step: Step
+    """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments."""
+
+
 def make_step(
     scene: SoftScene,
     dt: Any,
-    integrator: Integrator | str = "backward-euler",
+    integrator: Integrator = BACKWARD_EULER,
     *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,
     linear_solver: LinearSolverFactory = by_size,
-) -> Step:
-    """step(state, params, control) -> (state after dt, Info): differentiable in all of its arguments.
+) -> Stepper:
+    """(init, step) of a scene.
 
     Args:
         scene: the body; its terms are compiled, no others.
         dt: in s; a traced value, whose sign is not checked, serves several steps by one program.
-        integrator: "backward-euler", "bdf2" or "midpoint".
+        integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or one's own.
         tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
         iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
         linear_solver: how linear systems are solved; by size unless said.
 
     Raises:
-        InputError: an unknown integrator or a number that is not positive; a step of "bdf2" also for a state without
-            room for the state before.
+        InputError: a number that is not positive.
     """
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
-    if integrator not in get_args(Integrator):
-        raise InputError(f"integrator '{integrator}' is unknown; choose from {', '.join(get_args(Integrator))}")
     energies = incremental_potential(scene)
     free = scene.free
     at = pattern(energies, free.shape[0], free.shape[1], free)
 
-    def step(state: State, params: Params, control: Any = None) -> tuple[State, Info]:
-        length, target = _inertial_target(state, dt, integrator)
-        span = _span(dt, integrator, state)
-        context = Context(params.rest, params.masses, state.x, state.v, span, control)
-        inertia = _Inertia(params.masses / length**2, target)
-        data = (inertia, *prepare(scene, params, context))
+    def init(x: Any = None, v: Any = None) -> State:
+        given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
+        for name, values in given.items():
+            known = not isinstance(values, Tracer)
+            if known and len(wrong := np.argwhere(~np.isfinite(np.broadcast_to(np.asarray(values), free.shape)))):
+                raise InputError(f"{name} of vertex {wrong[0][0]} is not finite; expected numbers")
+        x, v = (jnp.broadcast_to(jnp.asarray(values, float), free.shape) for values in given.values())
+        return State(x, v, Previous(x, v, jnp.asarray(False)) if integrator.two_steps else None)
+
+    def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
+        h, target = integrator.target(state, dt)
+        span = jnp.asarray(integrator.span * dt, state.x.dtype)
+        inertia = _Inertia(params.masses / jnp.asarray(h, state.x.dtype) ** 2, target)
+        data = (inertia, *prepare(scene, params, state.x, dt=span, control=control))
         carried = state.x + span * state.v
-        start = _better(energies, data, jnp.where(free, state.x, carried), jnp.where(free, target, carried))
+        # The better of two starts: where the body is, or where it would be without forces.
+        stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
+        start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
         x, info = minimise(
             energies,
             start,
@@ -99,9 +159,16 @@ def make_step(
             linear_solver=linear_solver,
             at=at,
         )
-        return _advance(state, x, dt, integrator, free), info
+        x, v = integrator.finish(state, x, dt)
+        before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
+        return State(jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v), before), info
 
-    return step
+    return Stepper(init, step)
+
+
+def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:
+    """What of a motion most want to see, for `rollout`: x [n, dim] and whether the step converged."""
+    return state.x, info.converged
 
 
 def static_solve(
@@ -126,11 +193,10 @@ def static_solve(
         linear_solver: how linear systems are solved; by size unless said.
     """
     x = params.rest if x is None else x
-    context = Context(params.rest, params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), control)
     return minimise(
         element_energies(scene),
         x,
-        prepare(scene, params, context),
+        prepare(scene, params, x, control=control),
         free=scene.free,
         scale=params.masses,
         tolerance=tolerance,
@@ -141,43 +207,3 @@ def static_solve(
 
 def _inertia(x: Corners, data: _Inertia) -> Float[Array, ""]:
     return 0.5 * data.weight * sum((coordinate - data.target[i]) ** 2 for i, coordinate in enumerate(x[0]))
-
-
-def _inertial_target(state: State, dt: Any, integrator: str) -> tuple[Array, Array]:
-    """(h, y) of the minimisation."""
-    x, v = state.x, state.v
-    if integrator == "midpoint":
-        return jnp.asarray(dt / 2, x.dtype), x + dt / 2 * v
-    if integrator == "backward-euler":
-        return jnp.asarray(dt, x.dtype), x + dt * v
-    if (previous := state.previous) is None:
-        raise InputError("the state has no room for the state before; make it by initial_state(..., two_steps=True)")
-    length = jnp.where(previous.known, 2 / 3 * dt, dt).astype(x.dtype)
-    two_steps = (4 * x - previous.x + length * (4 * v - previous.v)) / 3
-    return length, jnp.where(previous.known, two_steps, x + dt * v)
-
-
-def _span(dt: Any, integrator: str, state: State) -> Array:
-    """Time in s from the state to the minimum."""
-    return jnp.asarray(dt / 2 if integrator == "midpoint" else dt, state.x.dtype)
-
-
-def _better(energies: tuple[ElementEnergy, ...], data: tuple[Any, ...], stay: Array, coast: Array) -> Array:
-    """The better start of the two: where the body is, or where it would be without forces."""
-    lower = value(energies, coast, data) < value(energies, stay, data)
-    return jnp.where(lower, coast, stay)
-
-
-def _advance(state: State, x: Array, dt: Any, integrator: str, free: np.ndarray) -> State:
-    before = state.previous
-    if integrator == "midpoint":
-        after, v = 2 * x - state.x, 4 / dt * (x - state.x) - state.v
-    elif before is None or integrator == "backward-euler":
-        after, v = x, (x - state.x) / dt
-    else:
-        two_steps = (3 * x - 4 * state.x + before.x) / (2 * dt)
-        after, v = x, jnp.where(before.known, two_steps, (x - state.x) / dt)
-    moved = state._replace(x=jnp.where(free, after, state.x + dt * state.v), v=jnp.where(free, v, state.v))
-    if before is None:
-        return moved
-    return moved._replace(previous=Previous(state.x, state.v, jnp.asarray(True)))

@@ -15,23 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elimination import solve
+from dln_jax.solvers.info import Info
 from dln_jax.types import InputError, require_positive
 
 Root = Float[Array, " n"]
 
 # A root that is right to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
 _ROUNDING_UNITS = 16
-
-
-class Info(NamedTuple):
-    """How an iteration ended."""
-
-    residual: Float[Array, ""]
-    """Largest |f_i| at the last point judged, in the unit of f; the root is one Newton step better."""
-    iterations: Int[Array, ""]
-    """Newton steps taken."""
-    converged: Bool[Array, ""]
-    """Whether the residual is within the tolerance or at the level of rounding; false for non-finite values."""
 
 
 class _State(NamedTuple):

@@ -7,10 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
-from dln_jax.softbody.mesh.builders import beam, box, disc, lattice
 from dln_jax.softbody.mesh.creatures import biped, body_length, crawler, quadruped
-from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
-from dln_jax.softbody.mesh.simplicial_mesh import (
+from dln_jax.softbody.mesh.mesh import (
     boundary,
     boundary_vertices,
     edges,
@@ -20,6 +18,8 @@ from dln_jax.softbody.mesh.simplicial_mesh import (
     vertices_where,
     volumes,
 )
+from dln_jax.softbody.mesh.shapes import beam, box, disc, lattice
+from dln_jax.softbody.mesh.simplices import facets, regularity, simplex_volumes
 from dln_jax.types import InputError
 
 SIZES = st.floats(0.01, 100.0)

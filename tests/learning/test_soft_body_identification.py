@@ -1,15 +1,17 @@
 """What a soft body is made of, found from how it moves; a rest shape, from how it hangs."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dln_jax.learning.soft_body_identification import ObservedMotions, design, identify
-from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import initial_state, make_scene
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.scene import make_scene, with_parameters
+from dln_jax.softbody.step import make_step, positions_and_convergence, static_solve
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
@@ -36,26 +38,31 @@ def slider():
 
 
 def params_of(scene, theta):
-    terms = dict(scene.params.terms)
-    terms["elastic"] = terms["elastic"]._replace(
-        youngs_modulus=theta["youngs_modulus"], poisson_ratio=theta["poisson_ratio"]
+    return with_parameters(
+        scene.params,
+        elastic={"youngs_modulus": theta["youngs_modulus"], "poisson_ratio": theta["poisson_ratio"]},
+        ground={"friction": theta["friction"]},
+        muscles={"stiffness": theta["muscle"]},
     )
-    terms["ground"] = terms["ground"]._replace(friction=theta["friction"])
-    terms["muscles"] = terms["muscles"]._replace(stiffness=theta["muscle"])
-    return scene.params._replace(terms=terms)
 
 
 def test_material_friction_and_muscle_are_recovered_from_a_motion(slider):
-    step = make_step(slider, 0.02, tolerance=1e-9)
-    state = initial_state(slider, v=[1.5, 0.0])
+    stepper = make_step(slider, 0.02, tolerance=1e-9)
+    state = stepper.init(v=[1.5, 0.0])
     controls = 0.8 + 0.2 * jnp.cos(jnp.arange(STEPS))[:, None]
-    _, (x, converged) = jax.jit(lambda p: rollout(step, state, p, controls))(params_of(slider, TRUTH))
+    observe = positions_and_convergence
+
+    @jax.jit
+    def motion(params):
+        return rollout(functools.partial(stepper.step, params), state, controls, observe=observe)[1]
+
+    x, converged = motion(params_of(slider, TRUTH))
     assert converged.all()
     unseen = x.at[3, 2].set(jnp.nan)
     motions = ObservedMotions(state.x[None], state.v[None], controls[None], unseen[None])
     scale = jax.tree.map(lambda value: jnp.asarray(float(value)), GUESS)
     result = identify(
-        step,
+        stepper,
         lambda ratio: params_of(slider, jax.tree.map(lambda r, s: r * s, ratio, scale)),
         jax.tree.map(jnp.ones_like, scale),
         motions,

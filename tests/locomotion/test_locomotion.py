@@ -21,9 +21,9 @@ from dln_jax.locomotion.learning import Goal, Record, compile_learner, learn
 from dln_jax.locomotion.policy import make_policy
 from dln_jax.locomotion.ppo import make_actor
 from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, make_task, observe
-from dln_jax.softbody.mesh.builders import lattice
 from dln_jax.softbody.mesh.creatures import Creature
-from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.types import InputError
 
 EPISODE, WINDOW = 12, 6

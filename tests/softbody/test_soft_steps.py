@@ -7,19 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.softbody.mesh.simplicial_mesh import make_mesh
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import initial_state, make_scene, potential
-from dln_jax.softbody.step import make_step, static_solve
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.scene import make_scene, potential, with_parameters
+from dln_jax.softbody.step import (
+    BACKWARD_EULER,
+    BDF2,
+    INTEGRATORS,
+    MIDPOINT,
+    make_step,
+    positions_and_convergence,
+    static_solve,
+)
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.types import InputError
 
 MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
 WEIGHT = gravity(MESH, (0.0, -9.81))
 SOLID = elastic(MESH, stable_neo_hookean, youngs_modulus=1e5)
-INTEGRATORS = ("backward-euler", "bdf2", "midpoint")
 DT = 0.05
 
 
@@ -30,21 +38,28 @@ def held_body():
 
 
 @functools.cache
-def program(integrator, steps=4, dt=DT):
-    scene = held_body()
-    step = make_step(scene, dt, integrator)
-    return jax.jit(lambda state, params: rollout(step, state, params, steps=steps, observe=lambda s, info: (s, info)))
+def stepper(integrator=BACKWARD_EULER):
+    return make_step(held_body(), DT, integrator)
 
 
-def start(integrator, **given):
-    return initial_state(held_body(), two_steps=integrator == "bdf2", **given)
+@functools.cache
+def program(integrator=BACKWARD_EULER):
+    step = stepper(integrator).step
+
+    def run(params, state):
+        return rollout(functools.partial(step, params), state, steps=4, observe=lambda *state_and_info: state_and_info)
+
+    return jax.jit(run)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+
+
+@every_integrator
 def test_held_vertices_move_with_their_velocity(integrator):
     v = np.zeros((4, 2))
     v[:2] = 0.3, -0.2
-    _, (states, info) = program(integrator)(start(integrator, v=v), held_body().params)
+    _, (states, info) = program(integrator)(held_body().params, stepper(integrator).init(v=v))
     assert info.converged.all() and info.definite.all()
     t = DT * np.arange(1, 5)
     np.testing.assert_allclose(states.x[:, :2], MESH.vertices[:2] + t[:, None, None] * v[:2], atol=1e-14)
@@ -52,18 +67,18 @@ def test_held_vertices_move_with_their_velocity(integrator):
     assert (states.x[:, 2:, 1] < MESH.vertices[2:, 1] - 0.2 * t[:, None]).all()
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@every_integrator
 def test_a_body_without_inner_forces_falls_as_the_method_says(integrator):
     scene = make_scene(MESH, (WEIGHT,))
-    state = initial_state(scene, v=[1.0, 2.0], two_steps=integrator == "bdf2")
-    last, _ = jax.jit(lambda s: rollout(make_step(scene, DT, integrator), s, scene.params, steps=6))(state)
+    init, step = make_step(scene, DT, integrator)
+    last, _ = jax.jit(lambda state: rollout(functools.partial(step, scene.params), state, steps=6))(init(v=[1.0, 2.0]))
     n = np.arange(7)
     parabola = 2.0 * n * DT - 9.81 * (n * DT) ** 2 / 2
     # Backward Euler falls g h² n/2 further.
-    behind = {"backward-euler": 9.81 * DT**2 * 6 / 2, "midpoint": 0.0}
+    behind = {BACKWARD_EULER: 9.81 * DT**2 * 6 / 2, MIDPOINT: 0.0}
     np.testing.assert_allclose(last.x[:, 0] - MESH.vertices[:, 0], 6 * DT, atol=1e-12)
     fallen = np.asarray(last.x[:, 1] - MESH.vertices[:, 1])
-    if integrator == "bdf2":
+    if integrator is BDF2:
         # The recurrence itself, after a first step of backward Euler.
         position, velocity = [0.0, 2.0 * DT - 9.81 * DT**2], [2.0, 2.0 - 9.81 * DT]
         for _ in range(5):
@@ -79,9 +94,9 @@ def test_elements_given_inverted_move_as_those_given_right():
     assert mesh.turned == 1
     solid = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5)
     scene = make_scene(mesh, (solid, gravity(mesh)), held=[0, 1])
-    step = make_step(scene, DT)
-    last = jax.jit(lambda state: rollout(step, state, scene.params, steps=4)[0])(initial_state(scene))
-    expected, _ = program("backward-euler")(start("backward-euler"), held_body().params)
+    init, step = make_step(scene, DT)
+    last = jax.jit(lambda state: rollout(functools.partial(step, scene.params), state, steps=4)[0])(init())
+    expected, _ = program()(held_body().params, stepper().init())
     np.testing.assert_allclose(last.x, expected.x, rtol=1e-12)
     assert np.abs(expected.x - MESH.vertices).max() > 0.05
 
@@ -91,10 +106,14 @@ def test_elements_that_meet_at_one_edge_keep_momentum():
     mesh = make_mesh([*MESH.vertices, [1.4, 1.2]], [[0, 1, 2], [1, 3, 2], [1, 4, 2]])
     scene = make_scene(mesh, (elastic(mesh, stable_neo_hookean, youngs_modulus=1e5),))
     v = np.random.default_rng(0).normal(size=mesh.vertices.shape)
-    step = make_step(scene, DT, tolerance=1e-10)
-    seen = jax.jit(lambda s: rollout(step, s, scene.params, steps=4, observe=lambda s, info: (s.v, info.converged))[1])(
-        initial_state(scene, v=v)
-    )
+    init, step = make_step(scene, DT, tolerance=1e-10)
+
+    @jax.jit
+    def run(state):
+        advance = functools.partial(step, scene.params)
+        return rollout(advance, state, steps=4, observe=lambda state, info: (state.v, info.converged))[1]
+
+    seen = run(init(v=v))
     assert seen[1].all()
     momentum = np.einsum("n,tni->ti", scene.params.masses, seen[0])
     np.testing.assert_allclose(momentum, np.broadcast_to(scene.params.masses @ v, (4, 2)), rtol=1e-9)
@@ -114,11 +133,11 @@ def test_a_hanging_weight_stretches_its_spring_by_its_weight_over_the_stiffness(
 
 def test_segments_change_the_memory_and_not_the_motion_or_its_gradient():
     scene = make_scene(MESH, (springs([[0, 2], [1, 3]], stiffness=200.0),), masses=1.5, held=[0, 1])
-    step = make_step(scene, DT)
+    init, step = make_step(scene, DT)
 
     def height(v, segment):
-        state = initial_state(scene)._replace(v=v)
-        last, (x, converged) = rollout(step, state, scene.params, steps=6, segment=segment)
+        observe, advance = positions_and_convergence, functools.partial(step, scene.params)
+        last, (x, converged) = rollout(advance, init(v=v), steps=6, segment=segment, observe=observe)
         return last.x[3, 1] + x[2, 3, 1], (x, converged)
 
     whole, parts = (jax.jit(jax.grad(functools.partial(height, segment=s), has_aux=True)) for s in (None, 3))
@@ -134,31 +153,29 @@ def test_mapping_over_parameters_equals_one_at_a_time():
     scene = held_body()
     moduli = jnp.array([1e4, 1e6])
 
-    def with_modulus(E):
-        return scene.params._replace(
-            terms=scene.params.terms | {"elastic": scene.params.terms["elastic"]._replace(youngs_modulus=E)}
-        )
+    def moved(E):
+        return program()(with_parameters(scene.params, elastic={"youngs_modulus": E}), stepper().init())[0].x
 
-    run = program("backward-euler")
-    together = jax.jit(jax.vmap(lambda E: run(start("backward-euler"), with_modulus(E))[0].x))(moduli)
+    together = jax.jit(jax.vmap(moved))(moduli)
     for E, x in zip(moduli, together, strict=True):
-        np.testing.assert_allclose(x, run(start("backward-euler"), with_modulus(E))[0].x, atol=1e-10)
+        np.testing.assert_allclose(x, moved(E), atol=1e-10)
 
 
 def test_single_precision_follows_double():
     scene = held_body()
-    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (start("backward-euler"), scene.params))
-    last, (_, info) = program("backward-euler")(*single)
+    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (scene.params, stepper().init()))
+    last, (_, info) = program()(*single)
     assert last.x.dtype == jnp.float32 and info.converged.all()
-    double, _ = program("backward-euler")(start("backward-euler"), scene.params)
+    double, _ = program()(scene.params, stepper().init())
     np.testing.assert_allclose(last.x, double.x, atol=1e-4)
 
 
 def test_what_a_scene_does_not_list_is_not_compiled():
     def flops(*terms):
         scene = make_scene(MESH, terms)
-        step = jax.jit(lambda state, params: make_step(scene, DT)(state, params)[0].x)
-        cost = step.lower(initial_state(scene), scene.params).compile().cost_analysis()
+        init, step = make_step(scene, DT)
+        program = jax.jit(lambda params, state: step(params, state, None)[0].x)
+        cost = program.lower(scene.params, init()).compile().cost_analysis()
         assert cost is not None
         return cost["flops"]
 
@@ -171,3 +188,27 @@ def test_the_potential_is_the_sum_of_the_terms():
     scene = make_scene(MESH, (SOLID, WEIGHT), masses=2.0)
     height = 9.81 * 2.0 * MESH.vertices[:, 1].sum()
     np.testing.assert_allclose(potential(scene, scene.params.rest, scene.params), height, rtol=1e-13)
+
+
+def test_parameters_of_terms_are_replaced_by_name_and_mistakes_are_named():
+    params = held_body().params
+    changed = with_parameters(params, elastic={"youngs_modulus": 2e5}, gravity={"acceleration": [0.0, -1.6]})
+    assert changed.terms["elastic"].youngs_modulus == 2e5 and params.terms["elastic"].youngs_modulus == 1e5
+    np.testing.assert_array_equal(changed.terms["gravity"].acceleration, [0.0, -1.6])
+    assert changed.terms["elastic"].poisson_ratio is params.terms["elastic"].poisson_ratio
+    with pytest.raises(InputError, match="no term 'ground'; expected one of elastic, gravity"):
+        with_parameters(params, ground={"friction": 0.1})
+    with pytest.raises(InputError, match="'elastic' has no parameter 'mu'; expected one of youngs_modulus"):
+        with_parameters(params, elastic={"mu": 1.0})
+
+
+def test_states_fit_their_integrator_or_are_refused():
+    assert stepper(BDF2).init().previous is not None and stepper(MIDPOINT).init().previous is None
+    with pytest.raises(InputError, match="x of vertex 2 is not finite"):
+        stepper().init(x=np.where(np.arange(4)[:, None] == 2, np.nan, MESH.vertices))
+    with pytest.raises(InputError, match="no room for the state before"):
+        stepper(BDF2).step(held_body().params, stepper().init(), None)
+    with pytest.raises(InputError, match="neither inputs nor steps"):
+        rollout(lambda state, _: (state, None), jnp.zeros(1))
+    with pytest.raises(InputError, match="segment is 4 for 6 steps"):
+        rollout(lambda state, _: (state, None), jnp.zeros(1), steps=6, segment=4)

@@ -9,20 +9,10 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
-from dln_jax.softbody.mesh.builders import beam, box
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
 from dln_jax.solvers.elements.conjugate_gradients import conjugate_gradients
-from dln_jax.solvers.elements.element_energies import (
-    ElementEnergy,
-    Pattern,
-    assemble,
-    element_hessians,
-    entries,
-    gradient,
-    lower_triangles,
-    pattern,
-    square,
-    value,
-)
+from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, square, value
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.elements.projection import project

@@ -1,1 +1,38 @@
-"""Meshes of simplices: built, checked and measured."""
+"""Meshes of simplices: drawn, checked and measured."""
+
+from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
+from dln_jax.softbody.mesh.mesh import (
+    Mesh,
+    boundary,
+    boundary_vertices,
+    edges,
+    lumped_masses,
+    make_mesh,
+    overlaps,
+    vertices_where,
+    volumes,
+)
+from dln_jax.softbody.mesh.shapes import beam, box, disc, lattice
+from dln_jax.softbody.mesh.simplices import simplex_volumes
+
+__all__ = [
+    "Creature",
+    "Mesh",
+    "beam",
+    "biped",
+    "body_length",
+    "boundary",
+    "boundary_vertices",
+    "box",
+    "crawler",
+    "disc",
+    "edges",
+    "lattice",
+    "lumped_masses",
+    "make_mesh",
+    "overlaps",
+    "quadruped",
+    "simplex_volumes",
+    "vertices_where",
+    "volumes",
+]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from dln_jax.softbody.mesh.builders import lattice
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, boundary, make_mesh
+from dln_jax.softbody.mesh.mesh import Mesh, boundary, make_mesh
+from dln_jax.softbody.mesh.shapes import lattice
 
 POINT = 0.8
 """Length of a pointed end, in cells."""

@@ -1,1 +1,25 @@
-"""Energy terms of soft bodies, one file each."""
+"""Energy terms of soft bodies, and the laws of material and friction that they are made of."""
+
+from dln_jax.softbody.terms.contact import distance_contact, plane_contact
+from dln_jax.softbody.terms.creature import creature_terms
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.springs import muscles, springs
+from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
+from dln_jax.softbody.terms.term import Context, Term
+
+__all__ = [
+    "Context",
+    "Term",
+    "corotated",
+    "creature_terms",
+    "distance_contact",
+    "elastic",
+    "gravity",
+    "muscles",
+    "neo_hookean",
+    "plane_contact",
+    "springs",
+    "st_venant_kirchhoff",
+    "stable_neo_hookean",
+]

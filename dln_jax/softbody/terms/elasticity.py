@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh
+from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.parameters import Bound, Numbers, material
 from dln_jax.softbody.terms.strain_energies import StrainEnergy, cofactors, determinant
 from dln_jax.softbody.terms.term import Context, Corners, Term

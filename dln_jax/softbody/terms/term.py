@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from dln_jax.solvers.elements.element_energies import Corners
+from dln_jax.solvers.elements.energies import Corners
 
 
 class Context(NamedTuple):
@@ -25,8 +25,6 @@ class Context(NamedTuple):
     """In kg."""
     x: Float[Array, "n dim"]
     """Positions at the start of the step, in m."""
-    v: Float[Array, "n dim"]
-    """Velocities at the start of the step, in m/s."""
     dt: Float[Array, ""]
     """Length of the step in s; infinite for a static solve."""
     control: Float[Array, " controls"] | None

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-Blocks = Float[Array, "n b"]
+from dln_jax.solvers.elements.energies import Blocks
 
 # Sufficient decrease of the line search (Armijo), and how often it halves the step.
 _DECREASE = 1e-4

@@ -19,19 +19,12 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from dln_jax.solvers.elements.element_energies import (
-    Blocks,
-    ElementEnergy,
-    Pattern,
-    element_hessians,
-    entries,
-    gradient,
-    pattern,
-    value_and_gradient,
-)
+from dln_jax.solvers.elements.assembly import Pattern, entries, gradient, pattern, value_and_gradient
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians
 from dln_jax.solvers.elements.line_search import Point, line_search
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory, by_size
 from dln_jax.solvers.elements.projection import project
+from dln_jax.solvers.info import Info
 from dln_jax.types import InputError, require_positive
 
 # Gradients and energies cannot be told from zero below so many units of rounding.
@@ -41,18 +34,12 @@ _ROUNDING_UNITS = 16
 _SHIFTS = (1e-6, 1e-3, 1.0)
 
 
-class Info(NamedTuple):
-    """How a minimisation ended."""
+class _Sum(NamedTuple):
+    """What is minimised, and how its linear systems are solved."""
 
-    residual: Float[Array, ""]
-    """Largest |dE/dx| / scale at the point returned."""
-    iterations: Int[Array, ""]
-    """Newton steps taken."""
-    converged: Bool[Array, ""]
-    """Whether the residual is within the tolerance or at the level of rounding; false where values are not finite."""
-    definite: Bool[Array, ""]
-    """Whether the Hessian at the point returned, as it is, is positive definite: a minimum and no saddle. Costs a
-    factorisation, which is left out of the program where this is not used."""
+    energies: tuple[ElementEnergy, ...]
+    at: Pattern
+    solver: LinearSolver
 
 
 class _State(NamedTuple):
@@ -103,19 +90,19 @@ def minimise(
         data = (jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], data),)
     energies = tuple(energies)
     at = pattern(energies, x0.shape[0], x0.shape[1], free) if at is None else at
-    solver = linear_solver(energies, at)
+    total = _Sum(energies, at, linear_solver(energies, at))
     scale = jnp.broadcast_to(jnp.asarray(scale, x0.dtype), x0.shape[:1])[:, None]
 
     @jax.custom_jvp
     def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
-        x, info = _newton(energies, at, solver, x0, data, scale, tolerance, iterations)
+        x, info = _newton(total, x0, data, scale, tolerance, iterations)
         # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
-        solved = solver.solve(_factor(energies, at, solver, x, data), jnp.ones_like(x))
+        solved = total.solver.solve(_factor(total, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
     def derivative(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         x, info = minimum(*primals)
-        x_dot = _implicit_derivative(energies, at, solver, x, primals[1], *tangents[:2])
+        x_dot = _implicit_derivative(total, x, primals[1], *tangents[:2])
         x_dot = x_dot * jnp.where(info.converged, 1.0, jnp.nan).astype(x.dtype)
         return (x, info), (x_dot, jax.tree.map(_no_tangent, info))
 
@@ -133,15 +120,8 @@ def _no_tangent(leaf: Array) -> Any:
     return np.zeros(leaf.shape, jax.dtypes.float0)
 
 
-def _implicit_derivative(
-    energies: Sequence[ElementEnergy],
-    at: Pattern,
-    solver: LinearSolver,
-    x: Blocks,
-    data: Any,
-    x0_dot: Any,
-    data_dot: Any,
-) -> Blocks:
+def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_dot: Any) -> Blocks:
+    energies, at, solver = total
     # What does not vary is left out: its derivatives would be computed only to be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
@@ -169,7 +149,7 @@ def _implicit_derivative(
         else:
             _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
         # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
-        factor = _factor(energies, at, solver, *jax.lax.stop_gradient((x, data)))
+        factor = _factor(total, *jax.lax.stop_gradient((x, data)))
         return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
 
     fixed_dot = jnp.where(at.free, 0, x0_dot) if moving else None
@@ -177,21 +157,13 @@ def _implicit_derivative(
     return solution if fixed_dot is None else solution + fixed_dot
 
 
-def _factor(energies: Sequence[ElementEnergy], at: Pattern, solver: LinearSolver, x: Blocks, data: Any) -> Any:
-    hessians = element_hessians(energies, x, data)
-    return solver.factorise(hessians, entries(at, hessians))
+def _factor(total: _Sum, x: Blocks, data: Any) -> Any:
+    hessians = element_hessians(total.energies, x, data)
+    return total.solver.factorise(hessians, entries(total.at, hessians))
 
 
-def _newton(
-    energies: Sequence[ElementEnergy],
-    at: Pattern,
-    solver: LinearSolver,
-    x0: Blocks,
-    data: Any,
-    scale: Array,
-    tolerance: float,
-    iterations: int,
-) -> tuple[Blocks, Info]:
+def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, iterations: int) -> tuple[Blocks, Info]:
+    energies, at, _ = total
     rounding = _ROUNDING_UNITS * jnp.finfo(x0.dtype).eps
 
     def evaluate(x: Blocks) -> tuple[Array, Blocks]:
@@ -206,7 +178,7 @@ def _newton(
     def iterate(state: _State) -> _State:
         hessians = element_hessians(energies, state.x, data)
         values = entries(at, hessians)
-        direction = _descent_direction(at, solver, hessians, values, state.gradient)
+        direction = _descent_direction(total, hessians, values, state.gradient)
         slope = jnp.vdot(direction, state.gradient)
         # What cancels in a row of the gradient is of the size of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(state.x.shape)
@@ -221,12 +193,12 @@ def _newton(
     start = _State(x0, energy, first, jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
     last = jax.lax.while_loop(running, iterate, start)
     residual = jnp.max(jnp.abs(last.gradient) / scale, initial=0)
-    return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy), jnp.asarray(False))
+    return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy))
 
 
-def _descent_direction(
-    at: Pattern, solver: LinearSolver, hessians: Sequence[Array], values: Array, gradient: Blocks
-) -> Blocks:
+def _descent_direction(total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks) -> Blocks:
+    _, at, solver = total
+
     def towards(hessians: Sequence[Array], values: Array) -> tuple[Blocks, Array]:
         direction = solver.search(solver.factorise(hessians, values), -gradient)
         return direction, jnp.isfinite(direction).all() & (jnp.vdot(direction, gradient) <= 0)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.solvers.elements.element_energies import lower_triangles, square
+from dln_jax.solvers.elements.energies import lower_triangles, square
 
 
 def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:

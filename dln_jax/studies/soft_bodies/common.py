@@ -1,32 +1,39 @@
 """What the cases of soft bodies share."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import Params, SoftScene, State
-from dln_jax.softbody.step import Integrator, make_step
-from dln_jax.solvers.elements.minimise import Info
+from dln_jax.rollout import rollout
+from dln_jax.softbody.scene import Params, State
+from dln_jax.softbody.step import Step
+from dln_jax.solvers.info import Info
 
 GRAVITY = 9.8
 """In m/s², of the reference values."""
 
 
-def positions_and_velocities(state: State, info: Info) -> tuple[Any, Any, Any]:
-    """x, v [n, dim], and whether the step converged."""
-    return state.x, state.v, info.converged
+class Seen(NamedTuple):
+    """What is seen after each of T steps."""
+
+    x: Float[np.ndarray, "T n dim"]
+    v: Float[np.ndarray, "T n dim"]
+    iterations: Int[np.ndarray, " T"]
+    converged: Bool[np.ndarray, " T"]
 
 
-def motion(
-    scene: SoftScene, dt: float, steps: int, integrator: Integrator = "backward-euler", **options: Any
-) -> Callable[..., Any]:
-    """(state, params, controls) -> (x [steps, n, dim], v, converged [steps]), compiled at its first call."""
-    step = make_step(scene, dt, integrator, **options)
+def motion(step: Step, steps: int) -> Callable[[Params, State], Seen]:
+    """(params, state) -> so many steps from there, compiled at its first call."""
 
-    def run(state: State, params: Params, controls: Any = None) -> Any:
-        observe = positions_and_velocities
-        return rollout(step, state, params, controls, steps=None if controls is not None else steps, observe=observe)[1]
+    def observe(state: State, info: Info) -> tuple:
+        return state.x, state.v, info.iterations, info.converged
 
-    return jax.jit(run)
+    @jax.jit
+    def program(params: Params, state: State) -> tuple:
+        return rollout(functools.partial(step, params), state, steps=steps, observe=observe)[1]
+
+    return lambda params, state: Seen(*map(np.asarray, program(params, state)))

@@ -9,6 +9,7 @@ for steps e that halve. Of these the one counts that changes least from the step
 the gradient.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,13 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dln_jax.softbody.mesh.builders import beam
+from dln_jax.rollout import rollout
+from dln_jax.softbody.examples import creature_scene
 from dln_jax.softbody.mesh.creatures import crawler
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import SoftScene, State, initial_state, make_scene
+from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, with_parameters
 from dln_jax.softbody.step import Step, make_step
 from dln_jax.softbody.terms.contact import plane_contact
-from dln_jax.softbody.terms.creature_terms import MASS, TIME_STEP, creature_terms
+from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
@@ -109,24 +111,23 @@ def coulomb(quick: bool) -> Findings:
     )
     material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5, poisson_ratio=0.3)
     scene = make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY)), ground])
+    init, step = make_step(scene, 0.01, tolerance=TOLERANCE)
+    terms = scene.params.terms
     at = {
-        "youngs_modulus": scene.params.terms["elastic"].youngs_modulus,
-        "poisson_ratio": scene.params.terms["elastic"].poisson_ratio,
-        "friction": scene.params.terms["ground"].friction,
-        "ground_stiffness": scene.params.terms["ground"].stiffness,
-        "v0": initial_state(scene, v=(2.0, 0.0)).v,
+        "youngs_modulus": terms["elastic"].youngs_modulus,
+        "poisson_ratio": terms["elastic"].poisson_ratio,
+        "friction": terms["ground"].friction,
+        "ground_stiffness": terms["ground"].stiffness,
+        "v0": init(v=(2.0, 0.0)).v,
     }
-    step = make_step(scene, 0.01, tolerance=TOLERANCE)
 
     def loss(at: dict[str, Array]) -> Array:
-        elastic_, ground_ = scene.params.terms["elastic"], scene.params.terms["ground"]
-        terms = {
-            **scene.params.terms,
-            "elastic": elastic_._replace(youngs_modulus=at["youngs_modulus"], poisson_ratio=at["poisson_ratio"]),
-            "ground": ground_._replace(friction=at["friction"], stiffness=at["ground_stiffness"]),
-        }
-        start = initial_state(scene)._replace(v=at["v0"])
-        return _objective(step, start, scene.params._replace(terms=terms), None, 20 if quick else 50)
+        params = with_parameters(
+            scene.params,
+            elastic={"youngs_modulus": at["youngs_modulus"], "poisson_ratio": at["poisson_ratio"]},
+            ground={"friction": at["friction"], "stiffness": at["ground_stiffness"]},
+        )
+        return _objective(step, init(v=at["v0"]), params, None, 20 if quick else 50)
 
     return _compared("sliding-beam", loss, at)
 
@@ -134,7 +135,7 @@ def coulomb(quick: bool) -> Findings:
 def crawling_scene() -> tuple[SoftScene, int]:
     """The crawler of the preset, and how many muscles it has."""
     body = crawler()
-    return make_scene(body.mesh, creature_terms(body.mesh, body.muscles), masses=MASS), len(body.muscles)
+    return creature_scene(body), len(body.muscles)
 
 
 def gait(steps: int, muscles: int) -> Array:
@@ -146,8 +147,8 @@ def gait(steps: int, muscles: int) -> Array:
 def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, Any]]:
     """How far the crawler gets as a function of all that it depends on, and the point where that is looked at."""
     scene, muscles = crawling_scene()
-    step = make_step(scene, TIME_STEP, tolerance=tolerance)
-    terms, start = scene.params.terms, initial_state(scene)
+    init, step = make_step(scene, TIME_STEP, tolerance=tolerance)
+    terms, start = scene.params.terms, init()
     at = {
         "controls": gait(steps, muscles),
         "mu": terms["elastic"].mu,
@@ -162,14 +163,13 @@ def crawling(steps: int, tolerance: float = TOLERANCE) -> tuple[Loss, dict[str, 
     }
 
     def loss(at: dict[str, Array]) -> Array:
-        replaced = {
-            **terms,
-            "elastic": terms["elastic"]._replace(mu=at["mu"], lam=at["lambda"]),
-            "muscles": terms["muscles"]._replace(stiffness=at["muscle_stiffness"]),
-            "ground": terms["ground"]._replace(stiffness=at["ground_stiffness"], friction=at["friction"]),
-        }
-        params = scene.params._replace(rest=at["rest_shape"], masses=at["masses"], terms=replaced)
-        return _objective(step, start._replace(x=at["x0"], v=at["v0"]), params, at["controls"], steps)
+        params = with_parameters(
+            scene.params._replace(rest=at["rest_shape"], masses=at["masses"]),
+            elastic={"mu": at["mu"], "lam": at["lambda"]},
+            muscles={"stiffness": at["muscle_stiffness"]},
+            ground={"stiffness": at["ground_stiffness"], "friction": at["friction"]},
+        )
+        return _objective(step, init(at["x0"], at["v0"]), params, at["controls"])
 
     return loss, at
 
@@ -179,25 +179,23 @@ def _swinging(steps: int) -> tuple[Loss, dict[str, Any]]:
     mesh = beam(1.0, 0.5, 1, 1)
     pairs = [[0, 1], [1, 3], [3, 2], [2, 0], [0, 3]]
     scene = make_scene(mesh, [springs(pairs, stiffness=2e4), gravity(mesh, (0.0, -GRAVITY))], held=[0])
-    terms, step = scene.params.terms, make_step(scene, 0.01, tolerance=TOLERANCE)
+    init, step = make_step(scene, 0.01, tolerance=TOLERANCE)
     at = {
         "stiffness": jnp.full(len(pairs), 2e4),
         "rest_shape": scene.params.rest,
-        "v0": initial_state(scene, v=np.array([[0.0, 0.0], [1.0, -0.2], [0.3, 0.0], [1.0, 0.5]])).v,
+        "v0": init(v=np.array([[0.0, 0.0], [1.0, -0.2], [0.3, 0.0], [1.0, 0.5]])).v,
     }
 
     def loss(at: dict[str, Array]) -> Array:
-        replaced = {**terms, "springs": terms["springs"]._replace(stiffness=at["stiffness"])}
-        params = scene.params._replace(rest=at["rest_shape"], terms=replaced)
-        return _objective(step, initial_state(scene)._replace(v=at["v0"]), params, None, steps)
+        params = with_parameters(scene.params._replace(rest=at["rest_shape"]), springs={"stiffness": at["stiffness"]})
+        return _objective(step, init(v=at["v0"]), params, None, steps)
 
     return loss, at
 
 
-def _objective(step: Step, start: State, params: Any, controls: Any, steps: int) -> Array:
+def _objective(step: Step, start: State, params: Params, controls: Any, steps: int | None = None) -> Array:
     """How far the body gets, plus its velocity and a part of its shape; in m."""
-    count = None if controls is not None else steps
-    last, _ = rollout(step, start, params, controls, steps=count, observe=lambda state, info: None)
+    last, _ = rollout(functools.partial(step, params), start, controls, steps=steps, observe=lambda state, info: None)
     return last.x[:, 0].mean() + 0.1 * (last.x[:, 1] ** 2).sum() + 0.1 * last.v[0, 0]
 
 

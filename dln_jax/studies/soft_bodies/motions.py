@@ -8,22 +8,22 @@ Numerical Integration" (2006), sections IV.2 and VI.
 
 import functools
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.softbody.mesh.builders import beam
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh
-from dln_jax.softbody.scene import Params, SoftScene, State, initial_state, make_scene, potential
-from dln_jax.softbody.step import Integrator, make_step
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.mesh.shapes import beam
+from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, potential, with_parameters
+from dln_jax.softbody.step import BACKWARD_EULER, INTEGRATORS, Integrator, make_step
 from dln_jax.softbody.terms.elasticity import elastic
-from dln_jax.softbody.terms.gravity import Gravity, gravity
+from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.studies.case import Case, Findings, largest
-from dln_jax.studies.soft_bodies.common import GRAVITY, motion
+from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, motion
 
 DT = 0.01
 STEPS = 50
@@ -32,16 +32,18 @@ TOLERANCE = 1e-9
 ORDERS = {"backward-euler": 1, "bdf2": 2, "midpoint": 2}
 DURATION = 1.0
 """Of the swing that orders are measured on, in s."""
+SWING = np.array([[0.0, 0.0], [0.0, 1.0], [0.5, -1.0]])
+"""Velocities at its start, in m/s."""
 
 
 def free_fall(quick: bool) -> Findings:
     """A body thrown without deformation: every vertex falls as the method says, to rounding."""
-    scene, run = _thrown("backward-euler")
-    velocity = jnp.array([1.0, 2.0])
-    x, *_ = run(initial_state(scene, v=velocity), scene.params)
+    scene, init, run = _thrown(BACKWARD_EULER)
+    velocity = np.array([1.0, 2.0])
+    seen = run(scene.params, init(v=velocity))
     n = np.arange(1, STEPS + 1)[:, None, None]
-    fall = n * DT * np.asarray(velocity) + np.array([0.0, -GRAVITY]) * DT**2 * n * (n + 1) / 2
-    error = largest(abs(np.asarray(x) - scene.mesh.vertices - fall))
+    fall = n * DT * velocity + np.array([0.0, -GRAVITY]) * DT**2 * n * (n + 1) / 2
+    error = largest(abs(seen.x - scene.mesh.vertices - fall))
     text = f"{STEPS} steps of {DT} s end where the sum says, to rounding"
     return Findings([Case("free-fall/backward-euler", "largest_position_error", text, error, 1e-12, "m")])
 
@@ -50,11 +52,11 @@ def invariants(quick: bool) -> Findings:
     """A free body that turns and wobbles: momentum, angular momentum, energy."""
     cases, curves = [], {}
     for integrator in ("backward-euler", "midpoint"):
-        scene, run = _thrown(integrator)
+        scene, init, run = _thrown(INTEGRATORS[integrator])
         params = _weightless(scene.params)
-        start = initial_state(scene, v=_turning(scene))
-        x, v, converged = run(start, params)
-        x, v = np.concatenate([start.x[None], x]), np.concatenate([start.v[None], v])
+        start = init(v=_turning(scene))
+        seen = run(params, start)
+        x, v = np.concatenate([start.x[None], seen.x]), np.concatenate([start.v[None], seen.v])
         masses = np.asarray(params.masses)
         momentum = np.einsum("n,tnd->td", masses, v)
         turning = np.einsum("n,tn->t", masses, x[..., 0] * v[..., 1] - x[..., 1] * v[..., 0])
@@ -65,7 +67,7 @@ def invariants(quick: bool) -> Findings:
         scale = float(np.sum(masses[:, None] * abs(v[0])))
         drift = largest(abs(momentum - momentum[0])) / scale
         cases += [
-            Case(name, "steps_not_converged", "every step converges", largest(~np.asarray(converged)), 0.0),
+            Case(name, "steps_not_converged", "every step converges", largest(~seen.converged), 0.0),
             Case(name, "momentum_drift", "internal forces sum to zero: exact to rounding", drift, 1e-12),
         ]
         change = (turning - turning[0]) / turning[0]
@@ -90,17 +92,18 @@ def oscillator(quick: bool) -> Findings:
     cases = []
     for integrator in ("backward-euler", "midpoint"):
         steps = min(_counts(quick))
-        scene, run = _pendulum(integrator, steps)
         h = DURATION / steps
-        unit = scene.params.terms["springs"]._replace(stiffness=jnp.array([1e3, 1e3]), rest_length=jnp.zeros(2))
-        params = _weightless(scene.params._replace(terms={**scene.params.terms, "springs": unit}))
+        scene = _two_masses()
+        init, step = make_step(scene, h, INTEGRATORS[integrator], tolerance=TOLERANCE)
+        unit = {"stiffness": np.array([1e3, 1e3]), "rest_length": np.zeros(2)}
+        params = _weightless(with_parameters(scene.params, springs=unit))
         # Only the last mass moves: the other hangs from the ceiling by springs that balance.
         masses = np.asarray(params.masses)
         frequencies, modes = _spring_modes(masses[1:], 1e3)
-        start = initial_state(scene, x=np.zeros((3, 2)))
-        start = start._replace(x=start.x.at[1:, 0].set(0.1 * jnp.asarray(modes[:, 0])))
-        x, v, _ = run(start, params)
-        amplitude = np.sqrt(frequencies[0] ** 2 * np.asarray(x[:, 2, 0]) ** 2 + np.asarray(v[:, 2, 0]) ** 2)
+        x = np.zeros((3, 2))
+        x[1:, 0] = 0.1 * modes[:, 0]
+        seen = motion(step, steps)(params, init(x))
+        amplitude = np.sqrt(frequencies[0] ** 2 * seen.x[:, 2, 0] ** 2 + seen.v[:, 2, 0] ** 2)
         first = frequencies[0] * 0.1 * abs(modes[1, 0])
         factors = amplitude / np.concatenate([[first], amplitude[:-1]])
         exact = (1 + (frequencies[0] * h) ** 2) ** -0.5 if integrator == "backward-euler" else 1.0
@@ -116,42 +119,32 @@ def orders(quick: bool) -> Findings:
     counts = _counts(quick)
     cases, curves = [], {"dt": DURATION / np.array(counts)}
     scene = _two_masses()
-    reference = _reference_swing(scene, initial_state(scene, v=_swing()))
-    for integrator in get_args(Integrator):
+    reference = _reference_swing(scene)
+    for name, integrator in INTEGRATORS.items():
 
-        def swing(start: State, count: Any, integrator: Integrator = integrator) -> Any:
-            step = make_step(scene, DURATION / count, integrator, tolerance=TOLERANCE)
-            return jax.lax.fori_loop(0, count, lambda _, state: step(state, scene.params, None)[0], start).x
+        @jax.jit  # one program for every step length
+        def end(count: Any, integrator: Integrator = integrator) -> Any:
+            init, step = make_step(scene, DURATION / count, integrator, tolerance=TOLERANCE)
+            return jax.lax.fori_loop(0, count, lambda _, state: step(scene.params, state, None)[0], init(v=SWING)).x
 
-        end = jax.jit(swing)  # one program for every step length
-
-        start = initial_state(scene, v=_swing(), two_steps=integrator == "bdf2")
-        errors = [largest(abs(np.asarray(end(start, count)) - reference)) for count in counts]
-        curves[integrator] = np.array(errors)
+        errors = [largest(abs(np.asarray(end(count)) - reference)) for count in counts]
+        curves[name] = np.array(errors)
         order = float(np.log2(errors[-2] / errors[-1]))
-        expected = ORDERS[integrator]
+        expected = ORDERS[name]
         text = f"order {expected} between {counts[-2]} and {counts[-1]} steps, against RK4 in NumPy"
-        cases.append(
-            Case(f"order/{integrator}", "order_error", text, abs(order - expected), 0.15, reference=float(expected))
-        )
+        cases.append(Case(f"order/{name}", "order_error", text, abs(order - expected), 0.15, reference=float(expected)))
     return Findings(cases, curves)
 
 
 @functools.cache
-def _thrown(integrator: Integrator) -> tuple[SoftScene, Callable[[State, Params], Any]]:
+def _thrown(integrator: Integrator) -> tuple[SoftScene, Callable[..., State], Callable[[Params, State], Seen]]:
     mesh = beam(1.0, 0.25, 4, 1)
     material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5, poisson_ratio=0.3)
     scene = make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))])
-    return scene, motion(scene, DT, STEPS, integrator, tolerance=TOLERANCE)
+    init, step = make_step(scene, DT, integrator, tolerance=TOLERANCE)
+    return scene, init, motion(step, STEPS)
 
 
-@functools.cache
-def _pendulum(integrator: Integrator, steps: int) -> tuple[SoftScene, Callable[[State, Params], Any]]:
-    scene = _two_masses()
-    return scene, motion(scene, DURATION / steps, steps, integrator, tolerance=TOLERANCE)
-
-
-@functools.cache
 def _two_masses() -> SoftScene:
     """Two masses that hang from a point by springs."""
     mesh = Mesh(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), np.zeros((0, 3), int))
@@ -167,7 +160,7 @@ def _counts(quick: bool) -> tuple[int, ...]:
 
 
 def _weightless(params: Params) -> Params:
-    return params._replace(terms={**params.terms, "gravity": Gravity(jnp.zeros(2))})
+    return with_parameters(params, gravity={"acceleration": np.zeros(2)})
 
 
 def _turning(scene: SoftScene) -> np.ndarray:
@@ -175,10 +168,6 @@ def _turning(scene: SoftScene) -> np.ndarray:
     x = scene.mesh.vertices - scene.mesh.vertices.mean(axis=0)
     bending = np.stack([np.zeros(len(x)), 8.0 * (x[:, 0] ** 2 - 0.1)], axis=1)
     return np.stack([-x[:, 1], x[:, 0]], axis=1) * 3.0 + bending + np.array([0.5, 0.2])
-
-
-def _swing() -> np.ndarray:
-    return np.array([[0.0, 0.0], [0.0, 1.0], [0.5, -1.0]])
 
 
 def _spring_modes(masses: np.ndarray, stiffness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +178,7 @@ def _spring_modes(masses: np.ndarray, stiffness: float) -> tuple[np.ndarray, np.
     return np.sqrt(squared), root[:, None] * vectors
 
 
-def _reference_swing(scene: SoftScene, start: State) -> np.ndarray:
+def _reference_swing(scene: SoftScene) -> np.ndarray:
     """The last positions by RK4 in 20,000 steps, written in NumPy."""
     stiffness, length = (np.asarray(leaf) for leaf in scene.params.terms["springs"])
     masses = np.asarray(scene.params.masses)
@@ -205,7 +194,7 @@ def _reference_swing(scene: SoftScene, start: State) -> np.ndarray:
         result[0] = 0.0
         return result
 
-    y, count = np.stack([start.x, start.v]), 20_000
+    y, count = np.stack([scene.mesh.vertices, SWING]), 20_000
     h = DURATION / count
 
     def rate(y: np.ndarray) -> np.ndarray:

@@ -12,19 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.softbody.mesh.builders import beam, box
+from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
+from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, vertices_where
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import Params, SoftScene, State, initial_state, make_scene
+from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, with_parameters
 from dln_jax.softbody.step import make_step
-from dln_jax.softbody.terms.elasticity import Material, elastic
+from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.solvers.elements.minimise import Info
+from dln_jax.solvers.info import Info
 from dln_jax.studies.case import Case, Findings, largest
-from dln_jax.studies.soft_bodies.common import GRAVITY
+from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, motion
 
 MODULUS = 1e6
 """In Pa, unless a case says otherwise; a beam of 4 m x 1 m then sags by about a length."""
@@ -38,21 +37,21 @@ def time_steps(quick: bool) -> Findings:
     scene = _beam(quick)
     cases = []
     for dt in (10.0,) if quick else (1e-3, 1e-2, 1e-1, 1.0, 10.0):
-        found = _observed(scene, dt, 3)(initial_state(scene), scene.params)
+        init, step = make_step(scene, dt)
+        found = motion(step, 3)(scene.params, init())
         cases += _converged(f"time-step/{dt:g}-s", found, 12, "2 to 12 Newton iterations, from rest")
     return Findings(cases)
 
 
 def materials(quick: bool) -> Findings:
     """Two seconds of a beam from soft to stiff and from compressible to nearly incompressible, by one program."""
-    scene = _beam(quick)
-    run = _beam_motion(quick)
+    params, init, run = _beam_motion(quick)
     cases = []
     table = [(f"modulus/{modulus:.0e}", modulus, 0.3) for modulus in (1e4, 1e6, 1e8, 1e10)]
     table += [(f"poisson/{ratio}", MODULUS, ratio) for ratio in (0.4, 0.49, 0.4999)]
     for name, modulus, ratio in table:
-        found = run(initial_state(scene), _with_material(scene.params, modulus, ratio))
-        most = largest(np.asarray(found["iterations"])[:3])
+        found = run(with_parameters(params, elastic={"youngs_modulus": modulus, "poisson_ratio": ratio}), init())
+        most = largest(found.iterations[:3])
         text = "3 to 4 Newton iterations in a prototype, in the first steps from rest"
         cases += _converged(name, found, 100, f"below what the solver allows, in {STEPS} steps")
         cases.append(Case(name, "most_iterations_at_first", text, most, 12.0))
@@ -61,11 +60,10 @@ def materials(quick: bool) -> Findings:
 
 def bad_starts(quick: bool) -> Findings:
     """Meshes that are scrambled, or collapsed to a point or a line, under their weight: they recover in a few steps."""
-    scene, run = _beam(quick), _beam_motion(quick)
-    mesh = scene.mesh
+    params, init, run = _beam_motion(quick)
+    mesh, free = _beam(quick).mesh, _beam(quick).free
     random = np.random.default_rng(0)
     rest = mesh.vertices
-    free = scene.free
     scrambled = random.uniform(rest.min(axis=0), rest.max(axis=0), rest.shape)
     starts = {
         "scrambled": scrambled,
@@ -74,9 +72,9 @@ def bad_starts(quick: bool) -> Findings:
     }
     cases, curves = [], {}
     for name, x in starts.items():
-        found = run(initial_state(scene, x=np.where(free, x, rest)), scene.params)
+        found = run(params, init(np.where(free, x, rest)))
         cases += _converged(f"start/{name}", found, 100, "below what the solver allows")
-        least = _least_J(mesh, found["x"])
+        least = _least_J(mesh, found.x)
         curves[name] = least
         text = "no element is inverted in the end (a prototype: 0.779)"
         cases.append(Case(f"start/{name}", "least_J", text, float(least[-1]), 0.0, at_least=True))
@@ -85,10 +83,10 @@ def bad_starts(quick: bool) -> Findings:
 
 def mass_ratio(quick: bool) -> Findings:
     """Vertices that are 1e4 times heavier than their neighbours, in turn."""
-    scene = _beam(quick)
-    heavy = np.where(np.arange(len(scene.mesh.vertices)) % 2, 1e4, 1.0)
-    params = _with_material(scene.params, 1e7, 0.3)._replace(masses=jnp.asarray(heavy))
-    found = _beam_motion(quick)(initial_state(scene), params)
+    params, init, run = _beam_motion(quick)
+    heavy = np.where(np.arange(len(params.masses)) % 2, 1e4, 1.0)
+    stiffer = with_parameters(params, elastic={"youngs_modulus": 1e7})
+    found = run(stiffer._replace(masses=jnp.asarray(heavy)), init())
     return Findings(_converged("mass-ratio/1e4", found, 20, "a few more than with even masses"))
 
 
@@ -100,8 +98,9 @@ def chain(quick: bool) -> Findings:
     masses = np.append(np.full(links, 0.01), 100.0)
     terms = [springs(pairs, stiffness=1e7), gravity(mesh, (0.0, -GRAVITY))]
     scene = make_scene(mesh, terms, masses=masses, held=[0])
-    found = _observed(scene, DT, 60)(initial_state(scene), scene.params)
-    stretch = np.linalg.norm(np.diff(np.asarray(found["x"]), axis=1), axis=2).sum(axis=1) / 10.0
+    init, step = make_step(scene, DT)
+    found = motion(step, 60)(scene.params, init())
+    stretch = np.linalg.norm(np.diff(found.x, axis=1), axis=2).sum(axis=1) / 10.0
     text = "the springs stretch by the load over their stiffness: 3 m g (the fall's pull) over 1e7 N/m, doubled"
     bound = 2 * 3 * 101 * GRAVITY / (1e7 * 0.1)
     return Findings(
@@ -120,23 +119,21 @@ def twist(quick: bool) -> Findings:
     right = vertices_where(mesh, lambda x: x[:, 0] == 4.0)
     material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5, poisson_ratio=0.4)
     scene = make_scene(mesh, [material], held=np.concatenate([left, right]))
-    step = make_step(scene, DT)
+    init, step = make_step(scene, DT)
     angle = 2 * np.pi * turns / steps
 
-    def turned(state: State, params: Params, control: Any) -> tuple[State, Info]:
+    def turned(params: Params, state: State, control: Any) -> tuple[State, Info]:
         y, z = state.x[right, 1] - 0.25, state.x[right, 2] - 0.25
         c, s = np.cos(angle), np.sin(angle)
         change = jnp.stack([jnp.zeros_like(y), (c - 1) * y - s * z, s * y + (c - 1) * z], axis=1)
-        return step(state._replace(v=state.v.at[right].set(change / DT)), params, control)
+        return step(params, state._replace(v=state.v.at[right].set(change / DT)), control)
 
-    found = jax.jit(lambda state, params: rollout(turned, state, params, steps=steps, observe=_seen)[1])(
-        initial_state(scene), scene.params
-    )
-    least = _least_J(mesh, found["x"])
+    found = motion(turned, steps)(scene.params, init())
+    least = _least_J(mesh, found.x)
     text = "no element inverts on the way, turned by less than 45 degrees per cell"
     shown = np.linspace(0, steps - 1, 4).round().astype(int)
     t = DT * (shown + 1)
-    curves = {"mesh": mesh, "x": np.asarray(found["x"])[shown], "t": t, "turns": turns * t / (DT * steps)}
+    curves = {"mesh": mesh, "x": found.x[shown], "t": t, "turns": turns * t / (DT * steps)}
     return Findings(
         [
             *_converged(f"twist/{turns:g}-turns", found, 30, "a bar of constant strain tetrahedra"),
@@ -148,12 +145,11 @@ def twist(quick: bool) -> Findings:
 
 def single_precision(quick: bool) -> Findings:
     """A beam that swings, in float32 and in float64."""
-    scene = _beam(quick)
-    run = _beam_motion(quick)
-    double = run(initial_state(scene), scene.params)
-    single = run(*jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (initial_state(scene), scene.params)))
-    moved = largest(abs(np.asarray(double["x"]) - scene.mesh.vertices))
-    difference = largest(abs(np.asarray(single["x"], np.float64) - np.asarray(double["x"]))) / moved
+    params, init, run = _beam_motion(quick)
+    double = run(params, init())
+    single = run(*jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (params, init())))
+    moved = largest(abs(double.x - params.rest))
+    difference = largest(abs(single.x.astype(np.float64) - double.x)) / moved
     text = f"{STEPS} steps in float32 differ from float64 by less than 1e-3 of the motion"
     return Findings(
         [
@@ -167,10 +163,10 @@ def not_converged(quick: bool) -> Findings:
     """A solver that may take one Newton step only: it says that it has not converged, and the gradient is NaN."""
     mesh = beam(1.0, 0.25, 4, 1)
     scene = cantilever_scene(mesh, modulus=1e4)
-    step = make_step(scene, 0.1, iterations=1)
+    init, step = make_step(scene, 0.1, iterations=1)
 
     def height(params: Params):
-        state, info = step(initial_state(scene), params, None)
+        state, info = step(params, init(), None)
         return state.x[-1, 1], info.converged
 
     (_, converged), slopes = jax.jit(jax.value_and_grad(height, has_aux=True))(scene.params)
@@ -196,29 +192,17 @@ def _beam(quick: bool) -> SoftScene:
 
 
 @functools.cache
-def _beam_motion(quick: bool) -> Callable[[State, Params], dict[str, Any]]:
-    return _observed(_beam(quick), DT, STEPS)
+def _beam_motion(quick: bool) -> tuple[Params, Callable[..., State], Callable[[Params, State], Seen]]:
+    scene = _beam(quick)
+    init, step = make_step(scene, DT)
+    return scene.params, init, motion(step, STEPS)
 
 
-def _with_material(params: Params, modulus: float, ratio: float) -> Params:
-    material = Material(jnp.asarray(modulus), jnp.asarray(ratio))
-    return params._replace(terms={**params.terms, "elastic": material})
-
-
-def _seen(state: State, info: Info) -> dict[str, Any]:
-    return {"x": state.x, "iterations": info.iterations, "converged": info.converged, "residual": info.residual}
-
-
-def _observed(scene: SoftScene, dt: float, steps: int):
-    step = make_step(scene, dt)
-    return jax.jit(lambda state, params: rollout(step, state, params, steps=steps, observe=_seen)[1])
-
-
-def _converged(name: str, found: dict[str, Any], iterations: int, text: str) -> list[Case]:
-    failed = float(np.sum(~np.asarray(found["converged"])))
+def _converged(name: str, found: Seen, iterations: int, text: str) -> list[Case]:
+    failed = float(np.sum(~found.converged))
     return [
         Case(name, "steps_not_converged", "every step converges", failed, 0.0),
-        Case(name, "most_iterations", text, largest(found["iterations"]), float(iterations)),
+        Case(name, "most_iterations", text, largest(found.iterations), float(iterations)),
     ]
 
 

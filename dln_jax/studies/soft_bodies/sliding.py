@@ -5,11 +5,11 @@ which is v h/2 less to first order. On a slope of tan = 0.5 it stays for mu >= 0
 friction is smooth, and slides with g (sin - mu cos) for less.
 """
 
-import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh
-from dln_jax.softbody.scene import SoftScene, initial_state, make_scene
+from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.scene import SoftScene, make_scene, with_parameters
+from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.studies.case import Case, Findings, largest
@@ -32,11 +32,12 @@ def block(quick: bool) -> Findings:
     cases = []
     for rate in (30, 300) if quick else (30, 300, 3000):
         h = 1 / rate
-        x, v, _ = motion(scene, h, round(0.4 * rate))(_resting(scene, speed=SPEED), scene.params)
+        init, step = make_step(scene, h)
+        seen = motion(step, round(0.4 * rate))(scene.params, init(*_resting(scene, speed=SPEED)))
         speeds = SPEED - FRICTION * GRAVITY * h * np.arange(1, rate)
         exact = h * float(speeds[speeds > 0].sum())
-        gone = float(x[-1, 0, 0] - scene.mesh.vertices[0, 0])
-        stopped = 1 + int(np.argmax(np.abs(np.asarray(v[:, 0, 0])) < THRESHOLD * 10))
+        gone = float(seen.x[-1, 0, 0] - scene.mesh.vertices[0, 0])
+        stopped = 1 + int(np.argmax(np.abs(seen.v[:, 0, 0]) < THRESHOLD * 10))
         name = f"block/{rate}-steps-per-second"
         text = "the method's own sum; smooth friction adds up to a threshold speed's way"
         error = abs(gone - exact)
@@ -58,16 +59,15 @@ def slope(quick: bool) -> Findings:
     normal = np.array([-SLOPE, 1.0]) / np.hypot(SLOPE, 1.0)
     along = np.array([normal[1], -normal[0]])
     scene = _block(normal, 0.5)
-    run = motion(scene, h, steps)
-    ground = scene.params.terms["ground"]
+    init, step = make_step(scene, h)
+    run = motion(step, steps)
     cases = []
     for friction in (0.5, 0.49):
-        terms = {**scene.params.terms, "ground": ground._replace(friction=jnp.asarray(friction))}
-        _, v, converged = run(_resting(scene), scene.params._replace(terms=terms))
-        downhill = -(np.asarray(v)[:, 0] @ along)
+        seen = run(with_parameters(scene.params, ground={"friction": friction}), init(*_resting(scene)))
+        downhill = -(seen.v[:, 0] @ along)
         name = f"slope/friction-{friction}"
         text = "every step converges"
-        cases.append(Case(name, "steps_not_converged", text, largest(~np.asarray(converged)), 0.0))
+        cases.append(Case(name, "steps_not_converged", text, largest(~seen.converged), 0.0))
         if friction == SLOPE:
             text = "it sticks: no faster than the threshold speed"
             cases.append(Case(name, "largest_speed", text, largest(abs(downhill)), THRESHOLD * (1 + 1e-6), "m/s"))
@@ -95,9 +95,8 @@ def _block(normal: np.ndarray, friction: float) -> SoftScene:
     return make_scene(mesh, [gravity(mesh, (0.0, -GRAVITY)), ground], masses=MASS)
 
 
-def _resting(scene: SoftScene, speed: float = 0.0):
-    """At the depth where the ground carries the weight."""
+def _resting(scene: SoftScene, speed: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Positions at the depth where the ground carries the weight, and velocities."""
     normal = np.asarray(scene.params.terms["ground"].normal)
     depth = MASS * GRAVITY * normal[1] / STIFFNESS
-    velocity = speed * np.array([normal[1], -normal[0]])
-    return initial_state(scene, x=scene.mesh.vertices - depth * normal, v=velocity)
+    return scene.mesh.vertices - depth * normal, speed * np.array([normal[1], -normal[0]])

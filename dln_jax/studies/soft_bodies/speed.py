@@ -3,22 +3,22 @@
 import functools
 import time
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.softbody.mesh.builders import beam, box
-from dln_jax.softbody.rollout import rollout
-from dln_jax.softbody.scene import Params, State, element_energies, initial_state, make_scene, prepare
-from dln_jax.softbody.step import Integrator, make_step
-from dln_jax.softbody.terms.creature_terms import TIME_STEP
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.scene import Params, State, element_energies, make_scene, prepare
+from dln_jax.softbody.step import INTEGRATORS, MIDPOINT, Integrator, make_step, positions_and_convergence
+from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.softbody.terms.term import Context
-from dln_jax.solvers.elements.element_energies import ElementEnergy, element_hessians, entries, pattern
+from dln_jax.solvers.elements.assembly import entries, pattern
+from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.studies.case import Case, Findings, largest
 from dln_jax.studies.soft_bodies.gradients import crawling, crawling_scene, gait
@@ -41,10 +41,13 @@ PROTOTYPE = {
 def creature(quick: bool) -> Findings:
     """Steps per second of one crawler, and of many at once."""
     scene, muscles = crawling_scene()
-    step = make_step(scene, TIME_STEP)
+    init, step = make_step(scene, TIME_STEP)
     controls = gait(200 if quick else 1000, muscles)
-    run = jax.jit(lambda state, params, controls: rollout(step, state, params, controls))
-    compiling, seconds, (_, (_, converged)) = timed(run, initial_state(scene), scene.params, controls)
+
+    def run(state: State, params: Params, controls: Any) -> Any:
+        return rollout(functools.partial(step, params), state, controls, observe=positions_and_convergence)
+
+    compiling, seconds, (_, (_, converged)) = timed(jax.jit(run), init(), scene.params, controls)
     alone = f"28 vertices, {len(controls)} steps; compiled in {compiling:.1f} s"
     failed = largest(~np.asarray(converged))
     text = f"{LANES} gaits side by side by vmap, 100 steps each"
@@ -62,13 +65,13 @@ def creature(quick: bool) -> Findings:
 
 def _lanes_rate() -> float:
     scene, muscles = crawling_scene()
-    step = make_step(scene, TIME_STEP)
+    init, step = make_step(scene, TIME_STEP)
     controls = gait(100, muscles) * jnp.linspace(0.8, 1.0, LANES)[:, None, None]
 
     @jax.jit
     @jax.vmap
     def run(controls: Any) -> Any:
-        return rollout(step, initial_state(scene), scene.params, controls)[0].x
+        return rollout(functools.partial(step, scene.params), init(), controls)[0].x
 
     _, seconds, _ = timed(run, controls)
     return controls.shape[0] * controls.shape[1] / seconds
@@ -79,13 +82,13 @@ def beams(quick: bool) -> Findings:
     cases = []
     for cells, bound in (((40, 10), 8e-3), ((80, 20), 40e-3)):
         scene = cantilever_scene(beam(4.0, 1.0, *cells))
-        step, steps = make_step(scene, DT), 10 if quick else 30
+        (init, step), steps = make_step(scene, DT), 10 if quick else 30
 
         def run(state: State, params: Params, step=step, steps=steps) -> Any:
             observe = lambda state, info: (info.iterations, info.converged)  # noqa: E731
-            return rollout(step, state, params, steps=steps, observe=observe)
+            return rollout(functools.partial(step, params), state, steps=steps, observe=observe)
 
-        compiling, seconds, (_, (iterations, converged)) = timed(jax.jit(run), initial_state(scene), scene.params)
+        compiling, seconds, (_, (iterations, converged)) = timed(jax.jit(run), init(), scene.params)
         name = f"speed/beam-{scene.mesh.vertices.size}-unknowns"
         text = f"{np.mean(np.asarray(iterations)):.1f} Newton iterations; compiled in {compiling:.1f} s"
         cases.append(Case(name, "seconds_per_step", text, seconds / steps, bound, "s"))
@@ -123,8 +126,7 @@ def linear_solvers(quick: bool) -> Findings:
         inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], written_out=True)
         energies = (inertia, *element_energies(scene))
         at = pattern(energies, *rest.shape)
-        context = Context(rest, masses, rest, jnp.zeros_like(rest), jnp.asarray(DT), None)
-        data = (masses / DT**2, *prepare(scene, scene.params, context))
+        data = (masses / DT**2, *prepare(scene, scene.params, rest, dt=DT))
         hessians = jax.jit(lambda rest, data, of=energies: element_hessians(of, rest, data))(rest, data)
         values = jax.jit(lambda hessians, at=at: entries(at, hessians))(hessians)
         b = jnp.asarray(np.random.default_rng(0).normal(size=rest.shape))
@@ -164,9 +166,9 @@ def speed_against_error(quick: bool) -> Findings:
     duration, counts = 0.4, (20, 80) if quick else (10, 40, 160)
     texts: dict[str, str] = {}
     curves: dict[str, Any] = {"dt": duration / np.array(counts)}
-    exact = _swung(scene, "midpoint", duration, 1600)[0]
+    exact = _swung(scene, MIDPOINT, duration, 1600)[0]
     moved = largest(abs(exact - scene.mesh.vertices))
-    for integrator in get_args(Integrator):
+    for name, integrator in INTEGRATORS.items():
         errors, rates = [], []
         for count in counts:
             x, seconds = _swung(scene, integrator, duration, count)
@@ -175,23 +177,23 @@ def speed_against_error(quick: bool) -> Findings:
         spent = ", ".join(
             f"{e:.1g} at {count / rate:.2g} s" for e, count, rate in zip(errors, counts, rates, strict=True)
         )
-        texts[integrator] = f"error of the motion against seconds: {spent}"
-        curves[integrator] = (np.array(errors), np.array(rates))
+        texts[name] = f"error of the motion against seconds: {spent}"
+        curves[name] = (np.array(errors), np.array(rates))
     first_order = curves["backward-euler"][0]
     fewer = float(first_order[0] / first_order[-1])
     where = "speed/backward-euler"
     cases = [Case(where, "error_gain_by_shorter_steps", texts["backward-euler"], fewer, 2.0, at_least=True)]
-    for integrator in ("bdf2", "midpoint"):
-        gain = float(first_order[-1] / curves[integrator][0][-1])
-        where = f"speed/{integrator}"
-        cases.append(Case(where, "error_gain_over_backward_euler", texts[integrator], gain, 2.0, at_least=True))
+    for name in ("bdf2", "midpoint"):
+        gain = float(first_order[-1] / curves[name][0][-1])
+        where = f"speed/{name}"
+        cases.append(Case(where, "error_gain_over_backward_euler", texts[name], gain, 2.0, at_least=True))
     return Findings(cases, curves)
 
 
 def _swung(scene: Any, integrator: Integrator, duration: float, count: int) -> tuple[np.ndarray, float]:
-    step = make_step(scene, duration / count, integrator)
-    run = jax.jit(lambda state, params: rollout(step, state, params, steps=count)[0].x)
-    _, seconds, x = timed(run, initial_state(scene, two_steps=integrator == "bdf2"), scene.params, repeats=3)
+    init, step = make_step(scene, duration / count, integrator)
+    run = jax.jit(lambda state, params: rollout(functools.partial(step, params), state, steps=count)[0].x)
+    _, seconds, x = timed(run, init(), scene.params, repeats=3)
     return np.asarray(x), seconds
 
 

@@ -14,15 +14,16 @@ from jaxtyping import Array, Float
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import eigsh, spsolve
 
-from dln_jax.softbody.mesh.builders import beam, box
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, boundary_vertices, make_mesh, vertices_where
-from dln_jax.softbody.scene import Params, SoftScene, element_energies, make_scene, prepare
+from dln_jax.softbody.mesh.mesh import Mesh, boundary_vertices, make_mesh, vertices_where
+from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.scene import Params, SoftScene, element_energies, make_scene, prepare, with_parameters
 from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.terms.term import Context, Term
-from dln_jax.solvers.elements.element_energies import element_hessians, entries, gradient, pattern
+from dln_jax.solvers.elements.assembly import entries, gradient, pattern
+from dln_jax.solvers.elements.energies import element_hessians
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.studies.case import Case, Findings, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY
@@ -54,8 +55,7 @@ def uniaxial(quick: bool) -> Findings:
     @jax.jit
     def stretched(stretch: Array):
         x = scene.params.rest * jnp.stack([stretch, jnp.ones(()), jnp.ones(())])
-        context = Context(scene.params.rest, scene.params.masses, x, jnp.zeros_like(x), jnp.asarray(jnp.inf), None)
-        data = prepare(scene, scene.params, context)
+        data = prepare(scene, scene.params, x)
         x, info = minimise(energies, x, data, free=free, scale=scene.params.masses, tolerance=1e-9)
         forces = gradient(energies, everywhere, x, data)
         return x, jnp.where(rest[:, 0] == 1, forces[:, 0], 0).sum(), info.converged
@@ -140,7 +140,7 @@ def _bent(slenderness: int, cells: tuple[int, int], loads: list[float]) -> np.nd
 
     @jax.jit
     def solve(x: Array, load: Array):
-        params = scene.params._replace(terms={**scene.params.terms, "load": Loads(load * shares)})
+        params = with_parameters(scene.params, load={"forces": load * shares})
         x, info = static_solve(scene, params, x=x, iterations=500)
         return x, info.converged
 
@@ -228,8 +228,7 @@ def stiffness_matrix(scene: SoftScene) -> csc_array:
 
     @jax.jit
     def values(params: Params):
-        context = Context(params.rest, params.masses, params.rest, params.rest, jnp.asarray(jnp.inf), None)
-        return entries(at, element_hessians(energies, params.rest, prepare(scene, params, context)))
+        return entries(at, element_hessians(energies, params.rest, prepare(scene, params, params.rest)))
 
     size = at.unknowns
     lower = coo_array((np.asarray(values(scene.params)), (at.rows, at.columns)), shape=(size, size)).tocsc()

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh, make_mesh
+from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError, require_positive
 
 # Lattice cells are cut so that every diagonal joins two vertices with an even sum of coordinates: neighbours are mirror

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from dln_jax.softbody.mesh.quality import as_elements, as_vertices, oriented, require_valid
 from dln_jax.softbody.mesh.simplices import facets, simplex_volumes
+from dln_jax.softbody.mesh.validity import as_elements, as_vertices, oriented, require_valid
 from dln_jax.types import InputError
 
 

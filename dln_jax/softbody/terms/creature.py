@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.mesh.simplicial_mesh import Mesh
+from dln_jax.softbody.mesh.mesh import Mesh
 from dln_jax.softbody.terms.elasticity import deformation_gradient, rest_geometry
 from dln_jax.softbody.terms.gravity import gravity as weight
 from dln_jax.softbody.terms.parameters import NOT_NEGATIVE, Indices, Numbers, material

@@ -1,13 +1,10 @@
-"""Sums of element energies, and how their gradients and Hessians are put together.
+"""Where the gradient and the Hessian of a sum of element energies come from, and how they are put together.
 
-    E(x) = sum over energies, sum over elements e:  energy(x[indices[e]], data[e]),    x [n, b]
-
-An element couples a few of the n blocks of b unknowns each (the corners of a triangle, the ends of a spring), so that
-the Hessian is sparse. Which elements meet where is known before anything is traced: assembly is by gathering and adding
-along index arrays made here once, because scattering costs a loop iteration per element.
+Which elements meet where is known before anything is traced: assembly is by gathering and adding along index arrays
+made here once, because scattering costs a loop iteration per element.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,24 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, local
 from dln_jax.solvers.linear_map import linear_map
 from dln_jax.types import InputError
-
-Blocks = Float[Array, "n b"]
-Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
-"""x[i][j]: unknown j of corner i, a scalar; `jnp.stack` makes vectors of it. An array [k, b] reads the same."""
-
-
-class ElementEnergy(NamedTuple):
-    """A sum of one scalar function over elements."""
-
-    energy: Callable[[Any, Any], Float[Array, ""]]
-    """(unknowns x[i][j] of one element, its data) -> energy."""
-    indices: Int[np.ndarray, "m k"]
-    """Blocks of unknowns of each element; an element may name a block once."""
-    written_out: bool = False
-    """Whether the energy takes `Corners`, scalars in place of an array [k, b]: arithmetic of scalars fuses over all
-    elements, so that its derivatives are several times faster; for elements of up to a dozen unknowns."""
 
 
 class Pattern(NamedTuple):
@@ -101,12 +83,6 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
     return Pattern(blocks, width, free, rows, columns, sources, diagonal, corner_tables)
 
 
-def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
-    """E(x)."""
-    terms = [jax.vmap(e.energy)(local(e, x), d).sum() for e, d in zip(energies, data, strict=True)]
-    return sum(terms, jnp.zeros((), x.dtype))
-
-
 def value_and_gradient(
     energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]
 ) -> tuple[Float[Array, ""], Blocks]:
@@ -122,14 +98,6 @@ def value_and_gradient(
 def gradient(energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]) -> Blocks:
     """dE/dx, with zeros where x is not free."""
     return value_and_gradient(energies, at, x, data)[1]
-
-
-def local(element: ElementEnergy, x: Blocks) -> Any:
-    """The unknowns of all elements, as the energy takes them: [m, k, b], or scalars [m] in nested tuples."""
-    if not element.written_out:
-        return x[element.indices]
-    corners = (_take(x, corner) for corner in element.indices.T)
-    return tuple(tuple(corner[:, j] for j in range(x.shape[1])) for corner in corners)
 
 
 def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
@@ -151,52 +119,10 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     return linear_map(add, read, components.reshape(-1), corners[..., 0].size).reshape(corners.shape[:2])
 
 
-def element_hessians(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> tuple[Array, ...]:
-    """Lower triangles of the Hessian of each element, row by row: [s (s + 1)/2, m] for each energy, s = k b."""
-    return tuple(
-        _written_out_hessians(e, x, of) if e.written_out else _array_hessians(e, x, of)
-        for e, of in zip(energies, data, strict=True)
-    )
-
-
 def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:
     """Values of the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
     flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, hessians[0].dtype)])
     return jnp.concatenate([flat[of_group].sum(-1) for of_group in at.sources])
-
-
-def square(lower: Float[Array, "entries m"]) -> Float[Array, "m s s"]:
-    """Whole element Hessians from their lower triangles."""
-    s = round((np.sqrt(8 * lower.shape[0] + 1) - 1) / 2)
-    row, column = np.indices((s, s))
-    larger, smaller = np.maximum(row, column), np.minimum(row, column)
-    return lower.T[:, larger * (larger + 1) // 2 + smaller]
-
-
-def lower_triangles(whole: Float[Array, "m s s"]) -> Float[Array, "entries m"]:
-    """The inverse of `square`."""
-    return whole[:, *np.tril_indices(whole.shape[-1])].T
-
-
-def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
-    s = element.indices.shape[1] * x.shape[1]
-    whole = jax.vmap(jax.hessian(element.energy))(local(element, x), data)
-    return lower_triangles(whole.reshape(-1, s, s))
-
-
-def _written_out_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
-    def of_one(corners: Corners, data: Any) -> list[Array]:
-        scalars, structure = jax.tree.flatten(corners)
-
-        def gradient(*scalars: Array) -> list[Array]:
-            return jax.tree.leaves(jax.grad(element.energy)(structure.unflatten(scalars), data))
-
-        _, product = jax.linearize(gradient, *scalars)
-        one, zero = jnp.ones_like(scalars[0]), jnp.zeros_like(scalars[0])
-        columns = [product(*(one if i == j else zero for i in range(len(scalars)))) for j in range(len(scalars))]
-        return [columns[j][i] for i in range(len(scalars)) for j in range(i + 1)]
-
-    return jnp.stack(jax.vmap(of_one)(local(element, x), data))
 
 
 def _components(of_corners: Any) -> Float[Array, "s m"]:
@@ -204,10 +130,6 @@ def _components(of_corners: Any) -> Float[Array, "s m"]:
     if isinstance(of_corners, tuple):
         return jnp.stack(jax.tree.leaves(of_corners))
     return of_corners.reshape(len(of_corners), -1).T
-
-
-def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
-    return x if np.array_equal(blocks, np.arange(len(x))) else x[blocks]
 
 
 def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys most"]:

@@ -1,0 +1,55 @@
+"""Many steps of anything as one scan, which is differentiable from end to end."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dln_jax.types import InputError, require_positive
+
+
+def rollout(
+    step: Callable[[Any, Any], tuple[Any, Any]],
+    state: Any,
+    inputs: Any = None,
+    *,
+    steps: int | None = None,
+    observe: Callable[[Any, Any], Any] = lambda state, info: state,
+    segment: int | None = None,
+) -> tuple[Any, Any]:
+    """The state after all steps, and what `observe` sees after each, stacked along a leading axis.
+
+    Args:
+        step: (state, input) -> (state, info); parameters are closed over, as by `functools.partial(step, params)`.
+        state: at the start; any tree of arrays, whose shapes and types a step keeps.
+        inputs: of the steps along the leading axis, [steps, ...], or `None` with `steps`.
+        steps: how many, where there are no inputs.
+        observe: (state, info) -> what to keep, the state by default; what is not kept of `info` is not computed either.
+        segment: steps between the states that reverse mode keeps; the steps between are then computed twice, and memory
+            grows with steps / segment + segment. Must divide the number of steps. By default all is kept.
+
+    Raises:
+        InputError: neither inputs nor steps, or a segment that does not divide them.
+    """
+    count = steps if inputs is None else jax.tree.leaves(inputs)[0].shape[0]
+    if count is None:
+        raise InputError("there are neither inputs nor steps; give one of them")
+    require_positive(steps=count)
+
+    def advance(state: Any, given: Any) -> tuple[Any, Any]:
+        state, info = step(state, given)
+        return state, observe(state, info)
+
+    if segment is None:
+        return jax.lax.scan(advance, state, inputs, length=count)
+    if segment < 1 or count % segment:
+        raise InputError(f"segment is {segment} for {count} steps; expected a divisor of the steps")
+    chunked = jax.tree.map(lambda leaf: leaf.reshape(-1, segment, *leaf.shape[1:]), inputs)
+
+    @jax.checkpoint
+    def advance_segment(state: Any, chunk: Any) -> tuple[Any, Any]:
+        return jax.lax.scan(advance, state, chunk, length=segment)
+
+    last, seen = jax.lax.scan(advance_segment, state, chunked, length=count // segment)
+    return last, jax.tree.map(lambda leaf: jnp.reshape(leaf, (count, *leaf.shape[2:])), seen)
