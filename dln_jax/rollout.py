@@ -35,7 +35,8 @@ def rollout(
     count = steps if inputs is None else jax.tree.leaves(inputs)[0].shape[0]
     if count is None:
         raise InputError("there are neither inputs nor steps; give one of them")
-    require_positive(steps=count)
+    if inputs is None:
+        require_positive(steps=count)
 
     def advance(state: Any, given: Any) -> tuple[Any, Any]:
         state, info = step(state, given)

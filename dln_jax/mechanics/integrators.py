@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from dln_jax.rollout import rollout as steps_in_turn
 from dln_jax.solvers.newton import find_root
 from dln_jax.types import InputError, require_positive
 
@@ -165,10 +166,10 @@ def rollout(step: Step, state: State, t: Float[Array, " T"], *, substeps: int = 
     times = t.astype(jnp.result_type(*jax.tree.leaves(state)))
 
     def interval(state, start_and_duration):
-        state = advance(step, start_and_duration[0], state, start_and_duration[1], substeps=substeps)
-        return state, state
+        start, duration = start_and_duration
+        return advance(step, start, state, duration, substeps=substeps), None
 
-    _, later = jax.lax.scan(interval, state, (times[:-1], jnp.diff(times)))
+    _, later = steps_in_turn(interval, state, (times[:-1], jnp.diff(times)))
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
 
 

@@ -43,9 +43,7 @@ class _Sum(NamedTuple):
 
 
 class _State(NamedTuple):
-    x: Blocks
-    energy: Float[Array, ""]
-    gradient: Blocks
+    point: Point
     floor: Blocks
     iterations: Int[Array, ""]
     stuck: Bool[Array, ""]
@@ -170,30 +168,30 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
         return value_and_gradient(energies, at, x, data)
 
     def within(state: _State) -> Array:
-        return (jnp.abs(state.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
+        return (jnp.abs(state.point.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
 
     def running(state: _State) -> Array:
         return ~within(state) & ~state.stuck & (state.iterations < iterations)
 
     def iterate(state: _State) -> _State:
-        hessians = element_hessians(energies, state.x, data)
+        x, energy, gradient = state.point
+        hessians = element_hessians(energies, x, data)
         values = entries(at, hessians)
-        direction = _descent_direction(total, hessians, values, state.gradient)
-        slope = jnp.vdot(direction, state.gradient)
+        direction = _descent_direction(total, hessians, values, gradient)
+        slope = jnp.vdot(direction, gradient)
         # What cancels in a row of the gradient is of the size of |H| |x|.
-        diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(state.x.shape)
-        extent = jnp.max(jnp.abs(state.x), initial=0)
+        diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
+        extent = jnp.max(jnp.abs(x), initial=0)
         floor = rounding * diagonal * extent
-        unclear = rounding * jnp.abs(state.energy) + floor.sum() * extent
-        point = Point(state.x, state.energy, state.gradient)
-        (x, energy, gradient), accepted = line_search(evaluate, point, direction, slope, unclear, scale)
-        return _State(x, energy, gradient, floor, state.iterations + 1, ~accepted)
+        unclear = rounding * jnp.abs(energy) + floor.sum() * extent
+        point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
+        return _State(point, floor, state.iterations + 1, ~accepted)
 
-    energy, first = evaluate(x0)
-    start = _State(x0, energy, first, jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
+    start = _State(Point(x0, *evaluate(x0)), jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
     last = jax.lax.while_loop(running, iterate, start)
-    residual = jnp.max(jnp.abs(last.gradient) / scale, initial=0)
-    return last.x, Info(residual, last.iterations, within(last) & jnp.isfinite(last.energy))
+    x, energy, slope = last.point
+    residual = jnp.max(jnp.abs(slope) / scale, initial=0)
+    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy))
 
 
 def _descent_direction(total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks) -> Blocks:

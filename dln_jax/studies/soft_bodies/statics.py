@@ -21,7 +21,7 @@ from dln_jax.softbody.step import static_solve
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import neo_hookean, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.softbody.terms.term import Context, Term
+from dln_jax.softbody.terms.term import Term
 from dln_jax.solvers.elements.assembly import entries, gradient, pattern
 from dln_jax.solvers.elements.energies import element_hessians
 from dln_jax.solvers.elements.minimise import minimise
@@ -245,11 +245,8 @@ class Loads(NamedTuple):
 def dead_loads(mesh: Mesh) -> Term:
     """-f·x of every vertex; the default is none."""
 
-    def prepare(parameters: Loads, context: Context) -> Array:
-        return parameters.forces
-
     def energy(x: Any, force: Any) -> Any:
         return -sum(force[i] * coordinate for i, coordinate in enumerate(x[0]))
 
-    vertices = mesh.vertices
-    return Term("load", np.arange(len(vertices))[:, None], energy, Loads(jnp.zeros(vertices.shape)), prepare)
+    none = Loads(jnp.zeros(mesh.vertices.shape))
+    return Term("load", np.arange(len(mesh.vertices))[:, None], energy, none, lambda loads, context: loads.forces)
