@@ -7,38 +7,17 @@ of soft bodies, their gradients and time steps), and all of them. Compilation is
 inputs vary, programs that are compared take turns, and medians count.
 """
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
-from matplotlib.figure import Figure
-from rich.console import Console
 
 from dln_jax.command_line.arguments import Unstated
-from dln_jax.files import run_folder, write_bytes, write_figure
-from dln_jax.studies.report import Row, conditions, markdown, write_report
-from dln_jax.studies.report_table import print_report
-from dln_jax.studies.speed import integrators as benchmark_integrators
-from dln_jax.studies.speed import one_step as benchmark_one_step
-from dln_jax.studies.speed import precision as benchmark_precision
-from dln_jax.studies.speed import scaling as benchmark_scaling
-from dln_jax.studies.speed import soft_bodies as benchmark_softbody
-from dln_jax.studies.speed import throughput as benchmark_throughput
-from dln_jax.studies.speed import training as benchmark_training
-
-Measure = Callable[[bool], tuple[list[Row], Figure]]
-MEASURES: dict[str, Measure] = {
-    "one-step": benchmark_one_step.measure,
-    "throughput": benchmark_throughput.measure,
-    "scaling": benchmark_scaling.measure,
-    "training": benchmark_training.measure,
-    "integrators": benchmark_integrators.measure,
-    "precision": benchmark_precision.measure,
-    "softbody": benchmark_softbody.measure,
-}
+from dln_jax.files import run_folder, write_bytes
+from dln_jax.studies.case import Done, draw, measure
+from dln_jax.studies.report import Row, conditions, markdown, publish
+from dln_jax.studies.speed.subjects import cases
 
 
 @dataclass(frozen=True)
@@ -57,25 +36,18 @@ class Arguments:
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes; what is measured is kept even if a later subject is interrupted."""
-    with run_folder(given.out, "benchmark") as folder:
-        measure_into(folder, given)
-
-
-def measure_into(folder: Path, given: Arguments) -> None:
-    """Measures the subjects, prints their tables, and writes what each gives as soon as it does."""
-    console = Console(highlight=False, soft_wrap=True)
-    subjects = MEASURES if given.subject == "all" else {given.subject: MEASURES[given.subject]}
-    facts = functools.partial(
-        conditions, dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=given.quick
-    )
+    chosen = [case for case in cases(quick=given.quick) if given.subject in (case.name, "all")]
     every: list[Row] = []
-    for name, measure in subjects.items():
-        console.print(f"{name} ...")
-        rows, figure = measure(given.quick)
-        rows = [row._replace(case=f"{name}/{row.case}") for row in rows]
-        every += rows
-        write_figure(folder / f"{name}.png", figure)
-        write_bytes(folder / f"{name}.md", markdown(rows).encode())
-        write_report(folder / "report.json", every, facts())
-        print_report([row for row in rows if row.bound is not None] or rows[:40], facts())
-    print(f"report: {folder / 'report.json'}; tables and figures of {', '.join(subjects)} beside it")
+    with run_folder(given.out, "benchmark") as folder:
+
+        def keep(done: Done) -> None:
+            rows = done.findings.rows
+            every.extend(rows)
+            draw(folder, done.case, done.findings)
+            write_bytes(folder / f"{done.case.name}.md", markdown(rows).encode())
+            facts = conditions(
+                dtype="float32 unless said", seeds=[0], call_path="default jit unless said", quick=given.quick
+            )
+            publish(folder, every, facts, shown=[row for row in rows if row.bound is not None] or rows[:40])
+
+        measure(chosen, keep)

@@ -5,38 +5,15 @@ Runs: gauss-newton and adam (train_delan), task (train_hnn --task, two stages), 
 end), resumed to the end, and its model file compared. Prints a count for each, and writes report.json.
 """
 
-import os
-import signal
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-from rich.console import Console
-
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.files import run_folder
-from dln_jax.studies.report import Row, conditions, write_report
-from dln_jax.studies.report_table import print_report
-from dln_jax.types import InputError, require_positive
-
-RUNS = {
-    "gauss-newton": ("train_delan", "--optimizer", "gauss-newton", "--steps", "60"),
-    "adam": ("train_delan", "--optimizer", "adam", "--steps", "4000", "--width", "16"),
-    "task": ("train_hnn", "--task", "spring", "--steps", "40"),
-    "function": ("train_diffnet", "--samples", "6000", "--width", "8"),
-    "locomotion": ("train_locomotion", "--steps", "6000"),
-}
-"""Script and options of each run; short, but of several checkpoints."""
-TIMED = ("train_delan", "train_hnn")
-"""Scripts that would also time calls in another process."""
-MODEL = "model.safetensors"
-ROOT = Path(__file__).parent.parent
+from dln_jax.studies.case import Done, measure
+from dln_jax.studies.report import conditions, publish
+from dln_jax.studies.stability.interruptions import RUNS, cases
 
 
 @dataclass(frozen=True)
@@ -55,101 +32,15 @@ class Arguments:
 
 def main(given: Arguments) -> None:
     """Kills, resumes, compares, prints and writes."""
-    require_positive(kills=given.kills)
-    names = names_in("--runs", given.runs, RUNS)
+    chosen = cases(names_in("--runs", given.runs, RUNS), kills=given.kills, seed=given.seed)
     with run_folder(given.out, "interruptions") as folder:
-        measure_into(folder, given, names)
+        rows = [row for findings in measure(chosen, say).values() for row in findings.rows]
+        facts = conditions(dtype="that of each run", seeds=[given.seed], kills=given.kills, runs=RUNS)
+        publish(folder, rows, facts)
 
 
-def measure_into(folder: Path, given: Arguments, names: list[str]) -> None:
-    """Interrupts the runs, and writes and prints the counts."""
-    console = Console(highlight=False, soft_wrap=True)
-    random = np.random.default_rng(given.seed)
-    rows = []
-    with tempfile.TemporaryDirectory() as place:
-        for name in names:
-            same, moments = interrupted(RUNS[name], Path(place) / name, random, kills=given.kills)
-            shown = ", ".join(f"{moment:.2f}" for moment in moments)
-            console.print(f"{name}: {same} of {given.kills} as the unbroken run; killed s after a checkpoint: {shown}")
-            rows.append(Row(name, "resumed_bit_for_bit", same, "runs", bound=given.kills, at_least=True))
-    facts = conditions(dtype="that of each run", seeds=[given.seed], kills=given.kills, runs=RUNS)
-    write_report(folder / "report.json", rows, facts)
-    print_report(rows, facts)
-    console.print(f"report: {folder / 'report.json'}")
-
-
-def interrupted(
-    command: Sequence[str], place: Path, random: np.random.Generator, *, kills: int
-) -> tuple[int, list[float]]:
-    """How many of `kills` interrupted runs end as the unbroken one, and when they were killed, s after a checkpoint."""
-    place.mkdir()
-    # Twice: the second has the compiled programs of the first, as the runs that are killed do.
-    for name in ("first", "unbroken"):
-        length = lasted(start(command, place, name), place / name)
-    expected = (place / "unbroken" / MODEL).read_bytes()
-    if (place / "first" / MODEL).read_bytes() != expected:
-        raise InputError(f"{' '.join(command)}: two unbroken runs differ; there is nothing to compare with")
-    same, moments = 0, []
-    while len(moments) < kills:
-        name = f"killed-{len(moments)}"
-        moment = float(random.uniform(0, length))
-        if not killed(start(command, place, name), place / name, moment):
-            # It was faster than the unbroken one; nothing was interrupted.
-            length *= 0.9
-            (place / name).rename(place / f"over-{time.monotonic_ns()}")
-            continue
-        moments.append(moment)
-        finished(start(command, place, name, "--resume"), place / name)
-        same += (place / name / MODEL).read_bytes() == expected
-    return same, moments
-
-
-def start(command: Sequence[str], place: Path, name: str, *others: str) -> subprocess.Popen[str]:
-    """A run in a process of its own; runs of one place share compiled programs."""
-    script, *options = command
-    settings = options if "--resume" not in others else []
-    left_out = ["--no-figures", *(["--no-low-latency"] if script in TIMED else [])]
-    return subprocess.Popen(
-        [sys.executable, "-m", f"scripts.{script}", *settings, *left_out, "--out", str(place / name), *others],
-        cwd=ROOT,
-        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(place / "programs")},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def lasted(process: subprocess.Popen[str], folder: Path) -> float:
-    """Seconds from a run's first checkpoint to its model."""
-    wait_for_checkpoint(process, folder)
-    began = time.monotonic()
-    while process.poll() is None and not (folder / MODEL).exists():
-        time.sleep(0.005)
-    length = time.monotonic() - began
-    finished(process, folder)
-    return length
-
-
-def killed(process: subprocess.Popen[str], folder: Path, moment: float) -> bool:
-    """Kills a run so many seconds after its first checkpoint; whether it had no model yet."""
-    wait_for_checkpoint(process, folder)
-    time.sleep(moment)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    return not (folder / MODEL).exists()
-
-
-def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
-    """Until a run has written one; `InputError` where it ended before."""
-    while not any(folder.glob("checkpoint*.json")):
-        if process.poll() is not None:
-            finished(process, folder)
-            return
-        time.sleep(0.005)
-
-
-def finished(process: subprocess.Popen[str], folder: Path) -> None:
-    """Waits for the end of a run; `InputError` where it failed."""
-    said = process.communicate()[1]
-    if process.returncode:
-        raise InputError(f"the run in {folder} failed: {said.strip()[-200:]}")
+def say(done: Done) -> None:
+    """Says what one run came to."""
+    (row,), moments = done.findings
+    shown = ", ".join(f"{moment:.2f}" for moment in moments["moments"])
+    print(f"{row.case}: {row.value} of {row.bound} as the unbroken run; killed s after a checkpoint: {shown}")

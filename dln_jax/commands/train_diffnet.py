@@ -133,7 +133,7 @@ def main(given: Arguments) -> None:
     if given.table:
         check_table(given)
         given = dataclasses.replace(given, **resolved(given, TABLE_DEFAULTS))
-        diffnet_table.write_table(console, given)
+        diffnet_table.write_table(given)
         return
     task = prepare(given)
     with run_folder(given.out, "train_diffnet", resume=given.resume) as folder:

@@ -20,8 +20,7 @@ from dln_jax.command_line.running import with_stored_arguments
 from dln_jax.runs import dynamics as dynamics_training
 from dln_jax.runs import frames as pixel_training
 from dln_jax.runs import phase_space as phase_training
-from dln_jax.studies.hamiltonian.published import PIXELS
-from dln_jax.studies.hamiltonian.tasks import TASKS
+from dln_jax.studies.hamiltonian.tasks import PIXELS, TASKS
 
 KINDS = {"auto": "structured-hnn", "structured": "structured-hnn", "black-box": "black-box-hnn"}
 

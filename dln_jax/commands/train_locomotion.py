@@ -30,8 +30,7 @@ from dln_jax.locomotion.policy import WIDTH
 from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, FALLEN, UPRIGHT, Task, creature_named, make_task
 from dln_jax.softbody.terms.creature import TIME_STEP
-from dln_jax.studies.report import Row, conditions, write_report
-from dln_jax.studies.report_table import print_report
+from dln_jax.studies.report import Row, conditions, print_report, write_report
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.load import save_model
 

@@ -1,1 +1,45 @@
-"""Numbers about a model: errors, predictions, speed."""
+"""Numbers about a model: errors, rollouts, definiteness, misfit, latency."""
+
+from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.latency import Latency, medians_in_turns, one_step
+from dln_jax.metrics.misfit import Misfit, velocity_misfit
+from dln_jax.metrics.phase_space import Motions, field_errors, motion_errors, predict, summary
+from dln_jax.metrics.rollouts import (
+    Motion,
+    energy_error,
+    follow,
+    normalised_state_error,
+    recorded_motions,
+    rollout_metrics,
+    valid_prediction_time,
+    valid_prediction_times,
+)
+from dln_jax.metrics.soft_body_energies import motion_energies
+
+__all__ = [
+    "Definiteness",
+    "Latency",
+    "Misfit",
+    "Motion",
+    "Motions",
+    "definiteness",
+    "energy_error",
+    "errors",
+    "field_errors",
+    "follow",
+    "mean_square",
+    "medians_in_turns",
+    "motion_energies",
+    "motion_errors",
+    "normalised_state_error",
+    "one_step",
+    "predict",
+    "predictions",
+    "recorded_motions",
+    "rollout_metrics",
+    "summary",
+    "valid_prediction_time",
+    "valid_prediction_times",
+    "velocity_misfit",
+]

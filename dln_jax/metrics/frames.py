@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, render, rod
 from dln_jax.mechanics.integrators import advance, rk4, second_order
-from dln_jax.metrics.phase_space import Motions, predict, summary
+from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, summary
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
 from dln_jax.precision import in_float64, with_float64
@@ -130,8 +130,7 @@ def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float
     q, qd = physical_states(pairs)
     times = q.shape[1]
     errors = physical_energy(q, qd) - physical_energy(truth.q[:, :times], truth.qd[:, :times])
-    squares = np.mean(errors**2, axis=1)
-    return np.where(np.isfinite(squares), squares, np.inf)
+    return finite_or_infinite(np.mean(errors**2, axis=1))
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
@@ -154,8 +153,7 @@ def late_energy_errors(
     latent = predict(model.field, parameters["field"], q, p, frames)
     late = Motions(frames[1:], latent.q[:, 1:], latent.p[:, 1:])
     found = physical_energy(*physical_states(decoded(model, parameters, late)))
-    squares = np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1)
-    return np.where(np.isfinite(squares), squares, np.inf)
+    return finite_or_infinite(np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
 
 
 def energy_floor(test: Frames) -> float:

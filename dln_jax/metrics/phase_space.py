@@ -74,22 +74,25 @@ def predict(
 
 def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
     """H along motions; infinite where a state is not finite."""
-    values = np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p)))
+    return finite_or_infinite(np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p))))
+
+
+def finite_or_infinite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The values, infinite where they are not finite: an error that is not a number is no small one."""
     return np.where(np.isfinite(values), values, np.inf)
 
 
 def energy_errors(H: Hamiltonian, predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
     """Mean over time of (H(x_hat) - H(x))² for each motion; infinite for one that is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.mean((energies(H, predicted) - energies(H, truth)) ** 2, axis=1)
+        return finite_or_infinite(np.mean((energies(H, predicted) - energies(H, truth)) ** 2, axis=1))
 
 
 def state_errors(predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
     """Mean over time and components of (x_hat - x)² for each motion; infinite for one that is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.concatenate([predicted.q - truth.q, predicted.p - truth.p], axis=2) ** 2
-        errors = np.mean(errors, axis=(1, 2))
-    return np.where(np.isfinite(errors), errors, np.inf)
+        return finite_or_infinite(np.mean(errors, axis=(1, 2)))
 
 
 def summary(name: str, errors: Float[np.ndarray, " K"]) -> dict[str, float]:
@@ -97,11 +100,7 @@ def summary(name: str, errors: Float[np.ndarray, " K"]) -> dict[str, float]:
     count = len(errors)
     finite = bool(np.isfinite(errors).all())
     spread = float(np.std(errors, ddof=1) / np.sqrt(count)) if finite and count > 1 else float("nan")
-    return {
-        name: float(np.mean(errors)),
-        f"{name}_standard_error": spread,
-        f"{name}_median": float(np.median(errors)),
-    }
+    return {name: float(np.mean(errors)), f"{name}_standard_error": spread, f"{name}_median": float(np.median(errors))}
 
 
 def motion_errors(

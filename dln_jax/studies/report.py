@@ -5,14 +5,23 @@ import importlib.metadata
 import os
 import platform
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from dln_jax.files import write_json
 
+REPORT = "report.json"
 PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
+WIDTH, NARROWEST = 200, 132
+"""Of a table in a file or a pipe, which has none to keep to, and of one in a terminal."""
+UNITS = {"seconds": "s", "us": "us", "j": "J"}
+"""What a word in the name of a quantity says of its unit, wherever it is measured."""
 
 
 class Row(NamedTuple):
@@ -21,20 +30,47 @@ class Row(NamedTuple):
     case: str
     quantity: str
     value: float
-    unit: str
+    unit: str = "1"
     reference: float | None = None
     """Published or closed-form value."""
     bound: float | None = None
     """Figure to reach."""
     at_least: bool = False
     """Whether the bound is a lower one."""
+    expected: str = ""
+    """The expectation in words, with where the bound comes from."""
 
     @property
     def passed(self) -> bool | None:
-        """Whether the bound is met; `None` without one."""
+        """Whether the bound is met, which NaN does not; `None` without one."""
         if self.bound is None:
             return None
-        return self.value >= self.bound if self.at_least else self.value <= self.bound
+        return bool(self.value >= self.bound if self.at_least else self.value <= self.bound)
+
+
+def expect(
+    case: str,
+    quantity: str,
+    expected: str,
+    value: SupportsFloat,
+    bound: SupportsFloat,
+    unit: str = "1",
+    *,
+    at_least: bool = False,
+    reference: float | None = None,
+) -> Row:
+    """The row of a number of which theory says what it may be: `expected`, and the `bound` that follows."""
+    return Row(case, quantity, float(value), unit, reference, float(bound), at_least, expected)
+
+
+def largest(values: Any) -> float:
+    """The largest of some numbers; NaN if one is NaN, so that it meets no bound."""
+    return float(np.max(np.asarray(values, np.float64)))
+
+
+def unit_of(quantity: str, units: Mapping[str, str] = UNITS) -> str:
+    """SI unit of a quantity: that of the first key whose words its name contains, else 1."""
+    return next((unit for words, unit in units.items() if f"_{words}_" in f"_{quantity}_"), "1")
 
 
 def conditions(**given: Any) -> dict[str, Any]:
@@ -50,32 +86,86 @@ def conditions(**given: Any) -> dict[str, Any]:
     }
 
 
-def write_report(path: Path, rows: list[Row], facts: dict[str, Any]) -> None:
-    """Writes `{"conditions": ..., "rows": [...]}` as JSON; a value that is not finite becomes null."""
-    listed = [
-        {
-            "case": row.case,
-            "quantity": row.quantity,
-            "value": row.value,
-            "unit": row.unit,
-            "reference": row.reference,
-            "bound": row.bound,
-            "pass": row.passed,
-        }
-        for row in rows
-    ]
-    write_json(path, {"conditions": facts, "rows": listed})
+def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
+    """Writes `{"conditions": ..., "rows": [...]}` as JSON; a value that is not finite becomes null.
+
+    What is expected of rows in words is part of the conditions.
+    """
+    names = ("case", "quantity", "value", "unit", "reference", "bound")
+    listed = [{**{name: getattr(row, name) for name in names}, "pass": row.passed} for row in rows]
+    words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
+    write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})
 
 
-def markdown(rows: list[Row]) -> str:
+def publish(
+    folder: Path,
+    rows: Sequence[Row],
+    facts: Mapping[str, Any],
+    *,
+    shown: Sequence[Row] | None = None,
+    tables: Sequence[Table | str] = (),
+) -> None:
+    """Writes report.json into a folder; prints the table of its rows, or of those `shown`, other tables, what fails."""
+    write_report(folder / REPORT, rows, facts)
+    print_report(rows if shown is None else shown, facts, *tables)
+    bound = [row for row in rows if row.passed is not None]
+    failing = [f"{row.case} {row.quantity}" for row in bound if not row.passed]
+    if bound:
+        print(f"{len(bound) - len(failing)} of {len(bound)} pass", *(f"fails: {name}" for name in failing), sep="\n")
+    print(f"report: {folder / REPORT}")
+
+
+def print_report(rows: Sequence[Row], facts: Mapping[str, Any], *others: Table | str) -> None:
+    """Prints the table of some rows, and others below it."""
+    console = Console(highlight=False, soft_wrap=True)
+    # Numbers that are cut off say nothing: a narrow terminal gets long lines.
+    console.width = max(console.width, NARROWEST) if sys.stdout.isatty() else WIDTH
+    for table in (report_table(rows, facts), *others):
+        print(table) if isinstance(table, str) else console.print(table)
+
+
+def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
+    """One line per row, without the columns that would be empty; the caption states the conditions."""
+    passed = {True: "yes", False: "[bold red]no[/]", None: ""}
+    columns = {
+        "case": [row.case for row in rows],
+        "quantity": [row.quantity for row in rows],
+        "expected": [row.expected for row in rows],
+        "value": [_number(row.value) for row in rows],
+        "unit": [row.unit for row in rows],
+        "reference": [_number(row.reference) for row in rows],
+        "to reach": [
+            f"{'≥' if row.at_least else '≤'} {row.bound:.3g}" if row.bound is not None else "" for row in rows
+        ],
+        "pass": [passed[row.passed] for row in rows],
+    }
+    columns = {name: cells for name, cells in columns.items() if any(cells)}
+    table = Table(
+        *columns, caption=f"{facts['machine']}; {facts['dtype']}; {facts['threads']} threads; {facts['command']}"
+    )
+    for cells in zip(*columns.values(), strict=True):
+        table.add_row(*cells)
+    return table
+
+
+def markdown(rows: Sequence[Row]) -> str:
     """A table with a line per case and a column per quantity, in the order in which they come."""
     cases = list(dict.fromkeys(row.case for row in rows))
     columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
     titles = [quantity.replace("_", " ") + (f", {unit}" if unit != "1" else "") for quantity, unit in columns]
-    lines = [["case", *titles], ["---"] * (len(columns) + 1)]
-    lines += [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return markdown_table(
+        ["case", *titles], [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
+    )
+
+
+def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Cells as Markdown."""
+    return "".join(f"| {' | '.join(line)} |\n" for line in [titles, ["---"] * len(titles), *lines])
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
 
 
 def _module_name() -> str:

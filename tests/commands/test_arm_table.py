@@ -10,9 +10,11 @@ from dln_jax.commands import arm_table
 from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm import models as arm_models
+from dln_jax.studies.arm import table
 from dln_jax.studies.arm.data import states
-from dln_jax.studies.arm.published import COLUMNS, PUBLISHED, published
+from dln_jax.studies.published import ARM
 
 NUMBERS = {
     **{f"{name}_mse": 1e-7 for name in ("torque", "inertial", "coriolis", "gravity", "torque_from_momenta")},
@@ -39,11 +41,11 @@ def stubbed(tmp_path, monkeypatch):
         return {"torque_mse": len(calls) * 1e-9, "torque_mse_largest": len(calls) * 1e-8}, None
 
     for name in ("measure_seeds", "measure_trigonometric", "measure_adam"):
-        monkeypatch.setattr(arm_table, name, measure)
-    monkeypatch.setattr(arm_table, "measure_split", measure_split)
+        monkeypatch.setattr(table, name, measure)
+    monkeypatch.setattr(table, "measure_split", measure_split)
     plant = {"vpt_seconds": 3.1, "whole_circle_torque_mean_square": 70.0}
-    monkeypatch.setattr(arm_table, "plant_rows", lambda scene, sets: (plant, None))
-    monkeypatch.setattr(arm_table, "gauss_newton_rows", lambda *a, **k: (TIMES, None))
+    monkeypatch.setattr(table, "measure_plant", lambda scene, sets: (plant, None))
+    monkeypatch.setattr(table, "measure_one_by_one", lambda *a, **k: (TIMES, None))
     return calls
 
 
@@ -51,16 +53,15 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     command(arm_table, "--out", "table")
     report = json.loads((tmp_path / "table" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
-    for kind, datasets in PUBLISHED.items():
-        for dataset, values in datasets.items():
-            for quantity, value in zip(COLUMNS[dataset], values, strict=True):
-                # Published Hamiltonian torques are computed from recorded momenta, and compared with ours of that kind.
-                by_momenta = kind.endswith("hnn") and quantity == "torque_mse"
-                assert (rows[f"{kind}/{dataset}", "torque_mse"]["reference"] is None) == kind.endswith("hnn")
-                quantity = "torque_from_momenta_mse" if by_momenta else quantity
-                row = rows[f"{kind}/{dataset}", quantity]
-                assert row["reference"] == value == published(kind, dataset, quantity)
-                assert row["bound"] is not None or quantity == "vpt_seconds"
+    for case, values in ARM.values.items():
+        # Published Hamiltonian torques are computed from recorded momenta, and compared with ours of that kind.
+        by_momenta = case.split("/")[0].endswith("hnn")
+        assert ("torque_from_momenta_mse" in values) == by_momenta != ("torque_mse" in values)
+        assert (rows[case, "torque_mse"]["reference"] is None) == by_momenta
+        for quantity, value in values.items():
+            row = rows[case, quantity]
+            assert row["reference"] == value
+            assert row["bound"] is not None or quantity == "vpt_seconds"
     assert rows["structured-delan/characters", "torque_mse"]["bound"] == pytest.approx(2.2e-7)
     assert rows["black-box-delan/characters", "torque_mse"]["bound"] == 2.8e-5
     assert rows["structured-hnn/characters", "torque_mse"]["bound"] == pytest.approx(5.4e-8)
@@ -70,7 +71,7 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     assert rows["trigonometric/characters", "torque_mse"]["pass"] is False
     assert rows["feed-forward/uniform", "torque_mse"]["pass"] is True
     lines = (tmp_path / "table" / "table.md").read_text().splitlines()
-    assert sum(line.startswith("| ") for line in lines) == 1 + len(PUBLISHED) + 2
+    assert sum(line.startswith("| ") for line in lines) == 2 + len(table.MODELS) + 1
     assert "1.0e-07 / 5.4e-06" in next(line for line in lines if line.startswith("| structured-hnn"))
     assert (tmp_path / "table" / "pareto.png").read_bytes().startswith(b"\x89PNG")
     # On the other splits every letter is a test once; their median and the worst single run are rows.
@@ -84,7 +85,7 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     # A table that is continued measures nothing twice.
     measured = len(stubbed)
     command(arm_table, "--out", "table", "--resume")
-    assert len(stubbed) == measured == 2 + 3 * len(PUBLISHED) + 7 * (len(PUBLISHED) + 1)
+    assert len(stubbed) == measured == 2 + 3 * len(table.SIZES) + 7 * len(table.MODELS)
     assert json.loads((tmp_path / "table" / "report.json").read_text())["rows"] == report["rows"]
 
 
@@ -106,7 +107,7 @@ def test_the_trigonometric_model_and_the_plant_are_measured(tmp_path):
     assert curve is not None
     assert curve.errors == [numbers["torque_mse"]] or curve.errors == [1e-32]
     assert numbers["whole_circle_torque_mse"] < 1e-20
-    plant, _ = arm_models.plant_rows(arm_table.two_link_arm(), sets)
+    plant, _ = arm_models.measure_plant(two_link_arm(), sets)
     assert numbers["vpt_seconds"] == pytest.approx(plant["vpt_seconds"])
     # What the published motions give, which symplectic Euler made; those of the hanging arm would give 6.62 s.
     assert plant["vpt_seconds"] == pytest.approx(6.467, abs=0.01)

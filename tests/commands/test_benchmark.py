@@ -10,7 +10,7 @@ import pytest
 from calls import command, refused
 
 from dln_jax.commands import benchmark
-from dln_jax.figures.benchmarks import curves, panels, points
+from dln_jax.figures.benchmarks import panels, points
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
@@ -18,7 +18,8 @@ from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.studies.arm.data import letters, published_split
-from dln_jax.studies.arm.models import needs_of
+from dln_jax.studies.arm.models import described
+from dln_jax.studies.case import Findings
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.studies.report import Row, markdown
 from dln_jax.studies.speed import calls as benchmark_calls
@@ -26,8 +27,9 @@ from dln_jax.studies.speed import integrators as benchmark_integrators
 from dln_jax.studies.speed import low_latency_calls
 from dln_jax.studies.speed import one_step as benchmark_one_step
 from dln_jax.studies.speed import throughput as benchmark_throughput
+from dln_jax.studies.speed.subjects import SUBJECTS
 from dln_jax.types import Needs
-from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.kinds import build
 from dln_jax.zoo.load import save_model
 
 
@@ -62,9 +64,7 @@ def test_halving_the_step_of_a_sweep_gains_by_the_order(method, order):
 def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, capsys):
     rows = [Row("a/b", "p50_us", 3.0, "us", None, 2.0), Row("a/b", "ratio", 2.0, "1"), Row("c", "ratio", 4.0, "1")]
     monkeypatch.setitem(
-        benchmark.MEASURES,
-        "scaling",
-        lambda quick: (rows, curves({"x": ([1.0, 2.0], [3.0, 4.0])}, x="", y="", title="")),
+        SUBJECTS, "scaling", (lambda quick: Findings(rows, {"x": ([1.0, 2.0], [3.0, 4.0])}), SUBJECTS["scaling"][1])
     )
     command(benchmark, "scaling", "--quick", "--out", str(tmp_path / "out"))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -102,10 +102,7 @@ def small_run(tmp_path_factory):
     """A run with random parameters."""
     folder = tmp_path_factory.mktemp("runs") / "structured-delan"
     folder.mkdir()
-    sets = published_split(letters(None))
-    description = describe(
-        "structured-delan", sets.train, needs_of(sets), precision="f64", width=2, depth=1, activation="tanh"
-    )
+    description = described("structured-delan", published_split(letters(None)).train, width=2, depth=1)
     save_model(folder, description, build(description).init(jax.random.key(0)))
     return folder
 

@@ -9,19 +9,21 @@ from motions import quick_motion
 from safetensors.numpy import load_file
 
 from dln_jax.commands import hnn_table, train_hnn
-from dln_jax.commands.hnn_table import TASKS
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.mechanics.flow import Flow
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.studies.case import Findings, rows_of
 from dln_jax.studies.hamiltonian import measures as hnn_measures
 from dln_jax.studies.hamiltonian import pixels as pixel_task
+from dln_jax.studies.hamiltonian import table
 from dln_jax.studies.hamiltonian import tasks as hnn_tasks
 from dln_jax.studies.hamiltonian import training as hnn_models
-from dln_jax.studies.hamiltonian.published import BOUNDS, PIXELS, PUBLISHED, markdown, rows_of
+from dln_jax.studies.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import pieces, problem_of
 from dln_jax.studies.hamiltonian.training import RECIPES, description_of, models_of
+from dln_jax.studies.published import HAMILTONIAN
 from dln_jax.types import InputError
 from dln_jax.zoo.load import load_phase_field
 
@@ -76,9 +78,9 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_models, "RECIPES", small)
         patch.setattr(hnn_tasks, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
-        patch.setattr(hnn_table, "models_of", KINDS.get)
+        patch.setattr(table, "models_of", KINDS.get)
         patch.setattr(hnn_measures, "predict", quick_prediction)
-        patch.setattr(hnn_table, "train", quick_training)
+        patch.setattr(table, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
             patch.setattr(module, "reference_motion", quick_motion)
         patch.setattr(hnn_tasks, "STARTS", 2)
@@ -106,10 +108,10 @@ def test_every_task_runs_and_reports(workplace, capsys):
             assert {"energy_mse", "rollout_mse", "train_seconds", "compile_seconds", "parameters"} <= quantities
             if task != hnn_tasks.REAL:
                 assert {"test_loss", "train_loss", "clean_field_mse", "energy_mse_standard_error"} <= quantities
-            for quantity, published in PUBLISHED[task].items():
+            beside = HAMILTONIAN.values[f"{task}/{'baseline' if kind == 'baseline' else 'hnn'}"]
+            for quantity, published in beside.items():
                 if (f"{task}/{kind}", quantity) in rows:
-                    expected = published[0 if kind == "baseline" else 1]
-                    assert rows[f"{task}/{kind}", quantity]["reference"] == expected
+                    assert rows[f"{task}/{kind}", quantity]["reference"] == published
     # The polynomial holds the oscillator.
     assert rows["spring/polynomial", "clean_field_mse"]["value"] < 0.1
     assert rows["three-body/hnn", "energy_mse"]["bound"] == 4.2e-3
@@ -117,7 +119,7 @@ def test_every_task_runs_and_reports(workplace, capsys):
 
 
 def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch):
-    monkeypatch.setattr(hnn_table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
+    monkeypatch.setattr(table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
     monkeypatch.setattr(hnn_table, "chosen_tasks", lambda given: list(TASKS))
     before = (workplace / "all" / "jobs.json").read_bytes()
     command(hnn_table, "--out", "all", "--resume")
@@ -126,7 +128,8 @@ def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch)
 
 def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
     numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
-    monkeypatch.setattr(hnn_table, "phase_task", lambda *given: {"hnn": numbers})
+    monkeypatch.setattr(table, "models_of", lambda task: ("hnn",))
+    monkeypatch.setattr(table, "phase_task", lambda name, **given: Findings(rows_of(f"{name}/hnn", numbers)))
     command(hnn_table, *TINY, "--tasks", "spring,real-pendulum", "--no-figures", "--out", "part")
     out = capsys.readouterr().out
     assert "real-pendulum is left out" in out
@@ -135,12 +138,14 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
 
 
 def test_bounds_decide():
-    line = markdown({"spring/hnn": {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7}}).splitlines()[-1]
-    assert "1.0e-06 ± 2e-07 / 3.8e-04" in line and PIXELS in PUBLISHED
-    rows = {row.quantity: row for row in rows_of("spring/hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})}
+    line = markdown(rows_of("spring/hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7})).splitlines()[-1]
+    assert "1.0e-06 ± 2e-07 / 3.8e-04" in line
+    bare = rows_of("spring/hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
+    rows = {row.quantity: row for row in table_rows(bare)}
     assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
-    assert all(row.bound is None for row in rows_of("spring/baseline", {"energy_mse": 1e-6}))
-    assert set(PUBLISHED) == set(BOUNDS) == set(TASKS) and set(RECIPES) == set(hnn_tasks.TASKS)
+    assert all(row.bound is None for row in table_rows(rows_of("spring/baseline", {"energy_mse": 1e-6})))
+    assert {f"{task}/hnn" for task in TASKS} == set(BOUNDS) < set(HAMILTONIAN.values)
+    assert set(RECIPES) == set(hnn_tasks.TASKS)
 
 
 def test_measured_motions_are_cut_at_gaps(workplace):

@@ -9,7 +9,9 @@ from calls import command, refused
 
 from dln_jax.commands import stability
 from dln_jax.metrics.misfit import velocity_misfit
-from dln_jax.studies.stability import NAMES, Case, measure
+from dln_jax.studies.case import named
+from dln_jax.studies.report import expect
+from dln_jax.studies.stability import NAMES, cases
 from dln_jax.types import InputError
 
 STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
@@ -17,15 +19,16 @@ STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
 
 @pytest.mark.parametrize("name", NAMES)
 def test_hard_cases_meet_their_bounds(name):
-    cases = measure(name, steps=STEPS.get(name, 1)).cases
-    assert cases and len({(case.name, case.quantity) for case in cases}) == len(cases)
-    failing = [(case.name, case.quantity, case.got, case.bound) for case in cases if not case.passed]
-    assert not failing
+    (case,) = named(cases(steps=STEPS.get(name, 1)), name)
+    rows = case.measure().rows
+    assert rows and len({(row.case, row.quantity) for row in rows}) == len(rows)
+    assert not [row for row in rows if not row.passed]
 
 
 def test_a_number_that_is_not_one_meets_no_bound():
-    assert not Case("a", "b", "", math.nan, 1.0).passed and not Case("a", "b", "", math.nan, 1.0, at_least=True).passed
-    assert Case("a", "b", "", 1.0, 1.0).passed and not Case("a", "b", "", 1.0, 2.0, at_least=True).passed
+    for at_least in (False, True):
+        assert expect("a", "b", "", math.nan, 1.0, at_least=at_least).passed is False
+    assert expect("a", "b", "", 1.0, 1.0).passed and not expect("a", "b", "", 1.0, 2.0, at_least=True).passed
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.05])

@@ -12,7 +12,9 @@ from calls import command, refused
 from dln_jax.commands import diffnet_report, train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import first_order, runs, second_order
+from dln_jax.studies.differential_networks import one_pass
 from dln_jax.studies.differential_networks import table as diffnet_table
+from dln_jax.studies.published import DIFFERENTIAL_NETWORKS
 from dln_jax.types import InputError
 from dln_jax.zoo.load_function import load_function
 
@@ -202,7 +204,7 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     """With training stubbed: each row of the published table gets the best of ours and its bound."""
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
     costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
-    monkeypatch.setattr(diffnet_table, "measure", lambda sets, test, settings: {**numbers, **costs})
+    monkeypatch.setattr(diffnet_table, "trained", lambda sets, test, settings: {**numbers, **costs})
     command(train_diffnet, "--table", "--samples", "50", "--out", "table")
     report = json.loads((workplace / "table" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
@@ -215,15 +217,16 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     assert bounds["cos_sin/best", "hessian_mse"] == pytest.approx(1.7e-4 / 10)
     assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
     # What is measured is not measured again.
-    monkeypatch.setattr(diffnet_table, "measure", None)
+    monkeypatch.setattr(diffnet_table, "trained", None)
     command(train_diffnet, "--table", "--resume", "--out", "table")
     out = capsys.readouterr().out
     assert out.count("published") >= 12 and "almost everywhere" in out and "…" not in out
-    assert all(f"{number:.1e}" in out for row in diffnet_table.PUBLISHED["sin"]["type2"] for number in row)
+    type2 = [each for case, each in DIFFERENTIAL_NETWORKS.values.items() if case.startswith("sin/type2/")]
+    assert len(type2) == 4 and all(f"{number:.1e}" in out for each in type2 for number in each.values())
 
 
 def test_the_report_states_the_ratio_for_every_number_of_inputs(workplace, monkeypatch):
-    monkeypatch.setattr(diffnet_report, "INPUTS", (1, 2))
+    monkeypatch.setattr(one_pass, "INPUTS", (1, 2))
     command(diffnet_report, "--width", "4", "--depth", "1", "--batch", "8", "--repetitions", "2", "--out", "report")
     rows = json.loads((workplace / "report" / "report.json").read_text())["rows"]
     ratios = {row["case"]: row for row in rows if row["quantity"] == "speedup_over_jax_hessian"}

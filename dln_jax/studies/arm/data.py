@@ -16,10 +16,7 @@ from dln_jax.types import InputError
 
 def letters(path: Path | None) -> Trajectories:
     """What the arm writes."""
-    data = default_data(two_link_arm()) if path is None else schema.load(path)
-    if data.degrees_of_freedom != 2:
-        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
-    return data._replace(needs=two_link_arm().needs)
+    return _of_the_arm(path, default_data(two_link_arm()) if path is None else schema.load(path))
 
 
 def published_split(written: Trajectories) -> Split:
@@ -29,11 +26,13 @@ def published_split(written: Trajectories) -> Split:
 
 def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:
     """Random states of the arm for training, the published free swings for the test."""
-    scene = two_link_arm()
-    data = generators.uniform(scene, samples=samples) if path is None else schema.load(path)
-    if data.degrees_of_freedom != 2:
-        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
-    data = data._replace(needs=scene.needs)
+    data = _of_the_arm(path, generators.uniform(two_link_arm(), samples=samples) if path is None else schema.load(path))
     present = np.random.default_rng(0).permutation(np.unique(data.trajectory))
     held_out = present[: min(validation, max(1, len(present) // 10))]
     return Split(select(data, np.setdiff1d(present, held_out)), select(data, held_out), uniform_tests())
+
+
+def _of_the_arm(path: Path | None, data: Trajectories) -> Trajectories:
+    if data.degrees_of_freedom != 2:
+        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
+    return data._replace(needs=two_link_arm().needs)

@@ -1,7 +1,7 @@
 """One model of the arm's table: trained, measured on the test, and timed."""
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from dln_jax.data.splits import Split
 from dln_jax.datasets import generators
 from dln_jax.learning.dynamics_fit import Settings, train
 from dln_jax.learning.engine.runs import Training
-from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.linear_fit import LinearFit, fit_linear
 from dln_jax.learning.objectives import TORQUE, objective_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Driven, dynamics
@@ -25,10 +25,11 @@ from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.types import Needs
+from dln_jax.types import Hamiltonian
 from dln_jax.zoo.kinds import build, describe
 from dln_jax.zoo.load import compiled
 
+TRIGONOMETRIC = "trigonometric"
 TORQUE_NOISE = 0.05
 """N m, standard deviation, of the trigonometric model's second fit."""
 TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
@@ -46,8 +47,8 @@ class Size(NamedTuple):
 
 SIZES = {
     "structured-delan": Size(8, 2, "tanh", 150),
-    "structured-hnn": Size(8, 2, "tanh", 150),
     "black-box-delan": Size(16, 2, "tanh", 150),
+    "structured-hnn": Size(8, 2, "tanh", 150),
     "black-box-hnn": Size(16, 2, "tanh", 150),
     "feed-forward": Size(16, 2, "tanh", 150),
 }
@@ -70,10 +71,10 @@ def whole_circle(*, samples: int = 1_000) -> Trajectories:
     return generators.uniform(two_link_arm(), samples=samples, seed=1, **WHOLE_CIRCLE)
 
 
-def needs_of(sets: Split) -> Needs:
-    """The needs that the data state."""
-    assert sets.train.needs is not None
-    return sets.train.needs
+def described(kind: str, data: Trajectories, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
+    """The description of a model of the arm; the trigonometric one is of degree 1, networks get their size."""
+    size = {"degree": 1} if kind == TRIGONOMETRIC else {"activation": "tanh", **keywords}
+    return describe(kind, data, two_link_arm().needs, precision=precision, **size)
 
 
 def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5.0, dt: float = 0.02) -> float:
@@ -85,40 +86,37 @@ def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5
     return float(np.median(np.where(outside.any(axis=1), t[outside.argmax(axis=1)], duration)))
 
 
-def plant_rows(scene: Scene, sets: Split) -> Measured:
+def measure_plant(scene: Scene, sets: Split) -> Measured:
     """What the true plant reaches on the test: the ceiling of every rollout, and what recorded momenta are wrong by.
 
     The mean square of the torques over the whole circle is what a model that answers zero would be wrong by.
     """
-    plant, H = dynamics(scene.energies), legendre(scene.lagrangian)
     return {
-        **errors(predictions(scene.energies, sets.test, jnp.float64, H=H), sets.test),
-        **rollout_metrics(plant, sets.test),
+        **on_the_test(scene.energies, sets, H=legendre(scene.lagrangian)),
         "free_motion_inside_seconds": free_motion_inside_seconds(scene, sets),
         "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
     }, None
 
 
-def linear_model(sets: Split) -> Model:
-    """The trigonometric model of a data set."""
-    return build(describe("trigonometric", sets.train, needs_of(sets), precision="f64", degree=1))
+def linear_fit(sets: Split) -> tuple[Model, LinearFit, float]:
+    """The trigonometric model of a data set, its fit, and the seconds that took."""
+    model = build(described(TRIGONOMETRIC, sets.train))
+    began = time.perf_counter()
+    fitted = fit_linear(model, sets.train)
+    return model, fitted, time.perf_counter() - began
 
 
 def measure_trigonometric(sets: Split) -> Measured:
     """The linear fit, and the same with noise on the training torques."""
-    model = linear_model(sets)
-    began = time.perf_counter()
-    fitted = fit_linear(model, sets.train)
-    seconds = time.perf_counter() - began
+    model, fitted, seconds = linear_fit(sets)
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
     noisy = fit_linear(model, sets.train._replace(tau=sets.train.tau + noise))
     energies = model.energies(fitted.parameters)
     system = compiled(dynamics(energies), jnp.float64)
     numbers = {
-        **errors(predictions(energies, sets.test, jnp.float64), sets.test),
+        **on_the_test(energies, sets),
         "noisy_torque_mse": torque_mse(dynamics(model.energies(noisy.parameters)), sets.test),
         "whole_circle_torque_mse": torque_mse(system, whole_circle()),
-        **rollout_metrics(system, sets.test),
         "rank": float(fitted.rank),
         "condition": fitted.condition,
         "train_seconds": seconds,
@@ -135,9 +133,8 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
     seconds = training.compile_seconds + training.train_seconds
     of_seeds = [
         {
-            **errors(predictions(of_seed, sets.test, jnp.float64), sets.test),
+            **on_the_test(of_seed, sets),
             "whole_circle_torque_mse": torque_mse(system, whole_circle()),
-            **rollout_metrics(system, sets.test),
             **definite(kind, system, sets),
         }
         for of_seed, system in zip(energies, systems, strict=True)
@@ -167,9 +164,9 @@ def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[T
 
 def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Test torque errors of one more split, trained as the published one: median and largest over seeds."""
-    if kind == "trigonometric":
-        model = linear_model(sets)
-        energies = [model.energies(fit_linear(model, sets.train).parameters)]
+    if kind == TRIGONOMETRIC:
+        model, fitted, _ = linear_fit(sets)
+        energies = [model.energies(fitted.parameters)]
     else:
         _, energies = trained(kind, sets, seeds=seeds, steps=steps)
     torques = [torque_mse(dynamics(each), sets.test) for each in energies]
@@ -178,14 +175,12 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
     """The published protocol: one seed, two layers of 64, batch 512, float32."""
-    description = describe(kind, sets.train, needs_of(sets), precision="f32", width=64, depth=2, activation="tanh")
-    model = build(description)
+    model = build(described(kind, sets.train, precision="f32", width=64, depth=2))
     training = train(model, sets, Settings(steps=steps), objective=objective_of(kind, sets.train))
     energies = model.energies(training.parameters)
     system = compiled(dynamics(energies), jnp.float32)
     numbers = {
-        **errors(predictions(energies, sets.test, jnp.float32), sets.test),
-        **rollout_metrics(system, sets.test, dtype=jnp.float32),
+        **on_the_test(energies, sets, jnp.float32),
         "compile_seconds": training.compile_seconds,
         "train_seconds": training.compile_seconds + training.train_seconds,
         "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters))),
@@ -194,7 +189,7 @@ def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
     return numbers, curve(kind, sets, training, numbers, 1)
 
 
-def gauss_newton_rows(sets: Split, *, seeds: int, steps: int | None) -> Measured:
+def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Structured models trained one by one: seconds to test errors, compilation included, medians over seeds.
 
     Also the cost of ten seeds in one program in units of a single run, compilation included.
@@ -224,8 +219,7 @@ def gauss_newton_rows(sets: Split, *, seeds: int, steps: int | None) -> Measured
 
 def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Model, Settings]:
     """The model of a kind, and Gauss-Newton's settings for it."""
-    keywords = {"width": size.width, "depth": size.depth, "activation": size.activation}
-    model = build(describe(kind, sets.train, needs_of(sets), precision="f64", **keywords))
+    model = build(described(kind, sets.train, width=size.width, depth=size.depth, activation=size.activation))
     return model, Settings(optimizer="gauss-newton", precision="f64", steps=steps or size.steps)
 
 
@@ -243,6 +237,12 @@ def definite(kind: str, system: Dynamics | PlainDynamics, sets: Split) -> dict[s
     if not kind.startswith("black-box"):
         return {}
     return {"share_not_definite": definiteness(system, sets.test.q, sets.test.qd).share_not_definite}
+
+
+def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:
+    """Errors, and how long motions are predicted; `H` as for `predictions`."""
+    predicted = predictions(energies, sets.test, dtype, H=H)
+    return {**errors(predicted, sets.test), **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
 
 
 def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:

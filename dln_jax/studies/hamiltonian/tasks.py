@@ -21,7 +21,7 @@ from dln_jax.learning.trajectory_matching import stretches
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import Hamiltonian, InputError, Needs
 
-REAL, MEASURED = "real-pendulum", "measured"
+REAL, MEASURED, PIXELS = "real-pendulum", "measured", "pixels"
 TASKS = (*PROTOCOLS, REAL, MEASURED)
 TEST_SHARE = 0.2
 """Of a single measured trajectory: its last samples, as published."""

@@ -1,16 +1,16 @@
-"""Soft bodies by subject: what is measured, what theory expects, and whether it is met."""
+"""Soft bodies: closed forms, hard cases, gradients and speed, each number beside what one may expect."""
 
+import functools
 from collections.abc import Callable
 
 from dln_jax.precision import in_float64
-from dln_jax.studies.case import Findings
+from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.soft_bodies import gradients, motions, robustness, sliding, speed, statics
-from dln_jax.types import InputError
+from dln_jax.studies.soft_bodies.figures import FIGURES
 
-Measurement = Callable[[bool], Findings]
-"""quick -> findings; a quick measurement is smaller."""
+__all__ = ["SUBJECTS", "cases"]
 
-SUBJECTS: dict[str, dict[str, Measurement]] = {
+SUBJECTS: dict[str, dict[str, Callable[[bool], Findings]]] = {
     "references": {
         "free-fall": motions.free_fall,
         "invariants": motions.invariants,
@@ -46,22 +46,13 @@ SUBJECTS: dict[str, dict[str, Measurement]] = {
         "speed-against-error": speed.speed_against_error,
     },
 }
-"""By subject and by name. Only `speed` depends on the machine."""
-
-__all__ = ["SUBJECTS", "measure"]
+"""quick -> findings, by subject and by name; only `speed` depends on the machine."""
 
 
-@in_float64
-def measure(subject: str, name: str, *, quick: bool = False) -> Findings:
-    """The cases of one measurement.
-
-    Raises:
-        InputError: no such subject or measurement.
-    """
-    if subject not in SUBJECTS:
-        raise InputError(f"subject '{subject}' is unknown; choose from {', '.join(SUBJECTS)}")
-    if name not in SUBJECTS[subject]:
-        raise InputError(f"{subject} has no '{name}'; choose from {', '.join(SUBJECTS[subject])}")
-    found = SUBJECTS[subject][name](quick)
-    # NumPy's scalars compare to NumPy's booleans.
-    return found._replace(cases=[case._replace(got=float(case.got), bound=float(case.bound)) for case in found.cases])
+def cases(*, quick: bool = False) -> list[Case]:
+    """All cases, named SUBJECT/NAME, in float64 unless they say otherwise; quick ones are smaller."""
+    return [
+        Case(f"{subject}/{name}", in_float64(functools.partial(measure, quick)), draw=FIGURES.get(name))
+        for subject, measures in SUBJECTS.items()
+        for name, measure in measures.items()
+    ]

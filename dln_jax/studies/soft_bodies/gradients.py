@@ -30,7 +30,8 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect
 from dln_jax.studies.soft_bodies.common import GRAVITY
 
 BOUND = 1e-7
@@ -66,7 +67,7 @@ def modes(quick: bool) -> Findings:
     _, forward = jax.jit(lambda at: jax.jvp(loss, (at,), (along,)))(at)
     inner = _inner(reverse, along)
     text = "Jᵀ and J of one motion agree to rounding"
-    cases = [Case("modes/forward", "relative_difference", text, float(abs(forward / inner - 1)), 1e-10)]
+    cases = [expect("modes/forward", "relative_difference", text, float(abs(forward / inner - 1)), 1e-10)]
     near = jax.tree.map(lambda leaf, change: np.stack([leaf, leaf + 0.1 * change]), at, along)
     lanes = jax.tree.map(np.asarray, jax.jit(jax.vmap(jax.grad(loss)))(near))
     second = jax.tree.map(lambda leaf: leaf[1], near)
@@ -75,7 +76,7 @@ def modes(quick: bool) -> Findings:
         for k, one in enumerate((reverse, slopes(second)))
     ]
     text = "lanes that take different numbers of iterations do not disturb each other"
-    cases.append(Case("modes/vmap", "relative_difference", text, max(both), 1e-8))
+    cases.append(expect("modes/vmap", "relative_difference", text, max(both), 1e-8))
     _, product = jax.jit(lambda at: jax.jvp(jax.grad(loss), (at,), (along,)))(at)
 
     def shifted(e: float):
@@ -93,7 +94,7 @@ def modes(quick: bool) -> Findings:
     changes = [_distance(a, b) for a, b in zip(differences[1:], differences, strict=False)]
     chosen = differences[1 + int(np.argmin(changes))]
     text = "Hessian-vector product against differences of the gradient"
-    cases.append(Case("modes/nested", "relative_difference", text, _distance(chosen, product), 1e-6))
+    cases.append(expect("modes/nested", "relative_difference", text, _distance(chosen, product), 1e-6))
     return Findings(cases)
 
 
@@ -225,7 +226,7 @@ def _compared(name: str, loss: Loss, at: dict[str, Any]) -> Findings:
         slope = float(sizes[key])
         curves["errors"][key] = abs(fourth / slope - 1)
         error = float(abs(fourth[best] / slope - 1))
-        cases.append(Case(f"gradient/{name}", f"{key}_relative_error", text, error, BOUND, reference=slope))
+        cases.append(expect(f"gradient/{name}", f"{key}_relative_error", text, error, BOUND, reference=slope))
     return Findings(cases, curves)
 
 

@@ -22,7 +22,8 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, motion
 
 DT = 0.01
@@ -45,7 +46,7 @@ def free_fall(quick: bool) -> Findings:
     fall = n * DT * velocity + np.array([0.0, -GRAVITY]) * DT**2 * n * (n + 1) / 2
     error = largest(abs(seen.x - scene.mesh.vertices - fall))
     text = f"{STEPS} steps of {DT} s end where the sum says, to rounding"
-    return Findings([Case("free-fall/backward-euler", "largest_position_error", text, error, 1e-12, "m")])
+    return Findings([expect("free-fall/backward-euler", "largest_position_error", text, error, 1e-12, "m")])
 
 
 def invariants(quick: bool) -> Findings:
@@ -67,23 +68,23 @@ def invariants(quick: bool) -> Findings:
         scale = float(np.sum(masses[:, None] * abs(v[0])))
         drift = largest(abs(momentum - momentum[0])) / scale
         cases += [
-            Case(name, "steps_not_converged", "every step converges", largest(~seen.converged), 0.0),
-            Case(name, "momentum_drift", "internal forces sum to zero: exact to rounding", drift, 1e-12),
+            expect(name, "steps_not_converged", "every step converges", largest(~seen.converged), 0.0),
+            expect(name, "momentum_drift", "internal forces sum to zero: exact to rounding", drift, 1e-12),
         ]
         change = (turning - turning[0]) / turning[0]
         if integrator == "midpoint":
             text = "a quadratic invariant: exact to the tolerance of the steps"
-            cases.append(Case(name, "angular_momentum_drift", text, largest(abs(change)), 1e-9))
+            cases.append(expect(name, "angular_momentum_drift", text, largest(abs(change)), 1e-9))
             wave = largest(abs(energy / energy[0] - 1))
             text = "no drift: the energy stays within the step's error of second order"
-            cases.append(Case(name, "largest_energy_error", text, wave, 0.02))
+            cases.append(expect(name, "largest_energy_error", text, wave, 0.02))
             continue
         rise = largest(np.diff(energy)) / energy[0]
         lost = largest(np.diff(turning) / turning[0])
         text = "it dissipates: the energy rises in no step, to rounding"
-        cases.append(Case(name, "largest_energy_rise", text, rise, 1e-12))
+        cases.append(expect(name, "largest_energy_rise", text, rise, 1e-12))
         text = "it damps rotation too: angular momentum grows in no step, to rounding"
-        cases.append(Case(name, "largest_angular_momentum_rise", text, lost, 1e-12))
+        cases.append(expect(name, "largest_angular_momentum_rise", text, lost, 1e-12))
     return Findings(cases, curves)
 
 
@@ -110,7 +111,7 @@ def oscillator(quick: bool) -> Findings:
         text = "(1 + w²h²)^-1/2 per step" if integrator == "backward-euler" else "the amplitude stays"
         text += f", w h = {frequencies[0] * h:.2g}"
         error = largest(abs(factors - exact))
-        cases.append(Case(f"oscillator/{integrator}", "amplitude_factor_error", text, error, 1e-10, reference=exact))
+        cases.append(expect(f"oscillator/{integrator}", "amplitude_factor_error", text, error, 1e-10, reference=exact))
     return Findings(cases)
 
 
@@ -132,7 +133,9 @@ def orders(quick: bool) -> Findings:
         order = float(np.log2(errors[-2] / errors[-1]))
         expected = ORDERS[name]
         text = f"order {expected} between {counts[-2]} and {counts[-1]} steps, against RK4 in NumPy"
-        cases.append(Case(f"order/{name}", "order_error", text, abs(order - expected), 0.15, reference=float(expected)))
+        cases.append(
+            expect(f"order/{name}", "order_error", text, abs(order - expected), 0.15, reference=float(expected))
+        )
     return Findings(cases, curves)
 
 

@@ -22,7 +22,8 @@ from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.info import Info
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import Row, expect, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, motion
 
 MODULUS = 1e6
@@ -54,7 +55,7 @@ def materials(quick: bool) -> Findings:
         most = largest(found.iterations[:3])
         text = "3 to 4 Newton iterations in a prototype, in the first steps from rest"
         cases += _converged(name, found, 100, f"below what the solver allows, in {STEPS} steps")
-        cases.append(Case(name, "most_iterations_at_first", text, most, 12.0))
+        cases.append(expect(name, "most_iterations_at_first", text, most, 12.0))
     return Findings(cases)
 
 
@@ -77,7 +78,7 @@ def bad_starts(quick: bool) -> Findings:
         least = _least_J(mesh, found.x)
         curves[name] = least
         text = "no element is inverted in the end (a prototype: 0.779)"
-        cases.append(Case(f"start/{name}", "least_J", text, float(least[-1]), 0.0, at_least=True))
+        cases.append(expect(f"start/{name}", "least_J", text, float(least[-1]), 0.0, at_least=True))
     return Findings(cases, curves)
 
 
@@ -106,7 +107,7 @@ def chain(quick: bool) -> Findings:
     return Findings(
         [
             *_converged("chain/100-springs", found, 30, "from level, where springs resist no sideways motion"),
-            Case("chain/100-springs", "largest_stretch", text, largest(abs(stretch - 1)), bound),
+            expect("chain/100-springs", "largest_stretch", text, largest(abs(stretch - 1)), bound),
         ]
     )
 
@@ -137,7 +138,7 @@ def twist(quick: bool) -> Findings:
     return Findings(
         [
             *_converged(f"twist/{turns:g}-turns", found, 30, "a bar of constant strain tetrahedra"),
-            Case(f"twist/{turns:g}-turns", "least_J", text, float(least.min()), 0.0, at_least=True),
+            expect(f"twist/{turns:g}-turns", "least_J", text, float(least.min()), 0.0, at_least=True),
         ],
         curves,
     )
@@ -154,7 +155,7 @@ def single_precision(quick: bool) -> Findings:
     return Findings(
         [
             *_converged("float32", single, 20, "the line search accepts what rounding hides"),
-            Case("float32", "relative_difference", text, difference, 1e-3),
+            expect("float32", "relative_difference", text, difference, 1e-3),
         ]
     )
 
@@ -173,8 +174,8 @@ def not_converged(quick: bool) -> Findings:
     finite = sum(int(np.isfinite(leaf).sum()) for leaf in jax.tree.leaves(slopes.terms))
     return Findings(
         [
-            Case("one-iteration", "reported_as_converged", "Info.converged is false", float(converged), 0.0),
-            Case("one-iteration", "finite_derivatives", "by a material and gravity: all NaN", float(finite), 0.0),
+            expect("one-iteration", "reported_as_converged", "Info.converged is false", float(converged), 0.0),
+            expect("one-iteration", "finite_derivatives", "by a material and gravity: all NaN", float(finite), 0.0),
         ]
     )
 
@@ -198,11 +199,11 @@ def _beam_motion(quick: bool) -> tuple[Params, Callable[..., State], Callable[[P
     return scene.params, init, motion(step, STEPS)
 
 
-def _converged(name: str, found: Seen, iterations: int, text: str) -> list[Case]:
+def _converged(name: str, found: Seen, iterations: int, text: str) -> list[Row]:
     failed = float(np.sum(~found.converged))
     return [
-        Case(name, "steps_not_converged", "every step converges", failed, 0.0),
-        Case(name, "most_iterations", text, largest(found.iterations), float(iterations)),
+        expect(name, "steps_not_converged", "every step converges", failed, 0.0),
+        expect(name, "most_iterations", text, largest(found.iterations), float(iterations)),
     ]
 
 

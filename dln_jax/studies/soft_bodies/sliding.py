@@ -12,7 +12,8 @@ from dln_jax.softbody.scene import SoftScene, make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.gravity import gravity
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY, motion
 
 STIFFNESS = 1e6
@@ -41,15 +42,15 @@ def block(quick: bool) -> Findings:
         name = f"block/{rate}-steps-per-second"
         text = "the method's own sum; smooth friction adds up to a threshold speed's way"
         error = abs(gone - exact)
-        cases.append(Case(name, "distance_error", text, error, 3 * THRESHOLD * h, "m", reference=exact))
+        cases.append(expect(name, "distance_error", text, error, 3 * THRESHOLD * h, "m", reference=exact))
         text = f"first order: {distance:.6f} m less v h/2"
         error = abs(gone - distance)
-        cases.append(Case(name, "distance_to_the_limit", text, error, SPEED * h / 2, "m", reference=distance))
+        cases.append(expect(name, "distance_to_the_limit", text, error, SPEED * h / 2, "m", reference=distance))
         if rate == 30:
             late = float(abs(stopped - 11))
-            cases.append(Case(name, "steps_off", "it stands at the end of step 11", late, 0.0, reference=11.0))
+            cases.append(expect(name, "steps_off", "it stands at the end of step 11", late, 0.0, reference=11.0))
             text = "0.153667 m, published"
-            cases.append(Case(name, "published_distance_error", text, abs(gone - 0.153667), 5e-6, "m"))
+            cases.append(expect(name, "published_distance_error", text, abs(gone - 0.153667), 5e-6, "m"))
     return Findings(cases)
 
 
@@ -67,15 +68,15 @@ def slope(quick: bool) -> Findings:
         downhill = -(seen.v[:, 0] @ along)
         name = f"slope/friction-{friction}"
         text = "every step converges"
-        cases.append(Case(name, "steps_not_converged", text, largest(~seen.converged), 0.0))
+        cases.append(expect(name, "steps_not_converged", text, largest(~seen.converged), 0.0))
         if friction == SLOPE:
             text = "it sticks: no faster than the threshold speed"
-            cases.append(Case(name, "largest_speed", text, largest(abs(downhill)), THRESHOLD * (1 + 1e-6), "m/s"))
+            cases.append(expect(name, "largest_speed", text, largest(abs(downhill)), THRESHOLD * (1 + 1e-6), "m/s"))
             continue
         exact = GRAVITY * (SLOPE - friction) / np.hypot(SLOPE, 1.0)
         got = (downhill[-1] - downhill[steps // 2 - 1]) / (steps // 2 * h)
         text = "g (sin - mu cos): 0.0877 m/s²"
-        cases.append(Case(name, "acceleration_error", text, abs(got / exact - 1), 1e-6, reference=float(exact)))
+        cases.append(expect(name, "acceleration_error", text, abs(got / exact - 1), 1e-6, reference=float(exact)))
     return Findings(cases)
 
 

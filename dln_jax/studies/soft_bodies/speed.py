@@ -20,7 +20,8 @@ from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.elements.assembly import entries, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 from dln_jax.studies.soft_bodies.gradients import crawling, crawling_scene, gait
 from dln_jax.studies.soft_bodies.robustness import cantilever_scene
 
@@ -54,9 +55,9 @@ def creature(quick: bool) -> Findings:
     lanes = _lanes_rate()
     return Findings(
         [
-            Case("speed/crawler", "steps_per_second", alone, len(controls) / seconds, 6000.0, "1/s", at_least=True),
-            Case("speed/crawler", "steps_not_converged", "every step converges", failed, 0.0),
-            Case(
+            expect("speed/crawler", "steps_per_second", alone, len(controls) / seconds, 6000.0, "1/s", at_least=True),
+            expect("speed/crawler", "steps_not_converged", "every step converges", failed, 0.0),
+            expect(
                 f"speed/{LANES}-crawlers", "environment_steps_per_second", text, lanes, 15_000.0, "1/s", at_least=True
             ),
         ]
@@ -91,8 +92,8 @@ def beams(quick: bool) -> Findings:
         compiling, seconds, (_, (iterations, converged)) = timed(jax.jit(run), init(), scene.params)
         name = f"speed/beam-{scene.mesh.vertices.size}-unknowns"
         text = f"{np.mean(np.asarray(iterations)):.1f} Newton iterations; compiled in {compiling:.1f} s"
-        cases.append(Case(name, "seconds_per_step", text, seconds / steps, bound, "s"))
-        cases.append(Case(name, "steps_not_converged", "every step converges", largest(~np.asarray(converged)), 0.0))
+        cases.append(expect(name, "seconds_per_step", text, seconds / steps, bound, "s"))
+        cases.append(expect(name, "steps_not_converged", "every step converges", largest(~np.asarray(converged)), 0.0))
     return Findings(cases)
 
 
@@ -111,7 +112,7 @@ def backward(quick: bool) -> Findings:
     for name in programs:
         ratio = seconds[name] / seconds["motion"] - 1
         text = f"the backward pass of a motion that takes {seconds['motion'] * 1e3:.1f} ms, in turns with it"
-        cases.append(Case(f"speed/gradient-by-{name}", "backward_over_forward", text, ratio, 0.5))
+        cases.append(expect(f"speed/gradient-by-{name}", "backward_over_forward", text, ratio, 0.5))
     return Findings(cases)
 
 
@@ -143,7 +144,7 @@ def linear_solvers(quick: bool) -> Findings:
             assert np.isfinite(np.asarray(p)).all()
             reference = PROTOTYPE[at.unknowns].get(name)
             where = f"speed/{name}/{at.unknowns}-unknowns"
-            cases.append(Case(where, "seconds_per_solve", text, seconds, LIMIT, "s", reference=reference))
+            cases.append(expect(where, "seconds_per_solve", text, seconds, LIMIT, "s", reference=reference))
     return Findings(cases, curves)
 
 
@@ -182,11 +183,11 @@ def speed_against_error(quick: bool) -> Findings:
     first_order = curves["backward-euler"][0]
     fewer = float(first_order[0] / first_order[-1])
     where = "speed/backward-euler"
-    cases = [Case(where, "error_gain_by_shorter_steps", texts["backward-euler"], fewer, 2.0, at_least=True)]
+    cases = [expect(where, "error_gain_by_shorter_steps", texts["backward-euler"], fewer, 2.0, at_least=True)]
     for name in ("bdf2", "midpoint"):
         gain = float(first_order[-1] / curves[name][0][-1])
         where = f"speed/{name}"
-        cases.append(Case(where, "error_gain_over_backward_euler", texts[name], gain, 2.0, at_least=True))
+        cases.append(expect(where, "error_gain_over_backward_euler", texts[name], gain, 2.0, at_least=True))
     return Findings(cases, curves)
 
 

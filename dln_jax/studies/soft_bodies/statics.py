@@ -25,7 +25,8 @@ from dln_jax.softbody.terms.term import Term
 from dln_jax.solvers.elements.assembly import entries, gradient, pattern
 from dln_jax.solvers.elements.energies import element_hessians
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY
 
 UNIAXIAL = {2.0: (0.79807754, 646.74466), 0.5: (1.21076739, -935.35206), 10.0: (0.41653193, 3839.4808)}
@@ -67,9 +68,9 @@ def uniaxial(quick: bool) -> Findings:
         wide = largest(abs(np.asarray(x)[:, 1:] - lateral * rest[:, 1:])) / lateral
         text = "to the published digits, at every vertex"
         cases += [
-            Case(name, "not_converged", "the solver says so", float(not converged), 0.0),
-            Case(name, "lateral_stretch_error", text, wide, 2e-8, reference=lateral),
-            Case(name, "nominal_stress_error", text, float(abs(force / stress - 1)), 2e-8, reference=stress),
+            expect(name, "not_converged", "the solver says so", float(not converged), 0.0),
+            expect(name, "lateral_stretch_error", text, wide, 2e-8, reference=lateral),
+            expect(name, "nominal_stress_error", text, float(abs(force / stress - 1)), 2e-8, reference=stress),
         ]
     return Findings(cases)
 
@@ -94,8 +95,8 @@ def patch_test(quick: bool) -> Findings:
         x, info = jax.jit(lambda x, scene=scene: static_solve(scene, scene.params, x=x, tolerance=1e-9))(start)
         name = f"patch-test/{d}-d"
         text = "x = F X inside, to rounding"
-        cases.append(Case(name, "not_converged", "the solver says so", float(not info.converged), 0.0))
-        cases.append(Case(name, "largest_position_error", text, largest(abs(np.asarray(x) - affine)), 1e-12, "m"))
+        cases.append(expect(name, "not_converged", "the solver says so", float(not info.converged), 0.0))
+        cases.append(expect(name, "largest_position_error", text, largest(abs(np.asarray(x) - affine)), 1e-12, "m"))
     return Findings(cases)
 
 
@@ -107,7 +108,7 @@ def elastica(quick: bool) -> Findings:
     converged = tips[..., 2].all()
     tips = tips[..., :2]
     extrapolated = tips[-1] + (tips[-1] - tips[-2]) / 3
-    cases = [Case("elastica", "not_converged", "every equilibrium is found", float(not converged), 0.0)]
+    cases = [expect("elastica", "not_converged", "every equilibrium is found", float(not converged), 0.0)]
     for index, load in enumerate(loads):
         name = f"elastica/load-{load:g}"
         for axis, quantity in enumerate(("deflection", "shortening")):
@@ -115,12 +116,12 @@ def elastica(quick: bool) -> Findings:
             error = abs(extrapolated[index, axis] / expected - 1)
             text = f"{expected} L, extrapolated from {len(meshes)} meshes; beams of {SLENDERNESS} : 1 shear a little"
             cases.append(
-                Case(name, f"{quantity}_error", text, float(error), 0.02 if quick else 2e-3, reference=expected)
+                expect(name, f"{quantity}_error", text, float(error), 0.02 if quick else 2e-3, reference=expected)
             )
         if not quick:
             order = float(np.log2((tips[1, index, 0] - tips[0, index, 0]) / (tips[2, index, 0] - tips[1, index, 0])))
             text = "deflections converge with order 2"
-            cases.append(Case(name, "order_error", text, abs(order - 2), 0.25, reference=2.0))
+            cases.append(expect(name, "order_error", text, abs(order - 2), 0.25, reference=2.0))
     curves = {"loads": loads, "cells": [cells[1] for cells in meshes], "tips": tips, "extrapolated": extrapolated}
     return Findings(cases, curves)
 
@@ -172,19 +173,19 @@ def cantilever(quick: bool) -> Findings:
     for index, (quantity, (value, bound, unit, text)) in enumerate(expected.items()):
         error = float(abs(extrapolated[index] / value - 1))
         text += f"; extrapolated from {len(cells)} meshes: {extrapolated[index]:.5g} {unit}"
-        cases.append(Case("cantilever", f"{quantity}_error", text, error, bound, reference=value))
+        cases.append(expect("cantilever", f"{quantity}_error", text, error, bound, reference=value))
         if not quick and quantity != "axial_frequency":
             order = float(np.log2((found[1, index] - found[0, index]) / (found[2, index] - found[1, index])))
             text = "linear elements lock: convergence is of order 2, a little less at the clamped corners"
-            cases.append(Case("cantilever", f"{quantity}_order", text, order, 1.5, at_least=True, reference=2.0))
+            cases.append(expect("cantilever", f"{quantity}_order", text, order, 1.5, at_least=True, reference=2.0))
     text = f"{BENDING_FREQUENCY} Hz is the limit of a slender beam, which bounds it from above"
-    cases.append(Case("cantilever", "bending_frequency", text, extrapolated[1], BENDING_FREQUENCY, "Hz"))
+    cases.append(expect("cantilever", "bending_frequency", text, extrapolated[1], BENDING_FREQUENCY, "Hz"))
     scene = _cantilever(cells[0])
     x, info = jax.jit(lambda params: static_solve(scene, params))(scene.params)
     sag = float(-(x[_tip(scene), 1] - scene.params.rest[_tip(scene), 1]).mean())
     text = "the nonlinear equilibrium is the linear one, to second order in deflection / length"
-    cases.append(Case("cantilever", "not_converged", "the solver says so", float(not info.converged), 0.0))
-    cases.append(Case("cantilever", "nonlinear_to_linear", text, abs(sag / found[0, 0] - 1), 1e-4))
+    cases.append(expect("cantilever", "not_converged", "the solver says so", float(not info.converged), 0.0))
+    cases.append(expect("cantilever", "nonlinear_to_linear", text, abs(sag / found[0, 0] - 1), 1e-4))
     return Findings(cases)
 
 

@@ -13,6 +13,7 @@ from dln_jax.mechanics import integrators
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
 from dln_jax.metrics.latency import medians_in_turns
+from dln_jax.studies.case import Findings
 from dln_jax.studies.hamiltonian.tasks import Problem, problem_of
 from dln_jax.studies.hamiltonian.training import description_of, train
 from dln_jax.studies.report import Row
@@ -31,7 +32,7 @@ METHODS = ("explicit-euler", "symplectic-euler", "stormer-verlet", "rk4", "impli
 QUICK = ("stormer-verlet", "rk4")
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """Some motions of each scene by each integrator, with dt halved; the truth is integrated to 1e-12 per step."""
     rows: list[Row] = []
     lines: dict[str, dict[str, tuple[list[float], list[float]]]] = {}
@@ -55,7 +56,12 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
                         Row(case, "energy_drift", drift, "J"),
                         Row(case, "trajectory_error", error, "1"),
                     ]
-    return rows, panels(lines, x="µs per simulated second", y="trajectory error, rms")
+    return Findings(rows, lines)
+
+
+def draw(lines: dict) -> Figure:
+    """Trajectory error against what a simulated second takes, for each scene."""
+    return panels(lines, x="µs per simulated second", y="trajectory error, rms")
 
 
 def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:

@@ -21,7 +21,8 @@ from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.metrics.latency import one_step
 from dln_jax.zoo.load import load_phase_field, load_run
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
+"""Where the package is, which the process is to import."""
 LIMIT = 120.0
 """Seconds after which the process is given up."""
 STATES = 512

@@ -17,10 +17,11 @@ from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.studies.arm.data import letters, published_split
-from dln_jax.studies.arm.models import SIZES, needs_of
-from dln_jax.studies.report import Row
+from dln_jax.studies.arm.models import SIZES, TRIGONOMETRIC, described
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import Row, unit_of
 from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.kinds import build
 from dln_jax.zoo.load import load_system, save_model
 
 WIDE = "structured-delan-64x64"
@@ -36,7 +37,7 @@ PROCESSES = 3
 """Of each way to dispatch, in turns; their medians count, and their spread shows the machine's noise."""
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """Trains every model of the arm, and times single calls in processes of their own."""
     sets = published_split(letters(None))
     with tempfile.TemporaryDirectory() as place:
@@ -53,10 +54,14 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
         rows.append(Row(name, "torque_mse", test_errors[name], "N^2 m^2"))
         for path, functions in paths.items():
             rows += rows_of(f"{name}/{path}", functions)
-            if "p50_us" not in functions["inverse"]:
-                continue
-            places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], max(test_errors[name], 1e-16))
-    return rows, points(
+            if "p50_us" in functions["inverse"]:
+                places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], max(test_errors[name], 1e-16))
+    return Findings(rows, places)
+
+
+def draw(places: dict) -> Figure:
+    """Error against the time of a call, for each model and call path."""
+    return points(
         places,
         x="one inverse-dynamics call, median, µs",
         y="test torque MSE, (N m)²; 1e-16 for what is exact",
@@ -68,24 +73,22 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
 
 def names(quick: bool) -> tuple[str, ...]:
     """Of the models; the wide one is trained by the published protocol."""
-    return (WIDE, "trigonometric") if quick else (*SIZES, WIDE, "trigonometric")
+    return (WIDE, TRIGONOMETRIC) if quick else (*SIZES, WIDE, TRIGONOMETRIC)
 
 
 def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     """A run folder with a trained model: by Gauss-Newton, the wide one by Adam, the trigonometric one by its solve."""
     folder = place / name
     folder.mkdir()
-    kind = SMALL if name == WIDE else name
-    network = {"width": 64, "depth": 2} if name == WIDE else SIZES[kind]._asdict() if kind in SIZES else {"degree": 1}
-    steps = network.pop("steps", 20_000)
-    activated = network if kind == "trigonometric" else {**network, "activation": "tanh"}
-    precision = "f32" if name == WIDE else "f64"
-    description = describe(kind, sets.train, needs_of(sets), precision=precision, **activated)
+    kind, wide = SMALL if name == WIDE else name, name == WIDE
+    network = {"width": 64, "depth": 2} if wide else SIZES[kind]._asdict() if kind in SIZES else {}
+    steps, precision = network.pop("steps", 20_000), "f32" if wide else "f64"
+    description = described(kind, sets.train, precision=precision, **network)
     model = build(description)
-    if kind == "trigonometric":
+    if kind == TRIGONOMETRIC:
         parameters = fit_linear(model, sets.train).parameters
     else:
-        optimizer = "adam" if name == WIDE else "gauss-newton"
+        optimizer = "adam" if wide else "gauss-newton"
         settings = Settings(optimizer=optimizer, precision=precision, steps=max(5, steps // 100) if quick else steps)
         parameters = train(model, sets, settings, objective=objective_of(kind, sets.train)).parameters
     save_model(folder, description, parameters)
@@ -99,17 +102,8 @@ def torque_mse(folder: Path, sets: Split) -> float:
 
 def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
     """What `dln_jax.studies.speed.calls` measures, by run."""
-    command = [
-        sys.executable,
-        "-m",
-        "dln_jax.studies.speed.calls",
-        "--dispatch",
-        dispatch,
-        "--calls",
-        str(calls),
-        "--runs",
-    ]
-    done = subprocess.run([*command, *map(str, folders)], capture_output=True, text=True)
+    command = [sys.executable, "-m", "dln_jax.studies.speed.calls", "--dispatch", dispatch, "--calls", str(calls)]
+    done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True, text=True)
     if done.returncode:
         raise InputError(f"timing in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -138,12 +132,9 @@ def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
     for name, latency in functions.items():
         if "calls_per_second" in latency:
             rate, bound = latency["calls_per_second"], LOOP_BOUNDS.get(case)
-            rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", None, bound, at_least=True))
+            rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", bound=bound, at_least=True))
             continue
-        quantities = {
-            f"{name}_{key}": latency[key] for key in ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
-        }
-        rows += [Row(case, key, value, "us", None, BOUNDS.get((case, key))) for key, value in quantities.items()]
-        ratio = f"{name}_p99_over_p50"
-        rows.append(Row(case, ratio, latency["p99_us"] / latency["p50_us"], "1", None, BOUNDS.get((case, ratio))))
+        numbers = {f"{name}_{key}": latency[key] for key in SHOWN}
+        numbers[f"{name}_p99_over_p50"] = latency["p99_us"] / latency["p50_us"]
+        rows += [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in numbers.items()]
     return rows

@@ -11,10 +11,11 @@ from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.model import Model, Parameters
-from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.data import letters, published_split
+from dln_jax.studies.arm.models import TRIGONOMETRIC, described
+from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
-from dln_jax.zoo.kinds import KINDS, build, describe
+from dln_jax.zoo.kinds import KINDS, build
 from dln_jax.zoo.load import compiled
 
 BATCH = 1_000
@@ -22,7 +23,7 @@ MEASURED = tuple(kind for kind in KINDS if kind != "black-box-hnn")
 """Parameters are random, and a random energy need not have a momentum for each velocity."""
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """Largest difference of float32 from float64, relative to the largest value, and batches of 1,000 in both."""
     sets = published_split(letters(None))
     data = sets.train
@@ -30,9 +31,7 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
     rows, shown = [], {}
     for kind in ("structured-delan",) if quick else MEASURED:
         answers, seconds = {}, {}
-        keywords = {"degree": 1} if kind == "trigonometric" else {"width": 64, "depth": 2, "activation": "tanh"}
-        needs = two_link_arm().needs
-        model = {p: build(describe(kind, data, needs, precision=p, **keywords)) for p in ("f32", "f64")}
+        model = {p: build(described(kind, data, precision=p, width=64, depth=2)) for p in ("f32", "f64")}
         # Parameters of float32 are exact in float64, so that arithmetic is all that differs.
         narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), initial(model["f32"], kind, data))
         wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), narrow)
@@ -55,12 +54,17 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
                 *(Row(f"{kind}/{name}", f"{p}_batch_us", 1e6 * seconds[p, name], "us") for p in ("f32", "f64")),
             ]
             shown[f"{kind}, {name}"] = (speed, error)
+    return Findings(rows, shown)
+
+
+def draw(shown: dict) -> Figure:
+    """What float32 gains in time against what it loses in accuracy."""
     labels = "time of float64 over time of float32, batch 1,000", "largest relative error of float32"
-    return rows, points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
+    return points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
 
 
 def initial(model: Model, kind: str, data: Trajectories) -> Parameters:
     """Random parameters; the linear model starts at zero, which has no motion, and gets its fit instead."""
-    if kind != "trigonometric":
+    if kind != TRIGONOMETRIC:
         return jax.jit(model.init)(jax.random.key(0))
     return fit_linear(model, data).parameters

@@ -13,6 +13,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
+from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
 
 SIZES = (1, 2, 3, 4, 6, 8, 10, 12, 30)
@@ -22,7 +23,7 @@ FITTED = (2, 12)
 BATCH = 512
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """Latency of single calls, a training step at batch 512, compilation and memory; and how fast each grows."""
     sizes = QUICK if quick else SIZES
     found = {d: cost(d, calls=500 if quick else 4_000, repetitions=10 if quick else 30) for d in sizes}
@@ -40,8 +41,12 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
         "compilation of a training step, s": by_quantity["training_compile_seconds"],
         "memory of a training step, MiB": by_quantity["training_memory_mib"],
     }
-    lines = {name: (list(map(float, sizes)), values) for name, values in shown.items()}
-    return rows, curves(lines, x="joints", y="cost", title="structured DeLaN, 64x64, float32, batch 512 in training")
+    return Findings(rows, {name: (list(map(float, sizes)), values) for name, values in shown.items()})
+
+
+def draw(lines: dict) -> Figure:
+    """Each cost against the number of joints."""
+    return curves(lines, x="joints", y="cost", title="structured DeLaN, 64x64, float32, batch 512 in training")
 
 
 def cost(d: int, *, calls: int, repetitions: int) -> list[tuple[str, float, str]]:

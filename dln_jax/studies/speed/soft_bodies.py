@@ -3,20 +3,23 @@
 from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import curves
-from dln_jax.studies.report import Row
-from dln_jax.studies.soft_bodies import measure as measure_cases
-from dln_jax.studies.soft_bodies.figures import FIGURES
+from dln_jax.studies import soft_bodies
+from dln_jax.studies.case import Findings, named
+from dln_jax.studies.soft_bodies.figures import speed_against_error
 from dln_jax.studies.soft_bodies.speed import LANES
 
-AGAINST_ERROR = "speed-against-error"
 
-
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """The speeds of `softbody_report`; the table of linear solvers is left to that."""
-    names = ("creature",) if quick else ("creature", "beams", "backward", AGAINST_ERROR)
-    found = {name: measure_cases("speed", name, quick=quick) for name in names}
-    rows = [case.row._replace(case=case.name.removeprefix("speed/")) for each in found.values() for case in each.cases]
-    if not quick:
-        return rows, FIGURES[AGAINST_ERROR](found[AGAINST_ERROR].curves)
+    names = ("creature",) if quick else ("creature", "beams", "backward", "speed-against-error")
+    found = [case.measure() for case in named(soft_bodies.cases(quick=quick), *(f"speed/{name}" for name in names))]
+    rows = [row._replace(case=row.case.removeprefix("speed/"), expected="") for each in found for row in each.rows]
     rates = [row.value for row in rows if row.quantity.endswith("steps_per_second")]
-    return rows, curves({"crawler": ([1, LANES], rates)}, x="lanes", y="steps per second", title="28 vertices, float64")
+    return Findings(rows, {"crawler": ([1, LANES], rates)} if quick else found[-1].curves)
+
+
+def draw(lines: dict) -> Figure:
+    """Speed against error, or if quick against the number of lanes."""
+    if "crawler" in lines:
+        return curves(lines, x="lanes", y="steps per second", title="28 vertices, float64")
+    return speed_against_error(lines)

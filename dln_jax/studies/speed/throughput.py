@@ -11,6 +11,7 @@ from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
+from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
 from dln_jax.types import Lagrangian
 
@@ -20,7 +21,7 @@ SIZES = (2, 4, 7, 12)
 HESSIAN_BATCH = 512
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """Inverse and forward dynamics for growing batches; at one batch, the full-Hessian way for growing d."""
     repetitions = 10 if quick else 40
     rows: list[Row] = []
@@ -43,7 +44,12 @@ def measure(quick: bool) -> tuple[list[Row], Figure]:
         rows.append(Row(f"structured-delan/batch-{batch}", "noise_of_repetition", noise, "1"))
     for d in SIZES[:1] if quick else SIZES:
         rows.append(hessian_row(d, repetitions))
-    return rows, curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
+    return Findings(rows, speeds)
+
+
+def draw(speeds: dict) -> Figure:
+    """States per second against the batch."""
+    return curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
 
 
 def hessian_row(d: int, repetitions: int) -> Row:

@@ -1,13 +1,13 @@
 """benchmark training: error against seconds for every model of the arm, by Gauss-Newton and by Adam."""
 
-import time
+from collections.abc import Callable
+from functools import partial
 
 from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
 from dln_jax.figures.dynamics import error_against_time
 from dln_jax.learning.dynamics_fit import train
-from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import (
@@ -16,52 +16,52 @@ from dln_jax.studies.arm.models import (
     Measured,
     Size,
     curve,
+    linear_fit,
     measure_adam,
     measure_seeds,
     measure_trigonometric,
-    needs_of,
     prepared,
     torque_mse,
 )
+from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
-from dln_jax.zoo.kinds import build, describe
 
 ADAM_STEPS = 20_000
 QUICK = "structured-delan"
 
 
-def measure(quick: bool) -> tuple[list[Row], Figure]:
+def measure(quick: bool) -> Findings:
     """One seed of each on the embedded letters; the arm's table has medians of several."""
     sets = published_split(letters(None))
+    linear = linear_alone if quick else measure_trigonometric
+    jobs: dict[str, Callable[[], Measured]] = {"trigonometric/letters": partial(linear, sets)}
     if quick:
-        jobs = {
-            "trigonometric/letters": lambda: linear_alone(sets),
-            f"{QUICK}/letters/gauss-newton": lambda: gauss_newton_alone(sets, steps=20),
-        }
-    else:
-        jobs = {"trigonometric/letters": lambda: measure_trigonometric(sets)}
-        for kind in SIZES:
-            jobs[f"{kind}/letters/gauss-newton"] = lambda kind=kind: measure_seeds(kind, sets, seeds=1, steps=None)
-            jobs[f"{kind}/letters/adam"] = lambda kind=kind: measure_adam(kind, sets, steps=ADAM_STEPS)
+        jobs[f"{QUICK}/letters/gauss-newton"] = partial(gauss_newton_alone, sets, steps=20)
+    for kind in () if quick else SIZES:
+        jobs[f"{kind}/letters/gauss-newton"] = partial(measure_seeds, kind, sets, seeds=1, steps=None)
+        jobs[f"{kind}/letters/adam"] = partial(measure_adam, kind, sets, steps=ADAM_STEPS)
     rows, lines = [], {}
     for case, job in jobs.items():
         numbers, path = job()
-        rows += [
-            Row(case, "torque_mse", numbers["torque_mse"], "N^2 m^2"),
-            Row(case, "train_seconds", numbers["train_seconds"], "s"),
-        ]
+        rows.append(Row(case, "torque_mse", numbers["torque_mse"], "N^2 m^2"))
+        rows.append(Row(case, "train_seconds", numbers["train_seconds"], "s"))
         if path is not None:
             lines[case] = (path.seconds, path.errors)
-    return rows, error_against_time(lines)
+    return Findings(rows, lines)
+
+
+def draw(lines: dict) -> Figure:
+    """Error against seconds of training."""
+    return error_against_time(lines)
 
 
 def linear_alone(sets: Split) -> Measured:
     """The linear fit, without the rollouts and latencies that the arm's table has beside it: they take far longer."""
-    model = build(describe("trigonometric", sets.train, needs_of(sets), precision="f64", degree=1))
-    began = time.perf_counter()
-    parameters = fit_linear(model, sets.train).parameters
-    seconds = time.perf_counter() - began
-    numbers = {"torque_mse": torque_mse(dynamics(model.energies(parameters)), sets.test), "train_seconds": seconds}
+    model, fitted, seconds = linear_fit(sets)
+    numbers = {
+        "torque_mse": torque_mse(dynamics(model.energies(fitted.parameters)), sets.test),
+        "train_seconds": seconds,
+    }
     return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
 
 

@@ -1,5 +1,6 @@
-"""Hard cases by name: what is measured, what theory expects, and whether it is met."""
+"""Hard cases: what is measured, what theory expects, and whether it is met."""
 
+import functools
 from collections.abc import Callable
 
 from dln_jax.precision import in_float64
@@ -8,11 +9,14 @@ from dln_jax.studies.stability.close_encounters import close_encounters
 from dln_jax.studies.stability.conditioning import mass_conditions, sizes
 from dln_jax.studies.stability.data_faults import batches, not_finite, torque_channels
 from dln_jax.studies.stability.double_pendulum import lyapunov_time
+from dln_jax.studies.stability.figures import FIGURES
 from dln_jax.studies.stability.indefinite import indefinite_hessians
 from dln_jax.studies.stability.noise import missing_friction, noise
 from dln_jax.studies.stability.rounding import activations, single_precision, turned_angles
 from dln_jax.studies.stability.separatrix import separatrix
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import require_positive
+
+__all__ = ["NAMES", "cases"]
 
 SHORT: dict[str, Callable[[], Findings]] = {
     "activations": activations,
@@ -32,19 +36,9 @@ LONG: dict[str, Callable[[int], Findings]] = {"separatrix": separatrix, "lyapuno
 """Those whose length is a choice."""
 NAMES = (*SHORT, *LONG)
 
-__all__ = ["LONG", "NAMES", "SHORT", "Case", "Findings", "measure"]
 
-
-@in_float64
-def measure(name: str, *, steps: int = 100_000) -> Findings:
-    """The cases of one subject; `steps` is the length of long motions.
-
-    Raises:
-        InputError: no such subject, or no steps.
-    """
+def cases(*, steps: int = 100_000) -> list[Case]:
+    """All hard cases, in float64; `steps` is the length of long motions, `InputError` for none."""
     require_positive(steps=steps)
-    if name in LONG:
-        return LONG[name](steps)
-    if name not in SHORT:
-        raise InputError(f"hard case '{name}' is unknown; choose from {', '.join(NAMES)}")
-    return SHORT[name]()
+    measures = {**SHORT, **{name: functools.partial(measure, steps) for name, measure in LONG.items()}}
+    return [Case(name, in_float64(measure), draw=FIGURES.get(name)) for name, measure in measures.items()]

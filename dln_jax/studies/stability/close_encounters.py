@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.integrators import adaptive_rollout, implicit_midpoint, second_order
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 
 TOLERANCE = 1e-12
 STEPS_NEAR = 100
@@ -43,46 +44,19 @@ def close_encounters() -> Findings:
     step = implicit_midpoint(field)
     ends = jax.jit(jax.vmap(lambda dt: step(0.0, near, dt)))(dts)
     wrong, refused = _wrong_steps(field, near, ends, dts)
-    return Findings(
-        [
-            Case(
-                "close-encounter/adaptive",
-                "orbits_not_finished",
-                f"an orbit of eccentricity {1 - NEAREST} is finished: the step adapts",
-                float(not finished),
-                0.0,
-            ),
-            Case(
-                "close-encounter/adaptive",
-                "largest_energy_error",
-                f"below {STEPS_NEAR} errors of tolerance / r²",
-                largest(abs(energy - energy[0])),
-                bound,
-                "J",
-            ),
-            Case(
-                "close-encounter/gradient",
-                "relative_difference",
-                "the derivative through the encounter is that of Kepler's orbit, within the same tolerance / r²",
-                float(abs(slope / exact - 1)),
-                bound,
-            ),
-            Case(
-                "close-encounter/collision",
-                "reported_as_finished",
-                "bodies that meet head-on end the integration: it says that it has not finished",
-                float(collided),
-                0.0,
-            ),
-            Case(
-                "close-encounter/implicit-midpoint",
-                "finite_states_that_are_no_step",
-                f"33 steps of 1e-4 to 1 s are solutions of the method's equations or NaN ({refused} refused)",
-                float(wrong),
-                0.0,
-            ),
-        ]
-    )
+    adaptive, near = "close-encounter/adaptive", f"below {STEPS_NEAR} errors of tolerance / r²"
+    whole = f"an orbit of eccentricity {1 - NEAREST} is finished: the step adapts"
+    kepler = "the derivative through the encounter is that of Kepler's orbit, within the same tolerance / r²"
+    head_on = "bodies that meet head-on end the integration: it says that it has not finished"
+    solved = f"33 steps of 1e-4 to 1 s are solutions of the method's equations or NaN ({refused} refused)"
+    rows = [
+        expect(adaptive, "orbits_not_finished", whole, not finished, 0.0),
+        expect(adaptive, "largest_energy_error", near, largest(abs(energy - energy[0])), bound, "J"),
+        expect("close-encounter/gradient", "relative_difference", kepler, abs(slope / exact - 1), bound),
+        expect("close-encounter/collision", "reported_as_finished", head_on, collided, 0.0),
+        expect("close-encounter/implicit-midpoint", "finite_states_that_are_no_step", solved, wrong, 0.0),
+    ]
+    return Findings(rows)
 
 
 def _wrong_steps(field, start, ends, dts) -> tuple[int, int]:

@@ -23,7 +23,8 @@ from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.scene import closed_form_decomposition
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import Row, expect, largest
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import Needs
 
@@ -58,14 +59,14 @@ def mass_conditions() -> Findings:
             residual, size = _residual(each, q, qd, found, tau)
             text = f"|M qdd + c - tau| <= {FACTOR:.0f} d eps of its terms, whatever the condition"
             got = largest(residual / (_DIMENSION * EPS * size))
-            cases.append(Case(name, "residual_rounding_units", text, got, FACTOR))
+            cases.append(expect(name, "residual_rounding_units", text, got, FACTOR))
             change = abs(found - qdd).max(axis=1) / (abs(qdd).max(axis=1) + abs(qd).max(axis=1) ** 2)
             text = f"qdd -> tau -> qdd within {FACTOR:.0f} d eps kappa"
             got = largest(change) / (_DIMENSION * EPS * condition)
-            cases.append(Case(name, "round_trip_rounding_units", text, got, FACTOR))
+            cases.append(expect(name, "round_trip_rounding_units", text, got, FACTOR))
             infinite = float(np.mean(~np.isfinite(slope)))
             text = "the gradient through the solve is finite"
-            cases.append(Case(name, "gradients_not_finite_share", text, infinite, 0.0))
+            cases.append(expect(name, "gradients_not_finite_share", text, infinite, 0.0))
             if path == "structured":
                 cases.append(_reported_condition(name, condition, mass))
     return Findings([*cases, *_singular()])
@@ -90,7 +91,7 @@ def sizes() -> Findings:
         error = abs(found - np.asarray(sum(parts))).max(axis=1) / (size * (1 + angle))
         text = f"the energy's tau equals the closed form within {FACTOR:.0f} d eps of its terms, angles summed along"
         got = largest(error) / (d * EPS)
-        cases.append(Case(f"d-{d}/chain", "inverse_rounding_units", text, got, FACTOR))
+        cases.append(expect(f"d-{d}/chain", "inverse_rounding_units", text, got, FACTOR))
         cases.append(_round_trip(f"d-{d}/chain", qdd, accelerations, np.asarray(mass), found))
     for d in SIZES:
         model = make_delan(Needs(joints=("revolute",) * d), width=8, dtype=jnp.float64)
@@ -139,25 +140,25 @@ def _residual(stiff: _Stiff, q, qd, qdd, tau) -> tuple[np.ndarray, np.ndarray]:
     return abs(inertial + coriolis - tau).max(axis=1), size
 
 
-def _reported_condition(name: str, condition: float, mass: np.ndarray) -> Case:
+def _reported_condition(name: str, condition: float, mass: np.ndarray) -> Row:
     report = definiteness(_constant(mass[0]), np.zeros((1, _DIMENSION)), np.zeros((1, _DIMENSION)))
     text = f"the reported condition number is right within {FACTOR:.0f} d eps kappa, as M's own rounding allows"
     got = abs(report.largest_condition_number / condition - 1) / (_DIMENSION * EPS * condition)
-    return Case(name, "condition_report_rounding_units", text, got, FACTOR, reference=condition)
+    return expect(name, "condition_report_rounding_units", text, got, FACTOR, reference=condition)
 
 
 def _constant(mass: np.ndarray) -> Dynamics:
     return lagrangian.dynamics(LagrangianSystem(lambda q, qd: 0.5 * qd @ jnp.asarray(mass) @ qd))
 
 
-def _singular() -> list[Case]:
+def _singular() -> list[Row]:
     """Matrices without an inverse: no finite acceleration may come of them."""
     ones = _constant(np.ones((2, 2)))
     flat = natural.dynamics(NaturalSystem(lambda q: jnp.array([[1.0, 0.0], [1.0, 0.0]])))
     text = "a singular M gives no finite acceleration: nothing is regularised silently"
     zero, tau = jnp.zeros(2), jnp.array([1.0, 2.0])
     return [
-        Case(
+        expect(
             f"condition-infinite/{name}",
             "states_with_finite_qdd",
             text,
@@ -180,14 +181,14 @@ def _mapped(system: Dynamics, q, qd, qdd) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(tau), np.asarray(accelerations)
 
 
-def _round_trip(name: str, qdd: np.ndarray, found: np.ndarray, mass: np.ndarray, tau: np.ndarray) -> Case:
+def _round_trip(name: str, qdd: np.ndarray, found: np.ndarray, mass: np.ndarray, tau: np.ndarray) -> Row:
     d = qdd.shape[1]
     condition = np.linalg.cond(mass, p=np.inf)
     norm = abs(mass).sum(axis=2).max(axis=1)
     size = abs(qdd).max(axis=1) + abs(tau).max(axis=1) / norm
     text = f"qdd -> tau -> qdd within {FACTOR:.0f} d eps kappa, kappa up to {condition.max():.0e}"
     got = largest(abs(found - qdd).max(axis=1) / (d * EPS * condition * size))
-    return Case(name, "round_trip_rounding_units", text, got, FACTOR)
+    return expect(name, "round_trip_rounding_units", text, got, FACTOR)
 
 
 def _states(samples: int, d: int) -> list[np.ndarray]:

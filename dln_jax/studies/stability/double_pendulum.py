@@ -23,7 +23,8 @@ from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.scene import Scene
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import Row, expect, largest
 
 DT = 0.002
 """s; 1e5 steps are 200 s."""
@@ -64,31 +65,20 @@ def lyapunov_time(steps: int) -> Findings:
     after_one = np.array([coarse[t[COARSE - 1 :: COARSE] <= 1 / rate, k].max() for k, rate in enumerate(exponents)])
     allowed = {"rounding": np.log(1 / eps) / exponents, "coarse-step": (1 + np.log(1 / after_one)) / exponents}
     seen = {"rounding": _horizon(rounded, t), "coarse-step": _horizon(coarse, t[COARSE - 1 :: COARSE])}
+    name, ten = "lyapunov/double-pendulum", "every motion is chaotic: it lasts for ten Lyapunov times at least"
+    both = "derivative of the step and second motion agree; curvature and rounding leave about 1e-5 / (lambda 1 s)"
+    different = largest(abs(by_pairs / exponents - 1))
     cases = [
-        Case(
-            "lyapunov/double-pendulum",
-            "smallest_exponent",
-            "every motion is chaotic: it lasts for ten Lyapunov times at least",
-            float(exponents.min()),
-            10 / float(t[-1]),
-            "1/s",
-            at_least=True,
-        ),
-        Case(
-            "lyapunov/double-pendulum",
-            "exponents_relative_difference",
-            "derivative of the step and second motion agree; curvature and rounding leave about 1e-5 / (lambda 1 s)",
-            largest(abs(by_pairs / exponents - 1)),
-            1e-3,
-        ),
+        expect(name, "smallest_exponent", ten, exponents.min(), 10 / t[-1], "1/s", at_least=True),
+        expect(name, "exponents_relative_difference", both, different, 1e-3),
     ]
     for cause, expected in allowed.items():
         what = "ln(1/eps)" if cause == "rounding" else "ln(1/error after one Lyapunov time)"
         score = float(np.median(seen[cause] / expected))
         text = f"median time until the prediction is 1 rad off, in units of {what} / lambda: 1, within a factor of 2"
         name = f"lyapunov/{cause}"
-        cases.append(Case(name, "horizon_score", text, score, 0.5, at_least=True, reference=1.0))
-        cases.append(Case(name, "horizon_score_upper", text, score, 2.0, reference=1.0))
+        cases.append(expect(name, "horizon_score", text, score, 0.5, at_least=True, reference=1.0))
+        cases.append(expect(name, "horizon_score_upper", text, score, 2.0, reference=1.0))
     cases.append(_energy_drift(scene, steps))
     curves = {"t": t, "exponents": exponents, "rounding": rounded, "coarse": coarse, "tangent": chaos.tangent}
     return Findings(cases, curves)
@@ -146,7 +136,7 @@ def _factored(scene: Scene) -> NaturalSystem:
     return NaturalSystem(cholesky, scene.potential)
 
 
-def _energy_drift(scene: Scene, steps: int) -> Case:
+def _energy_drift(scene: Scene, steps: int) -> Row:
     """Chaos costs the motion, not its energy, where the method is symplectic."""
     H = hamiltonian.hamiltonian_from_lagrangian(scene.lagrangian)
     step = gauss_legendre4(lambda t, state: hamiltonian.time_derivative(H, state[0], state[1], jnp.zeros(2)))
@@ -164,4 +154,4 @@ def _energy_drift(scene: Scene, steps: int) -> Case:
     tenth = max(1, steps // 10)
     text = "mean energy error of Gauss-Legendre 4 in the last tenth within the range of the first: it does not drift"
     got = abs(error[-tenth:].mean() - error[:tenth].mean()) / float(np.ptp(error[:tenth]))
-    return Case("lyapunov/gauss-legendre-4", "energy_drift_share", text, float(got), 1.0)
+    return expect("lyapunov/gauss-legendre-4", "energy_drift_share", text, float(got), 1.0)

@@ -9,7 +9,8 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import Needs
 
@@ -33,44 +34,18 @@ def indefinite_hessians() -> Findings:
     # Sylvester: a symmetric 2x2 matrix is definite if its first entry and its determinant are positive.
     definite = (mass[:, 0, 0] > 0) & (mass[:, 0, 0] * mass[:, 1, 1] - mass[:, 0, 1] ** 2 > 0)
     share = float(np.mean(~definite))
-    return Findings(
-        [
-            Case(
-                "indefinite/known-matrices",
-                "share_wrongly_reported",
-                "M = diag(1, q_0) at q_0 = 1, 0.5, 0, -1, NaN: three of five are reported",
-                abs(report.share_not_definite - 0.6),
-                0.0,
-                reference=0.0,
-            ),
-            Case(
-                "indefinite/known-matrices",
-                "smallest_eigenvalue_error",
-                "the smallest eigenvalue of the finite ones is -1, to rounding",
-                abs(clean.smallest_eigenvalue + 1.0),
-                2 * float(np.finfo(np.float64).eps),
-            ),
-            Case(
-                "indefinite/known-matrices",
-                "singular_or_nan_unreported",
-                "a singular M has an infinite condition number, and one that is NaN a NaN eigenvalue",
-                float(np.isfinite(report.largest_condition_number)) + float(not np.isnan(report.smallest_eigenvalue)),
-                0.0,
-            ),
-            Case(
-                "indefinite/black-box-delan",
-                "smallest_eigenvalue",
-                "an untrained black-box Lagrangian has negative kinetic energy in some direction, and it is reported",
-                network.smallest_eigenvalue,
-                0.0,
-                unit="kg m^2",
-            ),
-            Case(
-                "indefinite/black-box-delan",
-                "share_wrongly_reported",
-                f"the share reported is that by Sylvester's criterion, {share:.2f}",
-                abs(network.share_not_definite - share),
-                0.0,
-            ),
-        ]
-    )
+    case, untrained, eps = "indefinite/known-matrices", "indefinite/black-box-delan", float(np.finfo(np.float64).eps)
+    unreported = float(np.isfinite(report.largest_condition_number)) + float(not np.isnan(report.smallest_eigenvalue))
+    three = "M = diag(1, q_0) at q_0 = 1, 0.5, 0, -1, NaN: three of five are reported"
+    least = "the smallest eigenvalue of the finite ones is -1, to rounding"
+    none = "a singular M has an infinite condition number, and one that is NaN a NaN eigenvalue"
+    negative = "an untrained black-box Lagrangian has negative kinetic energy in some direction, and it is reported"
+    sylvester, error = f"the share reported is that by Sylvester's criterion, {share:.2f}", "share_wrongly_reported"
+    rows = [
+        expect(case, error, three, abs(report.share_not_definite - 0.6), 0.0, reference=0.0),
+        expect(case, "smallest_eigenvalue_error", least, abs(clean.smallest_eigenvalue + 1.0), 2 * eps),
+        expect(case, "singular_or_nan_unreported", none, unreported, 0.0),
+        expect(untrained, "smallest_eigenvalue", negative, network.smallest_eigenvalue, 0.0, "kg m^2"),
+        expect(untrained, error, sylvester, abs(network.share_not_definite - share), 0.0),
+    ]
+    return Findings(rows)

@@ -20,7 +20,8 @@ from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect
 
 LEVELS = (1e-4, 1e-2, 1e-1)
 """Standard deviations of the noise, in those of the quantity."""
@@ -48,7 +49,7 @@ def noise() -> Findings:
         bound = unequal * (1 + DEVIATIONS * (2 / fit.rank) ** 0.5)
         text = f"torque MSE in units of s² P / N, P = {fit.rank}, within {DEVIATIONS:.0f} deviations of its chance"
         name = f"noise/torque-{level:g}"
-        cases.append(Case(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
+        cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
         curves["torque"][0].append(error)
         curves["torque"][1].append(predicted)
 
@@ -60,7 +61,7 @@ def noise() -> Findings:
         text = "torque MSE in units of |M|² s² P / N plus the square of the bias s²/var(qdd) of M"
         bound = 1 + DEVIATIONS * (2 / fit.rank) ** 0.5
         name = f"noise/acceleration-{level:g}"
-        cases.append(Case(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
+        cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
         curves["acceleration"][0].append(error)
         curves["acceleration"][1].append(predicted)
     return Findings(cases, {"levels": LEVELS, **curves})
@@ -81,21 +82,21 @@ def missing_friction() -> Findings:
         if kind == "having":
             got = float(misfit.missing.sum())
             text = "a model with friction leaves noise, in which nothing is found"
-            cases.append(Case(name, "joints_reported", text, got, 0.0))
+            cases.append(expect(name, "joints_reported", text, got, 0.0))
             continue
         text = "both joints are reported, by the power that the residual takes"
-        cases.append(Case(name, "joints_reported", text, float(misfit.missing.sum()), 2.0, at_least=True))
+        cases.append(expect(name, "joints_reported", text, float(misfit.missing.sum()), 2.0, at_least=True))
         # A sum over samples of qd (noise and what the fit left), over that of qd².
         allowed = float(np.max(DEVIATIONS * misfit.residual_rms / np.sqrt(np.sum(noisy.qd**2, axis=0))))
         text = (
             f"the coefficient is {FRICTION} within {DEVIATIONS:.0f} standard errors: friction is odd in time, tau not"
         )
         got = float(abs(misfit.coefficient - FRICTION).max())
-        cases.append(Case(name, "coefficient_error", text, got, allowed, "N m s"))
+        cases.append(expect(name, "coefficient_error", text, got, allowed, "N m s"))
         text = "the residual is that of friction, b rms(qd), far above the noise"
         got = float(np.min(misfit.residual_rms) / sigma)
         expected = FRICTION * float(np.sqrt(np.mean(noisy.qd**2))) / sigma
-        cases.append(Case(name, "residual_over_noise", text, got, 0.8 * expected, at_least=True, reference=expected))
+        cases.append(expect(name, "residual_over_noise", text, got, 0.8 * expected, at_least=True, reference=expected))
     return Findings(cases)
 
 

@@ -23,7 +23,8 @@ from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.model import Model
 from dln_jax.nn.activations import activation
 from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 from dln_jax.studies.stability.random_models import random_parameters
 from dln_jax.types import Needs
 
@@ -99,7 +100,7 @@ def activations() -> Findings:
                 f"within {ROUNDINGS:.0f} eps (1 + kappa) of their expansions"
             )
             got = largest([error[name] for error in errors])
-            cases.append(Case(f"activations-{place}/{name}", "rounding_units", text, got, ROUNDINGS))
+            cases.append(expect(f"activations-{place}/{name}", "rounding_units", text, got, ROUNDINGS))
     return Findings(cases, _curvature_curves())
 
 
@@ -132,7 +133,7 @@ def turned_angles() -> Findings:
         slopes = [abs(torque(q + step, qd, qdd) - torque(q - step, qd, qdd)) / (2 * step.max()) for step in steps]
         change = abs(torque(q + turn, qd, qdd) - torque(q, qd, qdd)).max(axis=1)
         got = largest(change / (np.sum(slopes, axis=0).max(axis=1) * float(np.finfo(dtype).eps) * 2 * np.pi * TURNS))
-        cases.append(Case(f"turned-angles/{name}", "rounding_units", text, got, 2.0))
+        cases.append(expect(f"turned-angles/{name}", "rounding_units", text, got, 2.0))
     return Findings(cases)
 
 
@@ -159,9 +160,9 @@ def single_precision() -> Findings:
                 f"{quantity} dynamics within {roundings} eps32 (layers times width: the roundings in series) of the "
                 "sum of |terms|, with what inputs rounded by as much change"
             )
-            cases.append(Case(f"float32/{name}", f"{quantity}_rounding_units", text, got, float(roundings)))
+            cases.append(expect(f"float32/{name}", f"{quantity}_rounding_units", text, got, float(roundings)))
         text = "float32 in, float32 out: nothing is widened"
-        cases.append(Case(f"float32/{name}", "widened_outputs", text, float(found.dtype != np.float32), 0.0))
+        cases.append(expect(f"float32/{name}", "widened_outputs", text, float(found.dtype != np.float32), 0.0))
     return Findings(cases)
 
 

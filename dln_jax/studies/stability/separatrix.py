@@ -26,7 +26,8 @@ from dln_jax.mechanics.integrators import (
     symplectic_euler,
 )
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.studies.case import Case, Findings, largest
+from dln_jax.studies.case import Findings
+from dln_jax.studies.report import expect, largest
 
 GRAVITY = 9.81
 DT = 0.01
@@ -79,8 +80,8 @@ def separatrix(steps: int) -> Findings:
         reference = float(references[name])
         text = f"energy error over {steps:,} steps of {DT} s below the amplitude of the modified energy, no drift"
         got, bound = largest(error), HIGHER_ORDERS * reference
-        cases.append(Case(f"separatrix/{name}", "largest_energy_error", text, got, bound, "J", reference=reference))
+        cases.append(expect(f"separatrix/{name}", "largest_energy_error", text, got, bound, "J", reference=reference))
         text = f"released {BELOW_UPRIGHT:g} rad below upright, it never goes over the top: |q| < pi"
         below = float(np.pi) - largest(abs(q))
-        cases.append(Case(f"separatrix/{name}", "least_angle_from_upright", text, below, 0.0, "rad", at_least=True))
+        cases.append(expect(f"separatrix/{name}", "least_angle_from_upright", text, below, 0.0, "rad", at_least=True))
     return Findings(cases, {"steps": kept, "errors": curves, "references": references})

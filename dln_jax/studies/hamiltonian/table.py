@@ -1,0 +1,146 @@
+"""The table of Hamiltonian tasks: every model of the published ones, medians over seeds, beside published errors."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dln_jax.files import write_figure
+from dln_jax.studies.case import Case, Findings, by_case, rows_of
+from dln_jax.studies.hamiltonian import pixels
+from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once
+from dln_jax.studies.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.studies.hamiltonian.training import RECIPES, description_of, models_of, train
+from dln_jax.studies.published import HAMILTONIAN, published
+from dln_jax.studies.report import Row, markdown_table, unit_of
+from dln_jax.types import require_positive
+
+TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
+"""The published ones."""
+BOUNDS = {
+    "spring/hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
+    "pendulum/hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
+    "real-pendulum/hnn": {"energy_mse": 8e-4, "train_seconds": 60.0},
+    "two-body/hnn": {"energy_mse": 3.9e-6, "train_seconds": 30.0},
+    "three-body/hnn": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
+    "pixels/hnn": {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0},
+}
+"""Figures to reach, of the model that suits the scene."""
+SHOWN = (
+    *("test_loss", "clean_field_mse", "energy_mse", "energy_mse_standard_error", "energy_mse_median"),
+    *("energy_mse_over_baseline", "published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
+)
+TITLES = {
+    "test_loss": "test loss",
+    "clean_field_mse": "clean field",
+    "energy_mse": "energy MSE",
+    "published_energy_mse": "energy MSE, q²+p²",
+    "rollout_mse": "rollout MSE",
+    "train_seconds": "training, s",
+}
+
+
+def cases(
+    names: Sequence[str] = tuple(name for name in TASKS if name != REAL),
+    *,
+    seeds: int = 3,
+    steps: int | None = None,
+    trajectories: int | None = None,
+    real_pendulum: Path | None = None,
+    folder: Path | None = None,
+) -> list[Case]:
+    """A case for each task, with every model of it.
+
+    Args:
+        names: of tasks.
+        seeds: of each model: 0, 1, ...
+        steps: of each fit (default: each task's own).
+        trajectories: of generated data (default: as published).
+        real_pendulum: the file of the measured task.
+        folder: for a figure of each task, drawn while what it shows is at hand; `None` for none.
+
+    Raises:
+        InputError: a number that is not positive.
+    """
+    given = {"steps": steps, "trajectories": trajectories}
+    require_positive(seeds=seeds, **{key: value for key, value in given.items() if value is not None})
+    found = []
+    for name in names:
+        if name == PIXELS:
+            kinds, task = pixels.KINDS, pixel_task
+        else:
+            kinds, task = models_of(name), partial(phase_task, name, data=real_pendulum if name == REAL else None)
+        measure = partial(task, seeds=seeds, folder=folder, **given)
+        found.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
+    return found
+
+
+def phase_task(
+    name: str, *, seeds: int, steps: int | None, trajectories: int | None, data: Path | None, folder: Path | None
+) -> Findings:
+    """Every model of a task in coordinates and momenta, and its figure."""
+    problem = problem_of(name, trajectories=trajectories, data=data)
+    rows: list[Row] = []
+    seen: dict[str, Seen] = {}
+    for kind in models_of(name):
+        description = description_of(problem, kind)
+        # Each seed pays for its own compilation, as a user does.
+        runs = [
+            measured_once(problem, train(problem, description, seed=seed, steps=steps, seconds=RECIPES[name].seconds))
+            for seed in range(seeds)
+        ]
+        rows += rows_of(f"{name}/{kind}", medians(runs))
+        seen[kind] = runs[0][1]
+    if folder is not None:
+        write_figure(folder / f"{name}.png", figure_of(problem, seen))
+    return Findings(rows)
+
+
+def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folder: Path | None) -> Findings:
+    """The models of pictures, and their animation and pictures."""
+    numbers, seen = {}, {}
+    for kind in pixels.KINDS:
+        runs = [pixels.measure_pixels(kind, seed=seed, steps=steps, trajectories=trajectories) for seed in range(seeds)]
+        numbers[kind], seen[kind] = medians(runs), runs[0][1]
+    numbers["hnn"]["energy_mse_over_baseline"] = numbers["hnn"]["energy_mse"] / numbers["baseline"]["energy_mse"]
+    if folder is not None:
+        pixels.draw_pixels(seen, pixels.pixel_data(trajectories), folder)
+    return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
+
+
+def medians(runs: Sequence[tuple[dict[str, float], Any]]) -> dict[str, float]:
+    """Of each quantity over the seeds, and the largest energy error."""
+    of_seeds = [numbers for numbers, _ in runs]
+    found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
+    found["energy_mse_largest"] = float(np.max([each["energy_mse"] for each in of_seeds]))
+    return {key: value for key, value in found.items() if not np.isnan(value)}
+
+
+def table_rows(rows: Sequence[Row]) -> list[Row]:
+    """Numbers with the published ones and the figures to reach; every Hamiltonian network beside the published one."""
+    found = []
+    for row in rows:
+        task, kind = row.case.split("/")
+        beside = f"{task}/{'baseline' if kind == 'baseline' else 'hnn'}"
+        reference, bound = published(HAMILTONIAN, beside, row.quantity), BOUNDS.get(row.case, {}).get(row.quantity)
+        found.append(row._replace(unit=unit_of(row.quantity), reference=reference, bound=bound))
+    return found
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Ours / published, a line per case."""
+    lines = []
+    for case, numbers in by_case(rows).items():
+        cells = [case]
+        for quantity in TITLES:
+            value, theirs = numbers.get(quantity), published(HAMILTONIAN, case, quantity)
+            text = "" if value is None else f"{value:.1f}" if quantity == "train_seconds" else f"{value:.1e}"
+            if f"{quantity}_standard_error" in numbers:
+                text += f" ± {numbers[f'{quantity}_standard_error']:.0e}"
+            if value is not None and theirs is not None:
+                text += f" / {theirs:.1e}"
+            cells.append(text)
+        lines.append(cells)
+    return markdown_table(["task / model", *TITLES.values()], lines)
