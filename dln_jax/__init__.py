@@ -1,5 +1,6 @@
 """Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers."""
 
+import dln_jax.interrupts  # noqa: F401  first, as the others take a second to import
 from dln_jax.data.schema import Trajectories, load, save
 from dln_jax.deploy.c.load import load_c
 from dln_jax.deploy.c.source import export_c

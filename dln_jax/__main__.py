@@ -8,6 +8,8 @@ import pkgutil
 import sys
 from pathlib import Path
 
+from dln_jax import commands
+
 
 def command(name: str, prog: str) -> None:
     """Runs one command with the arguments of this process.
@@ -19,6 +21,7 @@ def command(name: str, prog: str) -> None:
     # Factorisations here are small: OpenBLAS's threads spin while they wait for each other, which took 4 to 20
     # times the processor time of one thread in a step of 560 tetrahedra. Read as SciPy is imported; what is set stays.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    sys.argv[0] = prog  # a report says how it was made
     try:
         from dln_jax.command_line.running import run
 
@@ -26,35 +29,40 @@ def command(name: str, prog: str) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
-    run(module.main, module.Arguments, prog=prog)
+    run(module.main, module.Arguments, prog=prog, from_shell=True)
 
 
 def main() -> None:
     """The command that the first argument names; without one, or with --help, what there is."""
+    prog = "dln-jax" if Path(sys.argv[0]).stem == "dln-jax" else "python -m dln_jax"
     names = command_names()
     given = sys.argv[1] if len(sys.argv) > 1 else "--help"
-    if given in ("-h", "--help"):
-        print("usage: dln-jax COMMAND [OPTIONS], where dln-jax COMMAND --help states units and defaults\n\ncommands:")
-        width = max(map(len, names))
-        for name in names:
-            print(f"  {name:{width}}  {_first_line(name)}")
-        return
+    try:
+        if given in ("-h", "--help"):
+            print(f"usage: {prog} COMMAND [OPTIONS]\n\n{prog} COMMAND --help states units and defaults\n\ncommands:")
+            width = max(map(len, names))
+            for name in names:
+                print(f"  {name:{width}}  {first_line(name)}")
+            sys.stdout.flush()
+            return
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
     name = given.replace("-", "_")
     if name not in names:
-        print(f"error: '{given}' is no command; choose from {', '.join(names)}", file=sys.stderr)
+        print(f"error: '{given:.80}' is no command; choose from {', '.join(names)}".replace("\n", " "), file=sys.stderr)
         raise SystemExit(2)
     del sys.argv[1]
-    command(name, f"dln-jax {name}")
+    command(name, f"{prog} {name}")
 
 
 def command_names() -> list[str]:
     """Names of all commands, sorted."""
-    from dln_jax import commands
-
     return sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 
 
-def _first_line(name: str) -> str:
+def first_line(name: str) -> str:
+    """What a command says that it does."""
     # Read and not imported: some commands take seconds to import.
     specification = importlib.util.find_spec(f"dln_jax.commands.{name}")
     source = Path(str(specification and specification.origin)).read_text(encoding="utf-8")

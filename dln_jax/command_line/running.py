@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import jax
+import tyro
 
+from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, parse
 from dln_jax.data.schema import needs_from_text
 from dln_jax.files import CONFIG, is_file, matches, read_json
@@ -29,20 +31,29 @@ SceneName = Annotated[str, choice(SCENES)]
 Arguments = TypeVar("Arguments")
 
 
-def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: str) -> None:
+def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: str, from_shell: bool = False) -> None:
     """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130.
 
     Args:
         main: the command.
         arguments: the class of what it takes.
         prog: what the user typed, for help and messages.
+        from_shell: whether the process is the command's own, which keeps compiled programs for the next one.
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
     try:
-        given = parse(arguments, prog=prog, description=sys.modules[main.__module__].__doc__)
-        require_storable(given)
-        main(given)
+        description = sys.modules[main.__module__].__doc__
+        whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
+        require_storable(whole.own)
+        if from_shell:
+            before = compilation_cache.compilation()
+            unkept = compilation_cache.keep(whole.compilation_cache)
+            main(whole.own)
+            if line := compilation_cache.summary(before, unkept):
+                print(line)
+        else:
+            main(whole.own)
         sys.stdout.flush()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -54,6 +65,20 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: 
     except KeyboardInterrupt as stop:
         print(interrupted(prog, arguments, *stop.args), file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def with_compilation_cache(arguments: type) -> Any:
+    """A dataclass of a command's own arguments, `own`, and of `compilation_cache`, the one that all commands have."""
+    kept = not getattr(arguments, "MEASURES_COMPILATION", False)
+    text = "Keep compiled programs for the next command, under the user's cache, 512 MiB at most"
+    text += "." if kept else "; off where compilation is measured."
+    return dataclasses.make_dataclass(
+        "Whole",
+        [
+            ("own", Annotated[arguments, tyro.conf.arg(name="")]),
+            ("compilation_cache", Annotated[bool, tyro.conf.arg(help=text)], kept),
+        ],
+    )
 
 
 def interrupted(command: str, arguments: type, folder: Path | None = None) -> str:

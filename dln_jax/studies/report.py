@@ -80,7 +80,7 @@ def conditions(**given: Any) -> dict[str, Any]:
         "device": str(jax.devices()[0]),
         "versions": {"python": platform.python_version(), **{p: importlib.metadata.version(p) for p in PACKAGES}},
         "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "command": " ".join(["python", "-m", _module_name(), *sys.argv[1:]]),
+        "command": " ".join(sys.argv),
         "date": datetime.date.today().isoformat(),
         **given,
     }
@@ -166,11 +166,6 @@ def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}"
-
-
-def _module_name() -> str:
-    specification = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return specification.name if specification else Path(sys.argv[0]).name
 
 
 def _processor() -> str:

@@ -1,6 +1,7 @@
 """What all command lines share: one line for a mistake, help that says what an option takes, bars that fit."""
 
 import io
+import os
 import re
 import signal
 import subprocess
@@ -13,7 +14,7 @@ from typing import Annotated, Literal
 import pytest
 from rich.console import Console
 
-from dln_jax.__main__ import command, command_names
+from dln_jax.__main__ import command, command_names, main
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import run
@@ -85,7 +86,7 @@ def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
     text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
     assert stop.value.code == 0
     assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
-    assert "--gif" not in text
+    assert "--gif" not in text and "--no-compilation-cache" in text
 
 
 def test_names_are_taken_apart():
@@ -118,13 +119,31 @@ def test_a_closed_pipe_ends_a_command_without_a_word():
     assert said == b"" and child.returncode == 141
 
 
-def test_an_interrupt_during_imports_is_one_word(tmp_path):
-    """The first import of the script waits, so that the interrupt meets it."""
+CONSOLE = "import sys\nfrom dln_jax.__main__ import main\nsys.exit(main())\n"
+"""What pip makes of the package's entry."""
+
+
+def ways(folder):
+    """The three ways of calling `make_data`."""
+    (folder / "dln-jax").write_text(CONSOLE)
+    return {
+        "console": [str(folder / "dln-jax"), "make_data"],
+        "package": ["-m", "dln_jax", "make_data"],
+        "script": ["-m", "scripts.make_data"],
+    }
+
+
+WAYS = ("console", "package", "script")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
+    """The first import of the command waits, so that the interrupt meets it."""
     (tmp_path / "jax.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
     with subprocess.Popen(
-        [sys.executable, "-m", "scripts.make_data"],
+        [sys.executable, *ways(tmp_path)[way]],
         cwd=ROOT,
-        env={"PYTHONPATH": f"{tmp_path}"},
+        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -135,6 +154,46 @@ def test_an_interrupt_during_imports_is_one_word(tmp_path):
         child.send_signal(signal.SIGINT)
         said = child.stderr.read()
     assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_way_of_calling_names_itself(tmp_path, way):
+    done = subprocess.run(
+        [sys.executable, *ways(tmp_path)[way], "--stepz"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    names = {"console": "dln-jax make_data", "package": "python -m dln_jax make_data"}
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stdout == ""
+    assert f"(see {names.get(way, 'python -m scripts.make_data')} --help)" in done.stderr
+
+
+def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["/bin/dln-jax"])
+    main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("usage: dln-jax COMMAND")
+    listed = [line.split(maxsplit=1) for line in lines[5:]]
+    assert [name for name, _ in listed] == COMMANDS and all(text.endswith(".") for _, text in listed)
+    for nonsense in ("teapot", "", "../x", "a\nb", "x" * 5000, "--steps", "__init__"):
+        monkeypatch.setattr(sys, "argv", ["dln-jax", nonsense])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        line = capsys.readouterr().err
+        assert stop.value.code == 2 and line.count("\n") == 1 and len(line) < 1000
+        assert line.startswith("error: ") and "is no command; choose from" in line
+
+
+def test_a_list_that_nobody_reads_ends_without_a_word():
+    with subprocess.Popen(
+        [sys.executable, "-m", "dln_jax"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        said = child.stderr.read()
+    assert said == b"" and child.returncode == 141
 
 
 @dataclass(frozen=True)
