@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import inspect
 import io
 import re
 from collections.abc import Iterable, Mapping
@@ -62,6 +63,14 @@ def parse(arguments: type[Arguments], *, prog: str, description: str | None) -> 
         if not stop.code:
             raise
         raise InputError(f"{_complaint(said.getvalue())} (see {prog} --help)") from None
+
+
+def own_first(arguments: type[Arguments]) -> type[Arguments]:
+    """Orders a dataclass's fields for help: its own before those of its bases, where a dataclass has them behind."""
+    fields = arguments.__dataclass_fields__  # type: ignore[attr-defined]
+    names = [name for base in arguments.__mro__ for name in inspect.get_annotations(base) if name in fields]
+    arguments.__dataclass_fields__ = {name: fields[name] for name in names}  # type: ignore[attr-defined]
+    return arguments
 
 
 def refuse_given(given: Any, names: Iterable[str], why: str) -> None:

@@ -13,7 +13,7 @@ import jax
 import tyro
 
 from dln_jax.command_line import compilation_cache
-from dln_jax.command_line.arguments import choice, parse
+from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.data.schema import needs_from_text
 from dln_jax.files import CONFIG, is_file, matches, read_json
 from dln_jax.scenes.registry import SCENES
@@ -42,18 +42,23 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: 
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
+    given = None
     try:
         description = sys.modules[main.__module__].__doc__
+        refuse_moved(arguments)
         whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
-        require_storable(whole.own)
+        given = whole.own
+        require_storable(given)
+        if getattr(given, "resume", False):
+            given = with_stored_arguments(given)
         if from_shell:
             before = compilation_cache.compilation()
             unkept = compilation_cache.keep(whole.compilation_cache)
-            main(whole.own)
+            main(given)
             if line := compilation_cache.summary(before, unkept):
                 print(line)
         else:
-            main(whole.own)
+            main(given)
         sys.stdout.flush()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -63,7 +68,7 @@ def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: 
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
     except KeyboardInterrupt as stop:
-        print(interrupted(prog, arguments, *stop.args), file=sys.stderr)
+        print(interrupted(prog, given, *stop.args), file=sys.stderr)
         raise SystemExit(130) from None
 
 
@@ -75,19 +80,29 @@ def with_compilation_cache(arguments: type) -> Any:
     return dataclasses.make_dataclass(
         "Whole",
         [
-            ("own", Annotated[arguments, tyro.conf.arg(name="")]),
+            ("own", Annotated[own_first(arguments), tyro.conf.arg(name="")]),
             ("compilation_cache", Annotated[bool, tyro.conf.arg(help=text)], kept),
         ],
     )
 
 
-def interrupted(command: str, arguments: type, folder: Path | None = None) -> str:
-    """What a user is told whose interrupt ended a command, in whose folder there may be a run to continue."""
+def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
+    """What a user is told whose interrupt ended a command, in whose folder there may be a run to continue.
+
+    A command continues if its arguments have `resume`, unless they have `continues` too, and that is false.
+    """
     if folder is None:
         return "interrupted"
-    if "resume" in {field.name for field in dataclasses.fields(arguments)} and (folder / CONFIG).is_file():
+    if hasattr(given, "resume") and getattr(given, "continues", True) and (folder / CONFIG).is_file():
         return f"interrupted; continue with: {command} --out {folder} --resume"
     return f"interrupted; {folder} is incomplete"
+
+
+def refuse_moved(arguments: type) -> None:
+    """Raises `InputError` for an option that has become a command; a class of arguments has them as `MOVED`."""
+    for option, where in getattr(arguments, "MOVED", {}).items():
+        if any(word.partition("=")[0] == option for word in sys.argv[1:]):
+            raise InputError(f"{option} is a command of its own now: {where}")
 
 
 def require_storable(given: Any) -> None:
@@ -146,7 +161,11 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     if absent := [key for key in expected if key not in stored]:
         raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
     hints = get_type_hints(arguments)
+    # What another release had and nobody gave decides nothing.
+    stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
     for key, value in stored.items():
+        if where := getattr(arguments, "MOVED", {}).get(f"--{key}"):
+            raise InputError(f"{path}: a run with --{key}, which is a command of its own now: {where}; train it again")
         if key not in expected:
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
         if not matches(value, hints[key]):

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated
-from dln_jax.command_line.running import stored_arguments, with_stored_arguments
+from dln_jax.command_line.options import Resumable
+from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import CONFIG, run_folder, write_bytes, write_figure, write_json
 from dln_jax.studies.arm import table
 from dln_jax.studies.case import Case, measure, say_numbers, stored_findings
@@ -21,7 +22,7 @@ from dln_jax.types import require_positive
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Resumable):
     """What to measure."""
 
     data: Unstated[Path] = None
@@ -40,16 +41,10 @@ class Arguments:
     """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
     timed_seeds: int = 5
     """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
-    out: Unstated[Path] = None
-    """Folder for report.json, table.md and the figure (default: runs/arm_table-1, -2, ...)."""
-    resume: bool = False
-    """Continue the measurement in --out."""
 
 
 def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
-    if given.resume:
-        given = with_stored_arguments(given)
     require_positive(seeds=given.seeds, split_seeds=given.split_seeds)
     if given.steps is not None:
         require_positive(steps=given.steps)

@@ -8,12 +8,11 @@ inputs vary, programs that are compared take turns, and medians count.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.options import Folder
 from dln_jax.files import run_folder, write_bytes
 from dln_jax.studies.case import Done, draw, measure
 from dln_jax.studies.report import Row, conditions, markdown, publish
@@ -21,7 +20,7 @@ from dln_jax.studies.speed.subjects import cases
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder):
     """What to measure, and for how long."""
 
     subject: tyro.conf.Positional[
@@ -30,8 +29,6 @@ class Arguments:
     """What is measured."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
-    out: Unstated[Path] = None
-    """Folder for report.json, a Markdown table and a figure of each subject (default: runs/benchmark-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:

@@ -6,9 +6,8 @@ gradients of the torque loss at batch 512, single calls are one state. `mechanic
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.options import Folder
 from dln_jax.files import run_folder
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.report import conditions, publish
@@ -16,15 +15,13 @@ from dln_jax.studies.speed.derivatives import cases
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder):
     """How long to measure."""
 
     repetitions: int = 40
     """Interleaved timings of each way, of which the median counts."""
     width: int = 64
     """Hidden units of the two layers of each network."""
-    out: Unstated[Path] = None
-    """Folder for report.json (default: runs/delan_derivatives_report-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:

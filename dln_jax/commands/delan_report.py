@@ -7,8 +7,10 @@ Prints a table and writes report.json with one number per row. It is one split: 
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.options import Folder
 from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import CHARACTERS_TEST
 from dln_jax.files import run_folder
@@ -20,8 +22,10 @@ from dln_jax.types import require_positive
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder):
     """What to measure on."""
+
+    MEASURES_COMPILATION: ClassVar = True
 
     data: Unstated[Path] = None
     """Trajectories of the two-link arm in the npz schema (default: the embedded letters)."""
@@ -31,8 +35,6 @@ class Arguments:
     """How many seeds to train, from 0 upwards; each also draws its own validation letters."""
     steps: int = 20_000
     """Optimiser steps."""
-    out: Unstated[Path] = None
-    """Folder for report.json (default: runs/delan_report-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:

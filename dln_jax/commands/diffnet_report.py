@@ -8,10 +8,10 @@ machine slows all alike; medians are compared. Prints a table and writes report.
 """
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.arguments import choice, names_in
+from dln_jax.command_line.options import Folder
 from dln_jax.files import run_folder
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.differential_networks.one_pass import PLAIN, Timed, cases
@@ -19,7 +19,7 @@ from dln_jax.studies.report import conditions, publish
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder):
     """What to time."""
 
     width: int = 128
@@ -32,8 +32,6 @@ class Arguments:
     """Of the hidden layers."""
     repetitions: int = 30
     """Timed calls of each program."""
-    out: Unstated[Path] = None
-    """Folder for report.json (default: runs/diffnet_report-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:

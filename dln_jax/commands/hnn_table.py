@@ -8,10 +8,11 @@ table, writes report.json and table.md, and draws each task's motions and energi
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from dln_jax.command_line.arguments import Unstated, choice, names_in
-from dln_jax.command_line.running import stored_arguments, with_stored_arguments
+from dln_jax.command_line.options import Drawn, Resumable
+from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import CONFIG, run_folder, write_bytes, write_json
 from dln_jax.studies.case import measure, say_numbers, stored_findings
 from dln_jax.studies.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
@@ -22,8 +23,10 @@ from dln_jax.types import InputError
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Resumable, Drawn):
     """What to measure."""
+
+    MEASURES_COMPILATION: ClassVar = True
 
     tasks: Annotated[str, choice(TASKS, several=True)] = ",".join(TASKS)
     """Tasks (default: all)."""
@@ -35,18 +38,10 @@ class Arguments:
     """Generated trajectories of each task, for a trial (default: as published)."""
     steps: Unstated[int] = None
     """Iterations of each fit (default: each task's own)."""
-    out: Unstated[Path] = None
-    """Folder for report.json and the figures (default: runs/hnn_table-1, -2, ...)."""
-    resume: bool = False
-    """Continue the measurement in --out."""
-    figures: bool = True
-    """Draw the figures."""
 
 
 def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
-    if given.resume:
-        given = with_stored_arguments(given)
     names = chosen_tasks(given)
     counts = {key: getattr(given, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
     with run_folder(given.out, "hnn_table", resume=given.resume) as folder:

@@ -1,15 +1,15 @@
 """Kill training runs at random moments, resume them, and compare what they come to with the unbroken run, bit for bit.
 
-Runs: gauss-newton and adam (train_delan), task (train_hnn --task, two stages), function (train_diffnet) and locomotion
+Runs: gauss-newton and adam (train_delan), task (train_hnn_task, two stages), function (train_diffnet) and locomotion
 (by gradients). Each is started anew for every kill (SIGKILL, at a moment drawn between its first checkpoint and its
 end), resumed to the end, and its model file compared. Prints a count for each, and writes report.json.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.arguments import choice, names_in
+from dln_jax.command_line.options import Folder
 from dln_jax.files import run_folder
 from dln_jax.studies.case import Done, measure
 from dln_jax.studies.report import conditions, publish
@@ -17,7 +17,7 @@ from dln_jax.studies.stability.interruptions import RUNS, cases
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder):
     """What to interrupt."""
 
     runs: Annotated[str, choice(RUNS, several=True)] = ",".join(RUNS)
@@ -26,8 +26,6 @@ class Arguments:
     """Of each run."""
     seed: int = 0
     """Of the moments."""
-    out: Unstated[Path] = None
-    """Folder for report.json (default: runs/interruptions-1, -2, ...)."""
 
 
 def main(given: Arguments) -> None:

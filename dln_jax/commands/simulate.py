@@ -24,6 +24,7 @@ import numpy as np
 from rich.console import Console
 
 from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.data import meshes
@@ -57,7 +58,7 @@ GALLERY = (0, 3, 2, 1, 4)
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder, Drawn):
     """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
@@ -88,10 +89,6 @@ class Arguments:
     """Floating-point type."""
     seed: int = 0
     """Of the turning rate in drop, and of its box's tilt; nothing else is random."""
-    out: Unstated[Path] = None
-    """Run folder (default: runs/simulate-1, -2, ...)."""
-    figures: bool = True
-    """Draw the figures and the GIF."""
 
 
 class Prepared(NamedTuple):

@@ -5,10 +5,10 @@ figures. All of it is float64 unless a case says otherwise.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.arguments import choice, names_in
+from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.studies.case import measure_and_draw
@@ -17,17 +17,13 @@ from dln_jax.studies.soft_bodies import SUBJECTS, cases
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder, Drawn):
     """What to measure."""
 
     only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
     """Subjects (default: all)."""
     quick: bool = False
     """Smaller meshes, fewer and shorter motions: 90 s instead of minutes."""
-    out: Unstated[Path] = None
-    """Folder for report.json and the figures (default: runs/softbody-1, -2, ...)."""
-    figures: bool = True
-    """Draw the figures."""
 
 
 def main(given: Arguments) -> None:

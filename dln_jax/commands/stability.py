@@ -5,10 +5,10 @@ figures. All of it is float64 unless a case says otherwise.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.arguments import choice, names_in
+from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.studies.case import measure_and_draw, named
@@ -17,17 +17,13 @@ from dln_jax.studies.stability import NAMES, cases
 
 
 @dataclass(frozen=True)
-class Arguments:
+class Arguments(Folder, Drawn):
     """What to measure."""
 
     only: Annotated[str, choice(NAMES, several=True)] = ",".join(NAMES)
     """Hard cases (default: all)."""
     steps: int = 100_000
     """Of the long motions: the separatrix and the double pendulum."""
-    out: Unstated[Path] = None
-    """Folder for report.json and the figures (default: runs/stability-1, -2, ...)."""
-    figures: bool = True
-    """Draw the figures."""
 
 
 def main(given: Arguments) -> None:

@@ -10,7 +10,10 @@ figures. For Hamiltonian networks see train_hnn.
 from dataclasses import dataclass
 from typing import Literal
 
-from dln_jax.runs import dynamics as dynamics_training
+from dln_jax.command_line.options import Drawn, Resumable, SingleCalls
+from dln_jax.files import run_folder
+from dln_jax.runs.dynamics import train_into
+from dln_jax.runs.dynamics_task import Options, prepare
 
 KINDS = {
     "structured": "structured-delan",
@@ -21,7 +24,7 @@ KINDS = {
 
 
 @dataclass(frozen=True)
-class Arguments(dynamics_training.Arguments):
+class Arguments(Options, Resumable, Drawn, SingleCalls):
     """What to train on, how, and where the results go."""
 
     model: Literal["structured", "black-box", "trigonometric", "feed-forward"] = "structured"
@@ -30,4 +33,7 @@ class Arguments(dynamics_training.Arguments):
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
-    dynamics_training.run_training(given, "train_delan", KINDS)
+    task = prepare(given, KINDS)
+    wanted = {"figures": given.figures, "low_latency": given.low_latency}
+    with run_folder(given.out, "train_delan", resume=given.resume) as folder:
+        train_into(folder, task, given, resume=given.resume, **wanted)

@@ -1,6 +1,5 @@
-"""What `train_hnn --task` does: from a command line to a trained model of a phase space in a run folder."""
+"""Training a task of a phase space into a run folder: the model, its errors, its speed and its pictures."""
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -10,35 +9,20 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from dln_jax.command_line.arguments import refuse_given, resolved
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import needs_from_option, stored_arguments
-from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.figures import animations
-from dln_jax.figures import dynamics as figures
+from dln_jax.figures.dynamics import training_curve
 from dln_jax.figures.phase_space import TRUTH
-from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.runs import Progress
 from dln_jax.metrics.latency import one_step
+from dln_jax.runs.phase_space_task import PhaseTask
 from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once
-from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem, problem_of
-from dln_jax.studies.hamiltonian.training import (
-    KINDS,
-    LEARNING_RATE,
-    MOTIONS,
-    POLYNOMIAL,
-    RATES,
-    Trained,
-    check,
-    description_of,
-    settings_of,
-    stages_of,
-    train,
-)
+from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
+from dln_jax.studies.hamiltonian.training import KINDS, MOTIONS, RATES, Trained, stages_of, train
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError
 from dln_jax.zoo.load import load_phase_field, save_model
-from dln_jax.zoo.phase_kinds import build_phase
 
 GIF_FRAMES = 80
 LOSSES = {
@@ -46,53 +30,31 @@ LOSSES = {
     MOTIONS: "motions: mean square error of (q, p) over its weight",
 }
 """What each stage makes small."""
-OF_TORQUES = ("test", "scene", "target", "batch", "weight_decay", "patience")
-"""Options of models of torques, which a task decides itself."""
-
-
-def run_task(given: Any) -> None:
-    """Trains, evaluates, and writes the run folder."""
-    console = Console(highlight=False, soft_wrap=True)
-    check_options(given)
-    needs = None if given.needs is None else needs_from_option(given.needs)
-    problem = problem_of(given.task or "", trajectories=given.trajectories, data=given.data, needs=needs)
-    size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
-    description = description_of(problem, given.model, **size)
-    check_suited(given, problem, description)
-    options: dict[str, Any] = {
-        "seed": given.seed,
-        "optimizer": "adam" if given.optimizer == "adam" else "gauss-newton",
-        "steps": given.steps,
-        **resolved(given, {"learning_rate": LEARNING_RATE, "seconds": math.inf}),
-    }
-    check(problem, description, settings_of(problem, description, **options))
-    with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
-        train_into(folder, given, problem, description, options, console)
 
 
 def train_into(
-    folder: Path,
-    given: Any,
-    problem: Problem,
-    description: dict[str, Any],
-    options: dict[str, Any],
-    console: Console,
+    folder: Path, task: PhaseTask, *, resume: bool = False, figures: bool = True, low_latency: bool = True
 ) -> None:
-    """Trains, evaluates, and writes the files of the run."""
-    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": description})
+    """Trains, evaluates, and writes the files of the run into an existing folder.
+
+    Raises:
+        InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
+    """
+    console = Console(highlight=False, soft_wrap=True)
+    problem, description, training = task
     announce(console, problem, description)
-    with stage_progress(stages_of(problem, description, given.steps)) as report:
-        trained = train(problem, description, **options, directory=folder, resume=given.resume, report=report)
+    with stage_progress(stages_of(problem, description, training["steps"])) as report:
+        trained = train(problem, description, **training, directory=folder, resume=resume, report=report)
     if not np.isfinite(trained.result.validation):
         raise InputError(f"{trained.stopped}; {folder} holds no model")
     save_model(folder, description, trained.result.parameters)
     numbers, seen = measured_once(problem, trained)
     metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.result.validation)}
-    if given.low_latency:
+    if low_latency:
         truth = problem.truth[0]
         metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
     write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
-    if given.figures:
+    if figures:
         draw(folder, problem, description["kind"], seen, trained)
     console.print(results_table(metrics, problem))
     console.print(f"run folder: {folder}")
@@ -100,41 +62,6 @@ def train_into(
         raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
     if trained.stopped:
         console.print(trained.stopped)
-
-
-def check_options(given: Any) -> None:
-    """Refuses what no task takes, before anything is written."""
-    require_seed(given.seed)
-    for name in ("width", "depth", "degree", "steps", "trajectories", "seconds"):
-        if getattr(given, name) is not None:
-            require_positive(**{name: getattr(given, name)})
-    refuse_given(given, OF_TORQUES, "for models of torques, not for --task")
-    if given.precision == "f32":
-        raise InputError("tasks are fitted in f64; leave --precision out")
-    if given.seeds != 1:
-        raise InputError("a task trains one seed at a time; scripts.hnn_table measures several")
-    if given.optimizer != "adam":
-        refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
-    if given.model != POLYNOMIAL:
-        refuse_given(given, ["degree"], "for the polynomial model")
-
-
-def check_suited(given: Any, problem: Problem, description: dict[str, Any]) -> None:
-    """Refuses what this task or its model does not take, before anything is written."""
-    build_phase(description)
-    if problem.name in PROTOCOLS:
-        refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
-    else:
-        refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
-    if problem.name == REAL:
-        refuse_given(given, ["needs"], "what the task decides itself")
-    if description["kind"] == KINDS[POLYNOMIAL]:
-        linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
-        refuse_given(given, ["width", "depth", "activation"], linear)
-        if MOTIONS not in stages_of(problem, description):
-            refuse_given(given, ["steps", "seconds"], linear)
-        if given.optimizer == "adam":
-            raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
 
 
 @contextmanager
@@ -189,7 +116,7 @@ def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained
         best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
         named = [at._replace(stage=LOSSES[at.stage]) for at in history]
         words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
-        write_figure(folder / "training.png", figures.training_curve(named, best_step=best, **words))
+        write_figure(folder / "training.png", training_curve(named, best_step=best, **words))
 
 
 MEANINGS = {

@@ -1,5 +1,6 @@
 """What all command lines share: one line for a mistake, help that says what an option takes, bars that fit."""
 
+import importlib
 import io
 import os
 import re
@@ -9,7 +10,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 from rich.console import Console
@@ -17,7 +18,7 @@ from rich.console import Console
 from dln_jax.__main__ import command, command_names, main
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import run
+from dln_jax.command_line.running import interrupted, run
 from dln_jax.files import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
@@ -87,6 +88,21 @@ def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
     assert stop.value.code == 0
     assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
     assert "--gif" not in text and "--no-compilation-cache" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "resumes"),
+    [
+        ("compare_locomotion", {}, False),
+        ("train_locomotion", {"method": "ppo"}, False),
+        ("train_locomotion", {"method": "evolution"}, True),
+        ("train_hnn_pixels", {}, True),
+    ],
+)
+def test_only_a_command_that_continues_says_so(name, arguments, resumes, tmp_path):
+    (tmp_path / CONFIG).touch()
+    given = importlib.import_module(f"dln_jax.commands.{name}").Arguments(**arguments)
+    assert ("--resume" in interrupted(name, given, tmp_path)) == resumes
 
 
 def test_names_are_taken_apart():
@@ -202,6 +218,14 @@ class Resumable:
 
     resume: bool = False
     """Continue."""
+    continues: ClassVar = True
+
+
+@dataclass(frozen=True)
+class Sometimes(Resumable):
+    """Of a command that can continue, but not with these arguments."""
+
+    continues: ClassVar = False
 
 
 @pytest.mark.parametrize(
@@ -210,6 +234,7 @@ class Resumable:
         (Resumable, True, "interrupted; continue with: command --out {folder} --resume"),
         (Resumable, False, "interrupted; {folder} is incomplete"),
         (Arguments, True, "interrupted; {folder} is incomplete"),
+        (Sometimes, True, "interrupted; {folder} is incomplete"),
     ],
 )
 def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):

@@ -1,4 +1,4 @@
-"""Hamiltonian tasks: the table and train_hnn end to end on tiny budgets, their bookkeeping, and what they refuse."""
+"""Hamiltonian tasks: hnn_table and train_hnn_task end to end on tiny budgets, and what they refuse."""
 
 import json
 
@@ -8,7 +8,8 @@ from calls import command, refused
 from motions import quick_motion
 from safetensors.numpy import load_file
 
-from dln_jax.commands import hnn_table, train_hnn
+from dln_jax.command_line.running import stored_arguments
+from dln_jax.commands import hnn_table, train_hnn, train_hnn_task
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
@@ -199,7 +200,7 @@ OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": [
 
 
 def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
-    command(train_hnn, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
+    command(train_hnn_task, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
     assert "finite differences" in capsys.readouterr().out
     folder = positions.parent / "whole"
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -208,7 +209,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     stored = load_file(folder / "model.safetensors")
     for name in ("model.json", "model.safetensors", "metrics.json"):
         (folder / name).unlink()
-    command(train_hnn, "--out", str(folder), "--resume", "--no-figures", "--no-low-latency")
+    command(train_hnn_task, "--out", str(folder), "--resume", "--no-figures", "--no-low-latency")
     again = load_file(folder / "model.safetensors")
     assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
     field = load_phase_field(folder)
@@ -220,23 +221,22 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
 def test_what_a_task_does_not_take_is_one_line(positions, capsys):
     cases = [
         (("--task", "juggling"), "task 'juggling' is unknown"),
+        (("--task", "pixels"), "task 'pixels' is unknown"),
         (("--task", "measured"), "needs its data"),
         (("--task", "measured", "--data", "forced.npz"), "applied forces"),
         (("--task", "spring", "--data", "positions.npz"), "generates its data"),
         ((*OWN, "--model", "pairwise"), "positions of bodies"),
-        ((*OWN, "--precision", "f32"), "leave --precision out"),
-        ((*OWN, "--seeds", "3"), "hnn_table measures several"),
-        ((*OWN, "--target", "1e-6"), "--target is for models of torques"),
+        ((*OWN, "--precision", "f32"), "Unrecognized options: --precision"),
+        ((*OWN, "--seeds", "3"), "Unrecognized options: --seeds"),
+        ((*OWN, "--target", "1e-6"), "Unrecognized options: --target"),
         ((*OWN, "--steps", "0"), "steps is 0"),
         ((*OWN[:4], "--needs", "{"), "--needs is not JSON"),
         ((*OWN[:4], "--needs", '{"joints": ["revolute", "revolute"]}'), "have 2 joints"),
-        (("--model", "baseline"), "expected one of auto, structured, black-box"),
-        (("--trajectories", "5"), "--trajectories is for a --task"),
         ((*OWN, "--seed", "-1"), "seed is -1"),
         ((*OWN, "--seconds", "nan"), "--seconds is nan"),
-        ((*OWN, "--batch", "-1"), "--batch is for models of torques"),
-        ((*OWN, "--patience", "4"), "--patience is for models of torques"),
-        ((*OWN, "--weight-decay", "0.1"), "--weight-decay is for models of torques"),
+        ((*OWN, "--batch", "-1"), "Unrecognized options: --batch"),
+        ((*OWN, "--patience", "4"), "Unrecognized options: --patience"),
+        ((*OWN, "--weight-decay", "0.1"), "Unrecognized options: --weight-decay"),
         ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
         ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
         ((*OWN, "--degree", "3"), "--degree is for the polynomial model"),
@@ -247,8 +247,23 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         (("--task", "measured", "--data", "points.npz"), "no trajectory has two samples"),
     ]
     for number, (options, message) in enumerate(cases):
-        assert message in refused(capsys, train_hnn, *options, "--out", f"none-{number}")
+        assert message in refused(capsys, train_hnn_task, *options, "--out", f"none-{number}")
         assert not (positions.parent / f"none-{number}").exists()
+
+
+def test_what_was_an_option_of_train_hnn_names_its_command(positions, capsys):
+    cases = [
+        (("--task", "spring"), "--task is a command of its own now: train_hnn_task --task NAME, and train_hnn_pixels"),
+        (("--task=pixels", "--steps", "3"), "train_hnn_pixels for pixels"),
+        (("--model", "baseline"), "invalid choice 'baseline'"),
+        (("--trajectories", "5"), "Unrecognized options: --trajectories"),
+    ]
+    for options, message in cases:
+        assert message in refused(capsys, train_hnn, *options, "--out", "none")
+    old = positions.parent / "old"
+    old.mkdir()
+    (old / "config.json").write_text(json.dumps({**stored_arguments(train_hnn.Arguments()), "task": "spring"}))
+    assert "train_hnn_task --task NAME" in refused(capsys, train_hnn, "--out", str(old), "--resume")
 
 
 def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch):
@@ -256,10 +271,10 @@ def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch
     slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}
     monkeypatch.setattr(hnn_models, "RECIPES", slow)
     options = (*OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out")
-    command(train_hnn, *options, "patient")
+    command(train_hnn_task, *options, "patient")
     out = capsys.readouterr().out
     assert "2/2 steps  rates: loss" in out and "2/2 steps  motions: loss" in out and "out of time" not in out
-    command(train_hnn, *options, "hurried", "--seconds", "1e-6")
+    command(train_hnn_task, *options, "hurried", "--seconds", "1e-6")
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
     assert isinstance(load_phase_field(positions.parent / "hurried"), Flow)

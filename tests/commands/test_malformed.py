@@ -20,8 +20,10 @@ from dln_jax.command_line.running import checked_arguments, stored_arguments
 from dln_jax.commands import (
     arm_table,
     benchmark,
+    compare_locomotion,
     delan_report,
     diffnet_report,
+    diffnet_table,
     export_c,
     hnn_table,
     make_data,
@@ -31,6 +33,8 @@ from dln_jax.commands import (
     train_delan,
     train_diffnet,
     train_hnn,
+    train_hnn_pixels,
+    train_hnn_task,
     train_locomotion,
 )
 from dln_jax.data import archive, functions, meshes, schema
@@ -192,7 +196,7 @@ ARCHIVES = {
 READERS = {
     "train_delan": (train_delan, TRAJECTORIES, "--data"),
     "train_hnn": (train_hnn, TRAJECTORIES, "--data"),
-    "train_hnn --task": (train_hnn, TRAJECTORIES, "--task=measured", "--data"),
+    "train_hnn_task": (train_hnn_task, TRAJECTORIES, "--task=measured", "--data"),
     "train_diffnet": (train_diffnet, SAMPLES, "--function"),
     "simulate": (simulate, MESH, "--mesh"),
 }
@@ -324,7 +328,7 @@ NEEDS = [
 @pytest.mark.parametrize("needs", NEEDS, ids=lambda text: text[:60] or "empty")
 def test_needs_that_are_none_are_refused(here, capsys, needs):
     np.savez("data.npz", **{key: value for key, value in TRAJECTORIES.items() if key != "tau"})
-    for script, *options in ((train_delan,), (train_hnn, "--task", "measured")):
+    for script, *options in ((train_delan,), (train_hnn_task, "--task", "measured")):
         assert "needs" in refuse(capsys, script, *options, "--data", "data.npz", "--out", "run", "--needs", needs)
     np.savez("stated.npz", **TRAJECTORIES, needs=np.array(needs))
     assert "needs" in refuse(capsys, train_delan, "--data", "stated.npz", "--out", "run")
@@ -351,10 +355,10 @@ def test_any_json_states_needs_or_is_refused(stated):
 RESUMED = {
     "train_delan": (train_delan, {"data": "data.npz"}, "width"),
     "train_hnn": (train_hnn, {"data": "data.npz"}, "width"),
-    "train_hnn --task": (train_hnn, {"task": "spring"}, "trajectories"),
-    "train_hnn --task pixels": (train_hnn, {"task": "pixels"}, "steps"),
+    "train_hnn_task": (train_hnn_task, {"task": "spring"}, "trajectories"),
+    "train_hnn_pixels": (train_hnn_pixels, {}, "steps"),
     "train_diffnet": (train_diffnet, {}, "depth"),
-    "train_diffnet --table": (train_diffnet, {"table": True}, "steps"),
+    "diffnet_table": (diffnet_table, {}, "steps"),
     "train_locomotion": (train_locomotion, {}, "episode"),
     "arm_table": (arm_table, {}, "seeds"),
     "hnn_table": (hnn_table, {}, "seeds"),
@@ -427,9 +431,9 @@ def test_a_damaged_table_of_what_was_measured_is_refused(here, capsys):
         *("{", "[]", {"teapot": {}}, {case: 3}, {case: {"value_mse": "small"}}, {case: {"value_mse": 1.0}}),
         {case: {"value_mse": [1.0]}},
     ):
-        write_json(folder / CONFIG, {**stored_arguments(train_diffnet.Arguments()), "table": True, "samples": 50})
+        write_json(folder / CONFIG, {**stored_arguments(diffnet_table.Arguments()), "samples": 50})
         (folder / "jobs.json").write_text(stored if isinstance(stored, str) else json.dumps(stored))
-        assert "jobs.json" in refuse(capsys, train_diffnet, "--out", "run", "--resume")
+        assert "jobs.json" in refuse(capsys, diffnet_table, "--out", "run", "--resume")
         write_json(folder / CONFIG, {**stored_arguments(hnn_table.Arguments()), "tasks": "spring"})
         assert "jobs.json" in refuse(capsys, hnn_table, "--out", "run", "--resume")
 
@@ -599,6 +603,8 @@ SCRIPTS = {
     "train_delan": (train_delan, "--data", "data.npz"),
     "train_hnn": (train_hnn, "--data", "data.npz"),
     "train_diffnet": (train_diffnet, "--samples", "20"),
+    "train_hnn_pixels": (train_hnn_pixels, "--trajectories", "6"),
+    "diffnet_table": (diffnet_table, "--samples", "20"),
     "train_locomotion": (train_locomotion,),
     "benchmark": (benchmark, "precision"),
     "stability": (stability,),
@@ -611,9 +617,7 @@ SCRIPTS = {
 
 
 @pytest.mark.parametrize("out", ["file", "file/below", "full", "link", LONG], ids=lambda name: name[:20])
-@pytest.mark.parametrize(
-    "script", [name for name in SCRIPTS if name not in ("arm_table", "train_hnn --task", "stability")]
-)
+@pytest.mark.parametrize("script", [name for name in SCRIPTS if name != "stability"])
 def test_a_place_that_cannot_be_written_to_is_refused(here, capsys, script, out):
     np.savez("data.npz", **TRAJECTORIES)
     Path("file").touch()
@@ -632,15 +636,16 @@ OPTIONS = {
     "infinite time step": (make_data, "--scene", "pendulum", "--kind", "free-swing", "--dt", "inf"),
     "infinite letters": (make_data, "--dt", "inf"),
     "one sample": (train_diffnet, "--samples", "1"),
-    "one sample for the table": (train_diffnet, "--table", "--samples", "1"),
+    "one sample for the table": (diffnet_table, "--samples", "1"),
     "endless networks": (train_diffnet, "--depth", "5000"),
     "endless Lagrangian": (train_delan, "--data", "data.npz", "--depth", "5000"),
     "endless Hamiltonian": (train_hnn, "--data", "data.npz", "--depth", "5000"),
-    "endless phase model": (train_hnn, "--task", "measured", "--data", "free.npz", "--depth", "5000"),
+    "endless phase model": (train_hnn_task, "--task", "measured", "--data", "free.npz", "--depth", "5000"),
     "endless report": (diffnet_report, "--depth", "5000"),
     "infinite rate": (train_delan, "--data", "data.npz", "--optimizer", "adam", "--learning-rate", "inf"),
     "infinite noise": (train_diffnet, "--noise", "inf"),
     "infinite posture": (train_locomotion, "--upright", "inf"),
+    "infinite posture of all": (compare_locomotion, "--upright", "inf"),
     "infinite stiffness": (simulate, "--youngs-modulus", "inf"),
     "unknown report": (softbody_report, "--only", "teapot"),
     "unknown case": (stability, "--only", ","),

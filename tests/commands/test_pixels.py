@@ -7,7 +7,7 @@ import pytest
 from calls import command, refused
 from PIL import Image
 
-from dln_jax.commands import train_hnn
+from dln_jax.commands import train_hnn_pixels
 from dln_jax.datasets import pendulum_frames
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
 from dln_jax.figures import animations
@@ -305,21 +305,11 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pixel_task, "energy_floor", lambda *given: 0.0)
     for name in ("late_energy_errors", "energy_errors"):
         monkeypatch.setattr(pixel_task, name, lambda *given: np.ones(2))
-    options = (
-        "--task",
-        "pixels",
-        "--model",
-        "baseline",
-        "--steps",
-        "1",
-        "--no-figures",
-        "--out",
-        str(tmp_path / "run"),
-    )
-    command(train_hnn, *options, "--out", str(tmp_path / "run"))
+    options = ("--model", "baseline", "--steps", "1", "--no-figures", "--out", str(tmp_path / "run"))
+    command(train_hnn_pixels, *options)
     stored = (tmp_path / "run" / "model.safetensors").read_bytes()
     (tmp_path / "run" / "model.safetensors").unlink()
-    command(train_hnn, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
+    command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == stored
     system = load_latent(tmp_path / "run")
     pair = pixel_task.pixel_data().test.pairs[0, 0]
@@ -327,10 +317,9 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     assert system.decode(q, p).shape == pair.shape and system.field.energy is None
     qd, pd = system.field.rates(q, p)
     assert np.isfinite([qd, pd]).all()
-    assert "not for pixels" in refused(capsys, train_hnn, "--task", "pixels", "--width", "8", "--out", "no")
-    assert "expected one of auto" in refused(
-        capsys, train_hnn, "--task", "pixels", "--model", "pairwise", "--out", "no"
-    )
+    assert "Unrecognized options: --width" in refused(capsys, train_hnn_pixels, "--width", "8", "--out", "no")
+    assert "invalid choice 'pairwise'" in refused(capsys, train_hnn_pixels, "--model", "pairwise", "--out", "no")
+    assert "steps is 0" in refused(capsys, train_hnn_pixels, "--steps", "0", "--out", "no")
     pixel_task.pixel_data.cache_clear()
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import diffnet_report, train_diffnet
+from dln_jax.commands import diffnet_report, diffnet_table, train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import first_order, runs, second_order
-from dln_jax.studies.differential_networks import one_pass
-from dln_jax.studies.differential_networks import table as diffnet_table
+from dln_jax.runs import function_task
+from dln_jax.runs import functions as function_runs
+from dln_jax.studies.differential_networks import one_pass, table
 from dln_jax.studies.published import DIFFERENTIAL_NETWORKS
 from dln_jax.types import InputError
 from dln_jax.zoo.load_function import load_function
@@ -81,7 +82,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
 
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
     coarse = partial(functions.cosine_sine_grid, points=9)
-    monkeypatch.setitem(train_diffnet.NAMED, "cos_sin", (functions.cosine_sine, coarse))
+    monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
     command(train_diffnet, *ADAM, "--function", "cos_sin", "--ensemble", "3", "--out", "run")
     folder = workplace / "run"
     assert names_in(folder) == FILES | {f"{name}.png" for name in ("ensemble", "heat_maps", "surfaces", "training")}
@@ -124,7 +125,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, 
     newton, adam = ("--steps", "12", "--coarse-steps", "6"), ("--width", "3", "--epochs", "6", "--batch", "16")
     growing = newton if optimizer == "gauss-newton" else adam
     wanted = ("--function", "mine.npz", "--loss", "type2", "--depth", "1", "--optimizer", optimizer)
-    monkeypatch.setattr(train_diffnet, "WIDTHS", (2,))
+    monkeypatch.setattr(function_runs, "WIDTHS", (2,))
     command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
     stored = runs.store
     left = iter(range(1))
@@ -175,7 +176,7 @@ MISTAKES = {
         "y has numbers of up to",
     ),
     "mark in dy": ({"dy": np.full((60, 2, 3), 1e200)}, [], "dy has numbers of up to"),
-    "option of a table": (None, ["--table", "--width", "4"], "--width is not for --table"),
+    "table": (None, ["--table", "--seed", "1"], "--table is a command of its own now: diffnet_table"),
 }
 
 
@@ -204,8 +205,8 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     """With training stubbed: each row of the published table gets the best of ours and its bound."""
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
     costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
-    monkeypatch.setattr(diffnet_table, "trained", lambda sets, test, settings: {**numbers, **costs})
-    command(train_diffnet, "--table", "--samples", "50", "--out", "table")
+    monkeypatch.setattr(table, "trained", lambda sets, test, settings: {**numbers, **costs})
+    command(diffnet_table, "--samples", "50", "--out", "table")
     report = json.loads((workplace / "table" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
     assert rows["sin/type1/cos/gauss-newton", "value_mse"]["reference"] == 2.0e-7
@@ -217,8 +218,8 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     assert bounds["cos_sin/best", "hessian_mse"] == pytest.approx(1.7e-4 / 10)
     assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
     # What is measured is not measured again.
-    monkeypatch.setattr(diffnet_table, "trained", None)
-    command(train_diffnet, "--table", "--resume", "--out", "table")
+    monkeypatch.setattr(table, "trained", None)
+    command(diffnet_table, "--resume", "--out", "table")
     out = capsys.readouterr().out
     assert out.count("published") >= 12 and "almost everywhere" in out and "…" not in out
     type2 = [each for case, each in DIFFERENTIAL_NETWORKS.values.items() if case.startswith("sin/type2/")]

@@ -11,7 +11,7 @@ import pytest
 from calls import refused
 from gymnasium.utils.env_checker import check_env
 
-from dln_jax.commands import train_locomotion
+from dln_jax.commands import compare_locomotion, train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.environment import CreatureEnvironment
@@ -222,8 +222,9 @@ def test_vector_lanes_are_single_environments(task, environment):
 def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "stable_baselines3" else find(name))
-    for arguments in (("--method", "ppo"), ("--compare",)):
-        assert "pip install 'dln-jax[rl]'" in refused(capsys, train_locomotion, *arguments, "--out", tmp_path / "run")
+    for script, *arguments in ((train_locomotion, "--method", "ppo"), (compare_locomotion,)):
+        assert "pip install 'dln-jax[rl]'" in refused(capsys, script, *arguments, "--out", tmp_path / "run")
+    assert "command of its own now: compare_locomotion" in refused(capsys, train_locomotion, "--compare")
     assert not (tmp_path / "run").exists()
 
 

@@ -1,17 +1,16 @@
-"""All that the published table of differential networks has, trained by both optimisers: the work of --table."""
+"""All that the published table of differential networks has, trained by both optimisers."""
 
 import itertools
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 from rich.table import Table
 
-from dln_jax.command_line.running import stored_arguments
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, train
 from dln_jax.metrics.functions import errors, predictions
 from dln_jax.nn.activations import activation
@@ -42,28 +41,25 @@ class Extent(NamedTuple):
     """Of Adam."""
 
 
-def write_table(given: Any) -> None:
-    """Trains what has not been trained yet, prints and writes report.json; `given` are the arguments of the command."""
-    chosen = cases(Extent(*(getattr(given, name) for name in Extent._fields)))
-    with run_folder(given.out, "train_diffnet", resume=given.resume) as folder:
-        stored = stored_findings(folder, chosen) if given.resume else {}
-        write_json(folder / CONFIG, stored_arguments(given))
-        found = measure(chosen, say_numbers(*QUANTITIES, "width", "job_seconds"), folder=folder, stored=stored)
-        rows = table_rows([row for findings in found.values() for row in findings.rows])
-        facts = conditions(
-            dtype="float64 for gauss-newton, float32 for adam",
-            seeds=[given.seed],
-            adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
-            gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
-            f"grown through {', '.join(map(str, WIDTHS))} by validation",
-            selection="widths and stopping by validation; best of a row over losses and activations, as published",
-            samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
-        )
-        by_optimizer = {optimizer: facts[optimizer.replace("-", "_")] for optimizer in OPTIMIZERS}
-        tables = [comparison(by_case(rows), optimizer, recipe) for optimizer, recipe in by_optimizer.items()]
-        publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
-        print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
-        print(facts["samples"])
+def measure_into(folder: Path, chosen: Sequence[Case], given: Extent, *, resume: bool = False) -> None:
+    """Measures what has not been measured yet of `cases(given)`, prints, and writes report.json."""
+    stored = stored_findings(folder, chosen) if resume else {}
+    found = measure(chosen, say_numbers(*QUANTITIES, "width", "job_seconds"), folder=folder, stored=stored)
+    rows = table_rows([row for findings in found.values() for row in findings.rows])
+    facts = conditions(
+        dtype="float64 for gauss-newton, float32 for adam",
+        seeds=[given.seed],
+        adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
+        gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
+        f"grown through {', '.join(map(str, WIDTHS))} by validation",
+        selection="widths and stopping by validation; best of a row over losses and activations, as published",
+        samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
+    )
+    by_optimizer = {optimizer: facts[optimizer.replace("-", "_")] for optimizer in OPTIMIZERS}
+    tables = [comparison(by_case(rows), optimizer, recipe) for optimizer, recipe in by_optimizer.items()]
+    publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
+    print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
+    print(facts["samples"])
 
 
 def cases(given: Extent = Extent()) -> list[Case]:  # noqa: B008  a tuple
@@ -94,8 +90,8 @@ def settings(given: Extent, function: str, loss: str, name: str, optimizer: str)
     common = Settings(loss=loss, activation=name, depth=depth, seed=given.seed, epochs=given.epochs)
     if optimizer == "adam":
         return common
-    budget = {"steps": given.steps, "coarse_steps": given.coarse_steps}
-    return common._replace(optimizer=optimizer, width=WIDTHS[0], precision="f64", **budget)
+    iterations = {"steps": given.steps, "coarse_steps": given.coarse_steps}
+    return common._replace(optimizer=optimizer, width=WIDTHS[0], precision="f64", **iterations)
 
 
 def trained(sets: SampleSplit, test: FunctionSamples, settings: Settings) -> dict[str, float]:

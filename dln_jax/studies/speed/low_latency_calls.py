@@ -35,7 +35,7 @@ class Arguments:
     run: Path
     """Folder of a run of train_delan or train_hnn."""
     function: Literal["inverse_dynamics", "rates"] = "inverse_dynamics"
-    """Of the dynamics, or of the phase field that --task trains."""
+    """Of the dynamics, or of the phase field that train_hnn_task trains."""
     calls: int = 5000
     """Calls that are timed."""
 

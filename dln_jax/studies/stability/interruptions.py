@@ -23,12 +23,12 @@ from dln_jax.types import InputError, require_positive
 RUNS = {
     "gauss-newton": ("train_delan", "--optimizer", "gauss-newton", "--steps", "60"),
     "adam": ("train_delan", "--optimizer", "adam", "--steps", "4000", "--width", "16"),
-    "task": ("train_hnn", "--task", "spring", "--steps", "40"),
+    "task": ("train_hnn_task", "--task", "spring", "--steps", "40"),
     "function": ("train_diffnet", "--samples", "6000", "--width", "8"),
     "locomotion": ("train_locomotion", "--steps", "6000"),
 }
 """Script and options of each run; short, but of several checkpoints."""
-TIMED = ("train_delan", "train_hnn")
+TIMED = ("train_delan", "train_hnn_task")
 """Scripts that would also time calls in another process."""
 MODEL = "model.safetensors"
 ROOT = Path(__file__).parents[3]

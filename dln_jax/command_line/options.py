@@ -1,0 +1,47 @@
+"""Options that several commands have; each command inherits those that it takes, and help shows its own first."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dln_jax.command_line.arguments import Unstated
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Where the results go."""
+
+    out: Unstated[Path] = None
+    """Folder of the results (default: runs/NAME-1, -2, ..., for a command NAME)."""
+
+
+@dataclass(frozen=True)
+class Resumable(Folder):
+    """Where the results go, and whether a part of them is there."""
+
+    resume: bool = False
+    """Continue what is in --out with the settings it was started with."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Whether pictures are wanted."""
+
+    figures: bool = True
+    """Draw the figures."""
+
+
+@dataclass(frozen=True)
+class Limited:
+    """How long a training may take."""
+
+    seconds: Unstated[float] = None
+    """Seconds of training after which to stop and keep the best so far, compilation included (default: no limit). At
+    least a few iterations are done. With --resume they count anew, and another number may be given."""
+
+
+@dataclass(frozen=True)
+class SingleCalls:
+    """How a model's calls are timed."""
+
+    low_latency: bool = True
+    """Time single calls also in low-latency mode, in a process of its own (about 2 s)."""

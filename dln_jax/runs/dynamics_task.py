@@ -1,0 +1,166 @@
+"""From options to a task of dynamics: the data, what they need, the model, and how it is trained."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.options import Limited
+from dln_jax.command_line.running import needs_from_option
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split, split
+from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.learning.dynamics_fit import Settings, automatic_optimizer, check, check_start
+from dln_jax.learning.objectives import Objective, objective_of
+from dln_jax.runs.dynamics_results import Task
+from dln_jax.scenes.registry import SCENES, scene_named
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError, Needs, require_positive, require_seed
+from dln_jax.zoo.kinds import build, describe
+
+OF_NETWORKS = ("width", "depth", "activation")
+OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
+DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
+
+
+@dataclass(frozen=True)
+class Options(Limited):
+    """What to train on, and how."""
+
+    model: str = "structured"
+    """What is learned."""
+    data: Unstated[Path] = None
+    """Trajectories in the npz schema (default: the embedded characters, or random states of --scene)."""
+    test: Unstated[str] = None
+    """Labels of the test trajectories, comma separated (default: e,q,v of the embedded set, else every sixth)."""
+    scene: Annotated[str | None, choice(SCENES, unstated=True)] = None
+    """Textbook scene whose needs the data have; without --data, the scene to sample."""
+    needs: Unstated[str] = None
+    """What the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
+    (default: what the scene or the file states, else revolute joints with gravity)."""
+    optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
+    """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
+    gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
+    width: Unstated[int] = None
+    """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
+    depth: Unstated[int] = None
+    """Hidden layers (default: 2)."""
+    activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
+    """Of the hidden layers (default: tanh)."""
+    degree: Unstated[int] = None
+    """trigonometric: degree of the polynomials in every joint (default: for each joint what validation asks for)."""
+    steps: Unstated[int] = None
+    """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
+    batch: Unstated[int] = None
+    """adam: samples per step (default: 512)."""
+    learning_rate: Unstated[float] = None
+    """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
+    weight_decay: Unstated[float] = None
+    """adam: decoupled weight decay (default: 0.00001)."""
+    patience: Unstated[int] = None
+    """adam: steps without a better validation error after which training stops (default: 10000)."""
+    precision: Unstated[Literal["f32", "f64"]] = None
+    """Floating-point type of the model and its training (default: f64; f32 for adam)."""
+    target: Unstated[float] = None
+    """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
+    from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
+    seed: int = 0
+    """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
+    seeds: int = 1
+    """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+
+
+def prepare(given: Options, kinds: dict[str, str]) -> Task:
+    """Reads and checks everything that the arguments name, before anything is written."""
+    if given.model not in kinds:
+        raise InputError(f"model is '{given.model}'; expected one of {', '.join(kinds)}")
+    kind = kinds[given.model]
+    scene = scene_named(given.scene) if given.scene else None
+    labels = tuple(given.test.split(",")) if given.test else None
+    if given.data is not None:
+        data, name = schema.load(given.data), str(given.data)
+    else:
+        scene = scene or two_link_arm()
+        data, name = default_data(scene), f"default data of {scene.name}"
+        if labels is None and scene.name == "two-link-arm":
+            labels = CHARACTERS_TEST
+    needs, origin = stated_needs(given, scene, data)
+    if needs.degrees_of_freedom != data.degrees_of_freedom:
+        raise InputError(
+            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
+        )
+    sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
+    objective = objective_of(kind, sets.train)
+    description, settings, reason = model_and_settings(given, kind, sets, needs, objective)
+    check(sets, settings, objective)
+    if kind != "trigonometric":
+        check_start(build(description), sets, settings, objective)
+    return Task(name, kind, sets, scene, needs, origin, description, objective, settings, reason)
+
+
+def model_and_settings(
+    given: Options, kind: str, sets: Split, needs: Needs, objective: Objective
+) -> tuple[dict[str, Any], Settings, str]:
+    """Description of the model, how to train it, and why by that optimiser."""
+    check_options(given, kind)
+    precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
+    if kind == "trigonometric":
+        keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
+        description = describe(kind, sets.train, needs, precision=precision, **keywords)
+        build(description)
+        return description, Settings(precision=precision, seed=given.seed), ""
+    keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
+    require_positive(width=keywords["width"], depth=keywords["depth"])
+    description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    model = build(description)
+    optimizer, reason = given.optimizer, ""
+    if optimizer == "auto":
+        optimizer, reason = automatic_optimizer(model, sets, objective)
+        precision = given.precision or ("f32" if optimizer == "adam" else "f64")
+        description["precision"] = precision
+    if optimizer == "gauss-newton":
+        chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
+        refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
+    defaults = {name: Settings._field_defaults[name] for name in (*OF_ADAM, "seconds", "target")}
+    numbers = resolved(given, {**defaults, "steps": DEFAULT_STEPS[optimizer]})
+    return description, Settings(optimizer=optimizer, precision=precision, seed=given.seed, **numbers), reason
+
+
+def check_options(given: Options, kind: str) -> None:
+    """Refuses options that the model does not read."""
+    require_positive(seeds=given.seeds)
+    require_seed(given.seed, given.seeds)
+    if kind == "trigonometric":
+        if given.seeds > 1:
+            raise InputError(f"--seeds is {given.seeds}, but one least-squares problem has no seeds; leave it out")
+        names = (*OF_NETWORKS, *OF_ADAM, "steps", "seconds", "target")
+        refuse_given(given, names, "for networks; the trigonometric model is one least-squares problem")
+        if given.optimizer != "auto":
+            raise InputError("the trigonometric model is one least-squares problem; leave --optimizer out")
+        return
+    refuse_given(given, ["degree"], "for the trigonometric model")
+    if given.target is not None:
+        if kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1:
+            raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
+        refuse_given(given, ["width", "depth"], "what --target grows")
+        require_positive(target=given.target)
+
+
+def default_width(kind: str, optimizer: str) -> int:
+    """Hidden units per layer: structure needs fewer, and first-order training more."""
+    if optimizer == "adam":
+        return 64
+    return 8 if kind.startswith("structured") else 16
+
+
+def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
+    """What the plant needs, and who says so: the command line, the scene, the file, or an assumption."""
+    if given.needs is not None:
+        return needs_from_option(given.needs), "--needs"
+    if scene is not None:
+        return scene.needs, f"scene {scene.name}"
+    if data.needs is not None:
+        return data.needs, "the data file"
+    return Needs(joints=("revolute",) * data.degrees_of_freedom), "assumed: nothing states the needs"

@@ -1,0 +1,128 @@
+"""From options to a differential network's task: the samples of a function, and how it is trained on them."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+
+from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.data import functions
+from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.learning.regression import LOSSES, WIDTHS, Settings, check
+from dln_jax.learning.standardisation import Units, own_units, standard_units, to_units
+from dln_jax.nn.activations import ALL
+from dln_jax.types import InputError, require_seed
+
+NAMED = {
+    "sin": (functions.sine, functions.sine_grid),
+    "cos_sin": (functions.cosine_sine, functions.cosine_sine_grid),
+}
+"""Generator and test grid of each named function."""
+OF_NAMED = {"samples": 25_600, "noise": 1e-3}
+OF_ADAM = ("epochs", "batch", "learning_rate", "weight_decay")
+OF_NEWTON = ("steps", "coarse_steps")
+SHARE_OF_DATA = 0.75
+"""Width of the training box over that of the shown one, for ensembles."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to train on, and how."""
+
+    function: Annotated[str, choice((*NAMED, "FILE.npz"))] = "sin"
+    """sin, cos_sin, or the path of an npz file with x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
+    loss: Annotated[str, choice(LOSSES)] = "type1"
+    """type1 fits value and gradient, type2 the value only."""
+    activation: Annotated[str, choice(ALL)] = "cos"
+    """Of the hidden layers."""
+    derivative: Literal[1, 2] = 1
+    """2 adds the Hessian to the loss."""
+    ensemble: int = 1
+    """Networks; with more than one, sin and cos_sin are trained on ±0.75 π and shown on ±π."""
+    optimizer: Literal["adam", "gauss-newton"] = "gauss-newton"
+    """Levenberg-Marquardt on all samples (f64) for small networks, or Adam, the published recipe, for wide ones."""
+    width: Unstated[int] = None
+    """Hidden units per layer (default: 128 for adam; for gauss-newton grown, 2, 4, 8, 16, until the validation error
+    no longer falls)."""
+    depth: Unstated[int] = None
+    """Hidden layers (default: 1 for one input, else 2)."""
+    steps: Unstated[int] = None
+    """Gauss-Newton: iterations on all samples at most, per network (default: 40)."""
+    coarse_steps: Unstated[int] = None
+    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many (default:
+    200; 0 for none)."""
+    epochs: Unstated[int] = None
+    """Adam: passes over the data (default: 500)."""
+    batch: Unstated[int] = None
+    """Adam: samples per step (default: 512)."""
+    learning_rate: Unstated[float] = None
+    """Adam: constant rate (default: 0.001)."""
+    weight_decay: Unstated[float] = None
+    """Adam: decoupled weight decay (default: 0.000001)."""
+    samples: Unstated[int] = None
+    """Samples of sin and cos_sin (default: 25600)."""
+    noise: Unstated[float] = None
+    """Their standard deviation of the noise on x, f, gradient and Hessian (default: 0.001)."""
+    precision: Unstated[Literal["f32", "f64"]] = None
+    """Floating-point type (default: f64 for gauss-newton, which needs it, f32 for adam)."""
+    seed: int = 0
+    """Of the data, the validation split, the initial parameters and the shuffling; 0 to 4294967295."""
+
+
+class Task(NamedTuple):
+    """What the arguments come to."""
+
+    name: str
+    sets: SampleSplit
+    test: FunctionSamples
+    shown: FunctionSamples
+    """What the figures show: the test, or a wider grid for an ensemble."""
+    bound: float | None
+    """Half the width of the box of the training data, where the shown grid is wider."""
+    units: Units
+    settings: Settings
+    grown: bool
+    """Whether the width is chosen by validation."""
+
+
+def prepare(given: Options) -> Task:
+    """Reads and checks everything that the arguments name, before anything is written."""
+    require_seed(given.seed)
+    settings, function, several = settings_from(given), given.function, given.ensemble > 1
+    if function in NAMED:
+        generate, grid = NAMED[function]
+        bound = np.pi * (SHARE_OF_DATA if several else 1)
+        data = generate(**of_named(given), bound=bound, seed=given.seed)
+        test, shown = grid(bound=bound), grid()
+        bound, units = (bound, own_units(data)) if several else (None, own_units(data))
+    else:
+        if not function.endswith(".npz"):
+            raise InputError(f"function '{function}' is unknown; expected sin, cos_sin or an npz file's path")
+        refuse_given(given, OF_NAMED, "for sin and cos_sin, not for a file")
+        everything = functions.load(function)
+        if len(everything.x) < 3:
+            raise InputError(f"{function}: {len(everything.x)} samples; training, validation and test need 3")
+        data, test = functions.split(everything, seed=given.seed)
+        shown, bound, units = test, None, standard_units(data)
+    depth = given.depth if given.depth is not None else min(data.inputs, 2)
+    settings = settings._replace(depth=depth)
+    check(to_units(data, units), settings)
+    grown = given.width is None and settings.optimizer == "gauss-newton"
+    return Task(function, functions.split(data, seed=given.seed), test, shown, bound, units, settings, grown)
+
+
+def of_named(given: Options) -> dict[str, Any]:
+    """How the data of a named function are drawn; nothing for a file."""
+    return resolved(given, OF_NAMED) if given.function in NAMED else {}
+
+
+def settings_from(given: Options) -> Settings:
+    """The settings that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
+    newton = given.optimizer == "gauss-newton"
+    if newton:
+        refuse_given(given, OF_ADAM, "for adam: add --optimizer adam")
+    else:
+        refuse_given(given, OF_NEWTON, "for gauss-newton")
+    own = {"width": WIDTHS[0] if newton else 128, "precision": "f64" if newton else "f32", "depth": 1}
+    defaults = {key: value for key, value in Settings._field_defaults.items() if hasattr(given, key)}
+    return Settings(**resolved(given, defaults | own), members=given.ensemble)
