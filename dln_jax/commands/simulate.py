@@ -119,8 +119,8 @@ def simulate_into(folder: Path, prepared: list[Prepared]) -> None:
         own.mkdir(exist_ok=True)
         pictures.append(simulate(each, own, console))
     if len(prepared) > 1 and prepared[0].given.figures:
-        gallery = moments_figure([pictures[i] for i in GALLERY], columns=3, width=11.5)
-        write_figure(folder / "soft-bodies.png", gallery, dpi=86)
+        gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
+        write_figure(folder / "soft-bodies.png", gallery)
     console.print(f"run folder: {folder}")
 
 

@@ -1,1 +1,38 @@
-"""Pictures of data, models and motions."""
+"""Pictures of data, models and motions; each function returns a Matplotlib figure or writes a GIF."""
+
+from dln_jax.figures.animations import write_frame_gif, write_motion_gif
+from dln_jax.figures.benchmarks import cost_curves, cost_panels, cost_points, error_against_time
+from dln_jax.figures.dynamics import force_decomposition, tip_paths
+from dln_jax.figures.ensembles import ensemble
+from dln_jax.figures.frames import Injection, inject_energy, injection_figure
+from dln_jax.figures.functions import function_curves, heat_maps, parity, surfaces
+from dln_jax.figures.phase_space import motion_figure
+from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
+from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
+from dln_jax.figures.training import training_curve
+
+__all__ = [
+    "Injection",
+    "Moments",
+    "cost_curves",
+    "cost_panels",
+    "cost_points",
+    "energies_against_time",
+    "ensemble",
+    "error_against_time",
+    "force_decomposition",
+    "function_curves",
+    "heat_maps",
+    "inject_energy",
+    "injection_figure",
+    "moments_figure",
+    "motion_figure",
+    "parity",
+    "soft_body_frame",
+    "surfaces",
+    "tip_paths",
+    "training_curve",
+    "write_frame_gif",
+    "write_motion_gif",
+    "write_soft_body_gif",
+]

@@ -1,19 +1,54 @@
-"""Animated GIFs of motions: pictures of several systems side by side, orbits, and the phase plane."""
+"""Animated GIFs: written frame by frame; films of systems, and motions in the plane, the model's over the truth's."""
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.animation import PillowWriter
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dln_jax.figures.gifs import DPI, write_gif
-from dln_jax.figures.phase_space import COLOURS, TRUTH, plane_paths
+from dln_jax.figures import style
+from dln_jax.figures.phase_space import plane_paths
+from dln_jax.figures.style import TRUTH
+from dln_jax.files import write_bytes
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import InputError, require_positive
+
+DPI = 100
+ONLY_TRUTH, ONLY_MODEL = np.array([0.0, 0.45, 0.7]), np.array([1.0, 0.55, 0.3])
+"""Colours of what a film has and the other has not; together they are white."""
+
+
+def write_gif(
+    path: Path,
+    figure: Figure,
+    show: Callable[[int], None],
+    t: Float[np.ndarray, " times"],
+    *,
+    frames: range,
+    frames_per_second: float,
+    title: str = "",
+) -> None:
+    """Writes what `show(frame)` draws into the figure, for each frame, under a title with the time t[frame] in s.
+
+    Raises:
+        InputError: the file cannot be written; it is written whole or not at all.
+    """
+    heading = figure.suptitle("", fontsize=style.TEXT, family="monospace")
+    writer = PillowWriter(fps=frames_per_second)  # type: ignore[arg-type]
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder) / "drawn.gif"  # Pillow knows the format by the ending
+        with writer.saving(figure, str(written), DPI):
+            for frame in frames:
+                show(frame)
+                heading.set_text(f"{title}  t = {t[frame]:5.2f} s".strip())
+                writer.grab_frame()
+                # The axes keep the places that the first frame gave them.
+                figure.set_layout_engine("none")
+        write_bytes(path, written.read_bytes())
 
 
 def write_frame_gif(
@@ -23,7 +58,7 @@ def write_frame_gif(
     *,
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes square pictures of systems side by side, with their names and the time.
+    """Writes square pictures of systems, each over the truth's where "truth" is among them: what both have is white.
 
     Args:
         path: of the GIF.
@@ -37,18 +72,25 @@ def write_frame_gif(
     require_positive(frames_per_second=frames_per_second)
     _require_common_length(t, {name: pictures.shape[0] for name, pictures in frames.items()})
     side = _side(next(iter(frames.values())).shape[1])
-    figure = _figure(2.0 * len(frames), 2.7)
-    images = []
-    for axis, (name, pictures) in zip(_panels(figure, len(frames)), frames.items(), strict=True):
-        axis.set_title(name, color=COLOURS.get(name, "C0"), fontsize=11)
+    models = [name for name in frames if name != TRUTH] or [TRUTH]
+    over = TRUTH in frames and models != [TRUTH]
+    figure, axes = style.figure(1, len(models), width=2.4 * len(models), height=2.9 + 0.3 * over, dpi=DPI)
+    blank, images = np.zeros((side, side, 3)), []
+    for axis, name in zip(axes[0], models, strict=True):
+        style.title(axis, name, color=style.colour(name))
         axis.set(xticks=[], yticks=[])
-        images.append(axis.imshow(pictures[0].reshape(side, side), cmap="gray", vmin=0.0, vmax=1.0))
+        axis.grid(False)
+        images.append(axis.imshow(blank))
+    if over:
+        figure.supxlabel("white: both  blue: truth only\norange: model only", fontsize=7)
 
     def show(index: int) -> None:
-        for image, pictures in zip(images, frames.values(), strict=True):
-            image.set_data(pictures[index].reshape(side, side))
+        for image, name in zip(images, models, strict=True):
+            model = np.clip(frames[name][index], 0.0, 1.0).reshape(side, side, 1)
+            truth = np.clip(frames[TRUTH][index], 0.0, 1.0).reshape(side, side, 1) if over else model
+            image.set_data(truth * ONLY_TRUTH + model * ONLY_MODEL)
 
-    _write(figure, path, t, show, frames_per_second)
+    write_gif(path, figure, show, t, frames=range(len(t)), frames_per_second=frames_per_second)
 
 
 def write_motion_gif(
@@ -58,18 +100,20 @@ def write_motion_gif(
     shown: int = 0,
     tail: int = 20,
     stride: int = 1,
+    units: tuple[str, str] = ("", ""),
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes one motion as each system has it, a panel each, with the truth's in grey behind the others.
+    """Writes one motion as each system has it, a panel each, over the truth's in black where "truth" is among them.
 
     With one coordinate a panel is the phase plane; with 2 n coordinates it shows n bodies in a plane.
 
     Args:
         path: of the GIF.
-        motions: by name, at common times; "truth" among them is drawn behind the rest.
+        motions: by name, at common times.
         shown: which motion.
         tail: samples that a body leaves behind it.
         stride: samples between two frames of the GIF.
+        units: of q and of p, of one coordinate; empty where they have none.
         frames_per_second: with which they are shown.
 
     Raises:
@@ -84,47 +128,31 @@ def write_motion_gif(
     corners = [1.2 * max(float(np.nanmax(np.abs(curve[half]))) for curve in framed) for half in range(2)]
     if not plane:
         corners = [max(corners)] * 2
-    figure = _figure(2.9 * len(motions) + 0.3, 3.4)
-    drawn: list[tuple[Artist, Artist, tuple[np.ndarray, np.ndarray]]] = []
-    for axis, name in zip(_panels(figure, len(motions)), motions, strict=True):
-        colour = COLOURS.get(name, "C0")
+    models = [name for name in motions if name != TRUTH] or [TRUTH]
+    width = min(style.WIDTH, 3.4 * len(models))
+    figure, axes = style.figure(1, len(models), width=width, height=width / len(models) + 0.6, sharey=True, dpi=DPI)
+    lines: list[tuple[Artist, Artist, tuple[np.ndarray, np.ndarray]]] = []
+    for axis, name in zip(axes[0], models, strict=True):
         axis.set(xlim=(-corners[0], corners[0]), ylim=(-corners[1], corners[1]), box_aspect=1)
-        axis.set_title(name, color=colour, fontsize=11)
-        axis.set_xlabel("q" if plane else "x, m")
-        axis.set_ylabel("p" if plane else "y, m")
-        behind = [] if name == TRUTH else [("0.75", curve) for curve in curves.get(TRUTH, [])]
-        for shade, curve in [*behind, *((colour, curve) for curve in curves[name])]:
-            (line,) = axis.plot([], [], color=shade, linewidth=1.4)
-            (body,) = axis.plot([], [], "o", color=shade, markersize=6)
-            drawn.append((line, body, curve))
+        style.title(
+            axis, f"{name}, over the truth" if TRUTH in motions and name != TRUTH else name, color=style.colour(name)
+        )
+        axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
+        for of in dict.fromkeys((TRUTH, name)) if TRUTH in motions else (name,):
+            thick, size = (3.0, 8) if of == TRUTH else (1.4, 5)
+            for curve in curves[of]:
+                (line,) = axis.plot([], [], color=style.colour(of), linewidth=thick)
+                (body,) = axis.plot([], [], "o", color=style.colour(of), markersize=size)
+                lines.append((line, body, curve))
+    axes[0, 0].set_ylabel(style.with_unit("p", units[1]) if plane else "y, m")
 
     def show(index: int) -> None:
-        for line, body, (x, y) in drawn:
+        for line, body, (x, y) in lines:
             since = max(0, index - tail)
             line.set(data=(x[since : index + 1], y[since : index + 1]))
             body.set(data=(x[index : index + 1], y[index : index + 1]))
 
-    _write(figure, path, t, show, frames_per_second, stride)
-
-
-def _write(figure: Figure, path: Path, t, show, frames_per_second: float, stride: int = 1) -> None:
-    clock = figure.suptitle("", fontsize=10, family="monospace")
-
-    def show_with_time(index: int) -> None:
-        show(index)
-        clock.set_text(f"t = {t[index]:6.2f} s")
-
-    write_gif(path, figure, show_with_time, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=DPI)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _panels(figure: Figure, count: int) -> list[Axes]:
-    return list(figure.subplots(1, count, squeeze=False)[0])
+    write_gif(path, figure, show, t, frames=range(0, len(t), stride), frames_per_second=frames_per_second)
 
 
 def _require_common_length(t: np.ndarray, lengths: dict[str, int]) -> None:

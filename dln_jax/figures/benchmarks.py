@@ -1,99 +1,195 @@
-"""Figures of benchmarks: growing costs as lines, and speed against error as points with their Pareto front."""
+"""Figures of costs: growing costs as lines, errors against costs as lines and as points, and error against seconds."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-MARKERS = "osv^Ddp*"
+from dln_jax.figures import style
+from dln_jax.figures.labels import label_ends
+
+Numbers = Sequence[float | int] | np.ndarray
+Line = tuple[Numbers, Numbers]
+"""(x, y)."""
+EXACT = 1e-15
+"""Squared errors below are those of rounding: they are drawn in a band of their own at the lower edge."""
+FRONT = "front: nothing as cheap is more accurate"
 
 
-def curves(lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, x: str, y: str, title: str) -> Figure:
-    """Lines in a plane with two logarithmic axes."""
-    figure = _figure(7.4, 4.4)
-    axis = figure.subplots()
-    for number, (name, (places, heights)) in enumerate(lines.items()):
-        axis.loglog(places, heights, marker=MARKERS[number % len(MARKERS)], markersize=5, linewidth=1.4, label=name)
-    ticks = sorted({place for places, _ in lines.values() for place in places})
-    if ticks[-1] < 100:
-        axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.minorticks_off()
+def cost_curves(lines: Mapping[str, Line], *, x: str, y: str, title: str) -> Figure:
+    """Lines in a plane with a logarithmic axis wherever values span a decade, named at their ends."""
+    figure, [[axis]] = style.figure(height=3.4)
+    colours = style.colours_of(lines)
+    for number, (name, line) in enumerate(lines.items()):
+        axis.plot(
+            *line, color=colours[name], marker=style.MARKERS[number % len(style.MARKERS)], markersize=4, linewidth=1.4
+        )
+    _scale(axis, lines.values())
     axis.set(xlabel=x, ylabel=y)
-    axis.set_title(title, fontsize=10)
-    axis.grid(True, which="major", alpha=0.25)
-    axis.legend(frameon=False, fontsize=8)
+    style.title(axis, title)
+    if len(lines) > 1:
+        label_ends(axis, {name: (float(x[-1]), float(y[-1])) for name, (x, y) in lines.items()}, colours=colours)
     return figure
 
 
-def points(
+def cost_panels(lines: Mapping[str, Mapping[str, Line]], *, x: str, y: str | Sequence[str], columns: int = 2) -> Figure:
+    """A panel of lines for each title, with one legend; a line "NAME, learned" has the colour of NAME and is dashed.
+
+    `y` names the axis of all panels, or of each.
+    """
+    columns = min(columns, len(lines))
+    rows = -(-len(lines) // columns)
+    figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.8)
+    every = list(dict.fromkeys(name for each in lines.values() for name in each))
+    names = list(dict.fromkeys(name.split(", ")[0] for name in every))
+    variants = any(", " in name for name in every)
+    for number, (axis, (title, each)) in enumerate(zip(axes.flat, lines.items(), strict=False)):
+        for name, line in each.items():
+            colour, marker = _look(name.split(", ")[0], names)
+            dash = "--" if ", " in name else "-"
+            axis.plot(*line, dash, color=colour, marker=marker, markersize=3.5, linewidth=1.2)
+        _scale(axis, each.values())
+        style.title(axis, title)
+        if number >= len(lines) - columns:
+            axis.set_xlabel(x)
+        if not isinstance(y, str):
+            axis.set_ylabel(y[number])
+        elif number % columns == 0:
+            axis.set_ylabel(y)
+    for axis in list(axes.flat)[len(lines) :]:
+        axis.axis("off")
+    handles = []
+    for name in names if len(names) > 1 else ():
+        colour, marker = _look(name, names)
+        handles.append(Line2D([], [], color=colour, marker=marker, markersize=4, label=name))
+    if variants:
+        handles += [Line2D([], [], color="0.4", label="exact energy")]
+        handles += [Line2D([], [], linestyle="--", color="0.4", label="learned energy")]
+    if handles:
+        style.legend(figure, handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def cost_points(
     places: Mapping[str, tuple[float, float]],
     *,
     x: str,
     y: str,
     title: str,
-    logarithmic_x: bool = False,
     front: bool = False,
+    exact: float | None = None,
 ) -> Figure:
-    """Points named "THING, VARIANT": a colour for each thing and a marker for each variant, on a logarithmic height.
+    """Points named "MODEL, VARIANT": the model's colour, named at the right, and a marker for each variant.
 
-    Low and left is good where a `front` is drawn.
+    Low and left is good where a `front` is drawn. Heights below `exact` are drawn in a band of their own.
     """
-    figure = _figure(8.4, 4.6)
-    axis = figure.subplots()
+    figure, [[axis]] = style.figure(height=4.0)
+    models, variants = (list(dict.fromkeys(name.split(", ")[half] for name in places)) for half in range(2))
+    colours = {model: style.colour(model) for model in models}
+    ground = _exact_ground([height for _, height in places.values()], exact)
+    drawn = {name: (place, max(height, ground)) for name, (place, height) in places.items()}
+    ends: dict[str, tuple[float, float]] = {}
+    for name, (place, height) in drawn.items():
+        model, variant = name.split(", ")
+        marker = style.MARKERS[variants.index(variant)]
+        axis.plot(place, height, marker, color=colours[model], markersize=6)
+        ends[model] = max(ends.get(model, (place, height)), (place, height))
     if front:
-        ordered = sorted(places.values())
-        lowest = np.minimum.accumulate([height for _, height in ordered])
-        axis.step(
-            [place for place, _ in ordered], lowest, where="post", color="0.85", linewidth=7, zorder=0, label="front"
-        )
-    things, variants = (list(dict.fromkeys(name.split(", ")[half] for name in places)) for half in range(2))
-    for name, (place, height) in places.items():
-        thing, variant = name.split(", ")
-        marker, colour = MARKERS[variants.index(variant) % len(MARKERS)], f"C{things.index(thing)}"
-        axis.plot(place, height, marker, color=colour, markersize=7)
-    for number, thing in enumerate(things):
-        axis.plot([], [], color=f"C{number}", linewidth=4, label=thing)
+        _front(axis, list(drawn.values()))
     for number, variant in enumerate(variants):
-        axis.plot([], [], MARKERS[number % len(MARKERS)], color="0.4", label=variant)
-    axis.set_yscale("log")
-    if logarithmic_x:
-        axis.set_xscale("log")
+        axis.plot([], [], style.MARKERS[number], color="0.4", label=variant)
+    axis.set_xscale(style.scale_of(place for place, _ in drawn.values()))
+    axis.set_yscale(style.scale_of(height for _, height in drawn.values()))
     axis.set(xlabel=x, ylabel=y)
-    axis.set_title(title, fontsize=10)
-    axis.grid(True, which="major", alpha=0.25)
-    figure.legend(frameon=False, fontsize=8, loc="outside right center")
+    style.title(axis, title)
+    if exact is not None:
+        _exact_band(axis, ground)
+    style.legend(figure, *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    label_ends(axis, ends, colours=colours)
     return figure
 
 
-def panels(lines: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float]]]], *, x: str, y: str) -> Figure:
-    """A panel of lines for each name, with one legend; a line "NAME, learned" has the colour of NAME and is dashed."""
-    figure = _figure(3.6 * len(lines) + 2.0, 3.8)
-    axes = figure.subplots(1, len(lines), squeeze=False)[0]
-    names = [name for name in dict.fromkeys(name for each in lines.values() for name in each) if ", " not in name]
-    handles = {}
-    for axis, (title, each) in zip(axes, lines.items(), strict=True):
-        for name, (places, heights) in each.items():
-            number = names.index(name.split(", ")[0])
-            style = "--" if ", " in name else "-"
-            (handles[name],) = axis.loglog(
-                places,
-                heights,
-                style,
-                color=f"C{number}",
-                marker=MARKERS[number % len(MARKERS)],
-                markersize=4,
-                linewidth=1.3,
-            )
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel(x)
-        axis.grid(True, which="major", alpha=0.25)
-    axes[0].set_ylabel(y)
-    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside right center")
+def error_against_time(curves: Mapping[str, Line]) -> Figure:
+    """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
+
+    Names are `model/data` or `model/data/optimiser`. Adam is dashed, and hollow at its end. A point is on the front if
+    nothing as quick has a lower error; what is exact to rounding is left out of it.
+    """
+    parts = {name: name.split("/") for name in curves}
+    datasets = list(dict.fromkeys(part[1] for part in parts.values()))
+    figure, axes = style.figure(len(datasets), 1, height=2.5 * len(datasets) + 0.6, sharex=True)
+    ground = _exact_ground([error for _, errors in curves.values() for error in errors], EXACT)
+    for axis, dataset in zip(axes[:, 0], datasets, strict=True):
+        front, ends, colours = [], {}, {}
+        for name, (seconds, errors) in curves.items():
+            model, its_dataset, *optimiser = parts[name]
+            if its_dataset != dataset:
+                continue
+            adam = optimiser == ["adam"]
+            label = f"{model}, Adam" if adam else model
+            colours[label] = style.colour(model)
+            shown = np.maximum(errors, ground)
+            axis.plot(seconds, shown, "--" if adam else "-", color=colours[label], linewidth=1.4)
+            face = "white" if adam else colours[label]
+            axis.plot(seconds[-1], shown[-1], style.marker(model), color=colours[label], markerfacecolor=face, zorder=3)
+            ends[label] = (float(seconds[-1]), float(shown[-1]))
+            front += [] if errors[-1] < EXACT else list(zip(seconds, errors, strict=True))
+        _front(axis, front)
+        axis.set(xscale="log", yscale="log", ylabel="test torque MSE, (N m)²")
+        style.title(axis, dataset)
+        _exact_band(axis, ground)
+        if axis is axes[0, 0]:
+            for dash, face, label in (("-", "0.4", "Gauss-Newton, or one solve"), ("--", "white", "Adam")):
+                axis.plot([], [], dash, marker="o", color="0.4", markerfacecolor=face, label=label)
+            style.legend(figure, *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        label_ends(axis, ends, colours=colours)
+    axes[-1, 0].set_xlabel("training, s per seed, compilation included")
     return figure
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
-    return figure
+def _look(name: str, names: Sequence[str]) -> tuple[str, str]:
+    """Colour and marker: a model's own, else by the place among the names."""
+    if name in style.MODELS:
+        return style.MODELS[name]
+    number = names.index(name) % len(style.MARKERS)
+    return style.CYCLE[number], style.MARKERS[number]
+
+
+def _scale(axis: Axes, lines) -> None:
+    """Logarithmic where values span a decade; a few places of x are ticks themselves."""
+    lines = list(lines)
+    places = sorted({float(place) for x, _ in lines for place in x})
+    axis.set_xscale(style.scale_of(places))
+    axis.set_yscale(style.scale_of(height for _, y in lines for height in y))
+    if len(places) < 12 and places[-1] < 100:
+        axis.set_xticks(places, [f"{place:g}" for place in places])
+        axis.minorticks_off()
+
+
+def _front(axis: Axes, points: list[tuple[float, float]]) -> None:
+    points.sort()
+    lowest = np.minimum.accumulate([height for _, height in points])
+    places = [place for place, _ in points]
+    axis.step(places, lowest, where="post", color="0.85", linewidth=6, zorder=0, label=FRONT)
+
+
+def _exact_ground(heights: Sequence[float], exact: float | None) -> float:
+    """Where exact heights are drawn: two decades below the least of the others."""
+    if exact is None:
+        return 0.0
+    inexact = [height for height in heights if height >= exact]
+    return 1e-2 * min(inexact, default=1.0)
+
+
+def _exact_band(axis: Axes, ground: float) -> None:
+    """Shades the strip around the ground, and names it in the place of the ticks that would lie in it."""
+    bottom, top = ground / 10, ground * 10
+    axis.axhspan(bottom, top, color="0.95", zorder=-1, linewidth=0)
+    axis.set_ylim(bottom=bottom)
+    low, high = np.log10(axis.get_ylim())
+    every = np.arange(np.ceil(np.log10(top)), np.floor(high) + 1)
+    kept = every[:: max(1, round((high - low) / 7))]
+    axis.set_yticks([ground, *10.0**kept], ["exact", *(f"$10^{{{exponent:.0f}}}$" for exponent in kept)])
+    axis.minorticks_off()

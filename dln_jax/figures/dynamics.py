@@ -1,185 +1,152 @@
-"""Figures of a trained model; each function returns a Matplotlib figure and touches no global state."""
+"""Figures of a trained model of dynamics: forces with their errors, and the paths of an arm's tip."""
 
-import itertools
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.engine.runs import Progress
+from dln_jax.figures import style
+from dln_jax.metrics.rollouts import Motion, valid_prediction_times
 
-TRUTH, MODEL, TEST = "#111111", "#d1495b", "#2e6f95"
-PARTS = ("tau", "tau_inertial", "tau_coriolis", "tau_gravity")
-TITLES = ("torque", "inertial", "Coriolis", "gravity")
+PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
+HIGH, LOW = 0.8, 0.36
+"""Inches of a panel of forces, and of one of errors."""
 
 
 def force_decomposition(
-    data: Trajectories, predicted: dict[str, np.ndarray], *, most_joints: int = 4, most_trajectories: int = 6
+    data: Trajectories,
+    predicted: dict[str, np.ndarray],
+    *,
+    model: str = "model",
+    most_joints: int = 4,
+    most_trajectories: int = 6,
 ) -> Figure:
-    """Torque and its parts over the first test trajectories: a row per joint, truth in black, model in colour."""
+    """Torque and its parts over the first test motions, a column per joint: truth, model, and below the error.
+
+    All errors have one scale. Motions follow each other in time; single states are compared point by point.
+
+    Args:
+        data: the test.
+        predicted: by the keys of `PARTS`, [N, d].
+        model: name, of which the colour is taken.
+        most_joints: that are shown.
+        most_trajectories: that are shown.
+    """
     shown = np.unique(data.trajectory)[:most_trajectories]
     samples = np.flatnonzero(np.isin(data.trajectory, shown))
     trajectory = data.trajectory[samples]
     starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
-    # Single states are no curves; they are compared point by point.
-    style = "-" if len(samples) > 2 * len(shown) else "."
-    rows = min(data.degrees_of_freedom, most_joints)
-    figure = _figure(13.0, 1.1 + 1.9 * rows)
-    axes = figure.subplots(rows, len(PARTS), sharex=True, squeeze=False)
-    for row in range(rows):
-        for axis, key, title in zip(axes[row], PARTS, TITLES, strict=True):
-            truth = getattr(data, key)
-            if truth is not None:
-                axis.plot(truth[samples, row], style, color=TRUTH, linewidth=2.2, label="truth")
-            model_style = "--" if style == "-" else "x"
-            axis.plot(predicted[key][samples, row], model_style, color=MODEL, linewidth=1.3, label="model")
-            for start in starts[1:]:
-                axis.axvline(start, color="0.8", linewidth=0.8, zorder=0)
-            if row == 0:
-                axis.set_title(title, pad=18)
-                for start, end in zip(starts, [*starts[1:], len(samples)], strict=True):
-                    name = str(data.label[trajectory[start]])
-                    axis.annotate(
-                        name,
-                        ((start + end) / 2, 1.02),
-                        xycoords=("data", "axes fraction"),
-                        ha="center",
-                        fontsize=9 if len(name) < 4 else 6,
-                        color="0.35",
-                    )
-            if row == rows - 1:
-                axis.set_xlabel("test sample")
-        axes[row, 0].set_ylabel(f"joint {row + 1}, {_force_unit(data, row)}")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
-    return figure
-
-
-LEAST_SHARE = 0.2
-"""Of the steps, from which a stage's name is written above it, else upright."""
-
-
-def training_curve(
-    history: Sequence[Progress],
-    *,
-    best_step: int,
-    error: str = "torque MSE",
-    loss: str = "training loss (normalised)",
-    unit: str = "loss, or MSE in (N m)²",
-) -> Figure:
-    """Training loss, validation error and test error against steps; the test error decided nothing.
-
-    Of several seeds the medians. `error` and `loss` name what is measured, `unit` the axis. Stages are set apart by
-    lines and have their names; their curves are not connected, for what they measure may differ.
-    """
-    figure = _figure(7.0, 4.2)
-    axis = figure.subplots()
-    stages = [list(ats) for _, ats in itertools.groupby(history, key=lambda at: at.stage)]
-    for number, stage in enumerate(stages):
-        steps = [at.step for at in stage]
-        curves = (("loss", "-", TRUTH, loss), ("validation", "--", MODEL, f"validation {error}"))
-        for field, style, colour, label in (*curves, ("monitor", "-", TEST, f"test {error}")):
-            values = [np.median(getattr(at, field)) for at in stage]
-            if not np.isnan(values).all():  # no test is monitored
-                marker = "." if len(stage) < 40 else ""
-                named = {"label": label} if number == 0 else {}
-                axis.semilogy(steps, values, style, marker=marker, markersize=4, color=colour, **named)
-    axis.axvline(best_step, color="0.6", linestyle=":", label="kept parameters")
-    last = history[-1].step
-    axis.set_xlim(0, max(1.02 * last, 1))
-    starts = [0, *(stage[-1].step for stage in stages[:-1])]
-    lengths = np.diff([*starts, last])
-    upright = bool(np.any(lengths < LEAST_SHARE * last))
-    for start, length, stage in zip(starts, lengths, stages, strict=True):
-        if start:
-            axis.axvline(start, color="0.4", linewidth=0.8)
-        if upright:
-            place, style = (start + 0.004 * last, 0.98), {"rotation": 90.0, "ha": "left", "va": "top"}
+    moving = len(samples) > 2 * len(shown)
+    x = _running_time(data.t[samples], starts) if moving else np.arange(len(samples), dtype=float)
+    joints = min(data.degrees_of_freedom, most_joints)
+    truths = {key: getattr(data, key) for key in PARTS}
+    errors = {key: predicted[key] - truth for key, truth in truths.items() if truth is not None}
+    largest = max((float(np.abs(error[samples, :joints]).max()) for error in errors.values()), default=0.0)
+    factor, _ = style.prefixed(largest, "")
+    rows = [(key, is_error) for key in PARTS for is_error in (False, True) if not is_error or key in errors]
+    heights = [LOW if is_error else HIGH for _, is_error in rows]
+    figure, axes = style.figure(len(rows), joints, height=sum(heights) + 0.9, sharex=True, height_ratios=heights)
+    figure.get_layout_engine().set(h_pad=0.02, hspace=0.0)  # type: ignore[union-attr]
+    shade, dash, dot = style.colour(model), "--" if moving else "", "" if moving else "."
+    for axis, (key, is_error) in ((axis, row) for line, row in zip(axes, rows, strict=True) for axis in line):
+        joint = axis.get_subplotspec().colspan.start
+        if is_error:
+            axis.plot(x, errors[key][samples, joint] / factor, "-" if moving else ".", color=shade, linewidth=0.9)
+            axis.set_ylim(-1.15 * largest / factor, 1.15 * largest / factor)
         else:
-            place, style = (start + length / 2, 1.02), {"rotation": 0.0, "ha": "center", "va": "bottom"}
-        name = axis.text(*place, stage[0].stage, transform=axis.get_xaxis_transform(), fontsize=8, color="0.3")
-        name.update(style)
-    axis.set_xlabel("optimiser step")
-    axis.set_ylabel(unit)
-    axis.grid(True, alpha=0.25)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+            if truths[key] is not None:
+                truth = truths[key][samples, joint]
+                axis.plot(x, truth, "-" if moving else "o", color="black", linewidth=2.0, markersize=4, label="truth")
+            found = predicted[key][samples, joint]
+            axis.plot(x, found, dash, marker=dot, color=shade, linewidth=1.3, label=model)
+        axis.margins(x=0.01)
+        axis.tick_params(axis="x", bottom=axis is axes[-1, joint])
+        for start in starts[1:]:
+            axis.axvline((x[start - 1] + x[start]) / 2, color="0.75", linewidth=0.8, zorder=0)
+        if joint == 0:
+            name = "error" if is_error else PARTS[key]
+            unit = _force_unit(data, joint)
+            axis.set_ylabel(f"{name},\n{style.prefixed(largest, unit)[1] if is_error else unit}")
+    for joint in range(joints):
+        unit = _force_unit(data, joint)
+        differs = "" if unit == _force_unit(data, 0) else f" ({unit})"
+        style.title(axes[0, joint], f"joint {joint + 1}{differs}", pad=16)
+        _name_motions(axes[0, joint], x, starts, [str(data.label[each]) for each in trajectory[starts]])
+        axes[-1, joint].set_xlabel("time, s (test motions in turn)" if moving else "test state")
+    figure.align_ylabels(axes[:, 0])
+    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
-LEAST_ERROR_SHOWN = 1e-15
-"""Of `error_against_time`: what is exact to rounding is marked at the lower edge."""
+def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Time of motions that follow each other at the spacing of their samples."""
+    steps = np.r_[0.0, np.diff(t)]
+    inside = np.ones(len(t), bool)
+    inside[starts] = False
+    steps[starts[1:]] = np.median(steps[inside])
+    return np.cumsum(steps)
 
 
-def error_against_time(curves: dict[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
-    """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
+def _name_motions(axis: Axes, x: np.ndarray, starts: np.ndarray, names: list[str]) -> None:
+    for start, end, name in zip(starts, [*starts[1:], len(x)], names, strict=True):
+        place = (x[start] + x[end - 1]) / 2, 1.04
+        size = style.SMALL if len(name) < 4 else 6.5
+        axis.annotate(name, place, xycoords=("data", "axes fraction"), ha="center", fontsize=size, color="0.35")
 
-    Names are `model/data` or `model/data/optimiser`. A model has one colour, and Adam is dashed with squares. A point
-    is on the front if nothing as quick has a lower error; what is exact to rounding is left out of it.
+
+def tip_paths(
+    data: Trajectories,
+    tip: Callable,
+    *,
+    test: Trajectories,
+    motions: Sequence[Motion],
+    model: str = "model",
+    most_trajectories: int = 24,
+) -> Figure:
+    """The paths that an arm's tip draws, a panel each: the test's first, and over them the model's own.
+
+    Args:
+        data: all trajectories, by whose labels the test's are known.
+        tip: q -> position [2] in m.
+        test: trajectories that the model was not fitted to.
+        motions: of the model from the test's first states under its torques, as `recorded_motions`; a path ends where
+            the prediction is no longer valid. None where there are no motions.
+        model: name, of which the colour is taken.
+        most_trajectories: that are shown.
     """
-    parts = {name: name.split("/") for name in curves}
-    models = list(dict.fromkeys(part[0] for part in parts.values()))
-    datasets = list(dict.fromkeys(part[1] for part in parts.values()))
-    figure = _figure(5.2 * len(datasets) + 1.8, 4.6)
-    axes = figure.subplots(1, len(datasets), sharey=True, squeeze=False)[0]
-    handles = {}
-    for axis, dataset in zip(axes, datasets, strict=True):
-        front = []
-        for name, (seconds, errors) in curves.items():
-            model, its_dataset, *optimiser = parts[name]
-            if its_dataset != dataset:
-                continue
-            exact = errors[-1] < LEAST_ERROR_SHOWN
-            adam = optimiser == ["adam"]
-            label = f"{model}, Adam" if adam else f"{model} (exact)" if exact else model
-            (handles[label],) = axis.loglog(
-                seconds,
-                np.maximum(errors, LEAST_ERROR_SHOWN),
-                color=f"C{models.index(model)}",
-                linestyle="--" if adam else "-",
-                marker="v" if exact else "s" if adam else "o",
-                markevery=[len(seconds) - 1],
-                linewidth=1.4,
-            )
-            front += [] if exact else list(zip(seconds, errors, strict=True))
-        front.sort()
-        lowest = np.minimum.accumulate([error for _, error in front])
-        times = [second for second, _ in front]
-        (handles["front"],) = axis.step(times, lowest, where="post", color="0.85", linewidth=7, zorder=0)
-        axis.set_title(dataset, fontsize=10)
-        axis.set_xlabel("training, s per seed, compilation included")
-        axis.grid(True, which="major", alpha=0.25)
-    axes[0].set_ylabel("test torque MSE, (N m)²")
-    figure.legend(handles.values(), handles.keys(), frameon=False, fontsize=8, loc="outside right center")
-    return figure
-
-
-def tip_paths(data: Trajectories, tip: Callable, *, test: Sequence[int], most_trajectories: int = 24) -> Figure:
-    """The paths that an arm's tip draws, one panel a trajectory; those of the test in colour."""
-    shown = np.unique(data.trajectory)[:most_trajectories]
+    tested = list(np.unique(test.trajectory))
+    others = [index for index in np.unique(data.trajectory) if index not in tested]
+    shown = [*tested, *others][:most_trajectories]
     columns = min(len(shown), 8)
     rows = -(-len(shown) // columns)
-    figure = _figure(1.5 * columns, 1.75 * rows + 0.3)
-    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    figure, axes = style.figure(rows, columns, height=1.0 * rows + 0.55, sharex=True, sharey=True)
     positions = np.asarray(jax.vmap(tip)(data.q))
     for axis in axes.flat:
         axis.set_aspect("equal")
         axis.axis("off")
-    for axis, index in zip(axes.flat, shown, strict=False):
-        path = positions[data.trajectory == index]
-        is_test = index in test
-        axis.plot(*path.T, color=MODEL if is_test else TRUTH, linewidth=1.4)
-        axis.set_title(f"{data.label[index]} (test)" if is_test else str(data.label[index]), fontsize=9)
+    times = valid_prediction_times(test, list(motions)) if motions else []
+    for number, (axis, index) in enumerate(zip(axes.flat, shown, strict=False)):
+        is_test = number < len(tested)
+        chosen = data.trajectory == index
+        axis.plot(*positions[chosen].T, color="black" if is_test else "0.6", linewidth=2.2 if is_test else 1.2)
+        axis.set_title(f"{data.label[index]} (test)" if is_test else str(data.label[index]), fontsize=style.SMALL)
+        if is_test and number < len(times):
+            t = data.t[chosen]
+            valid = t - t[0] <= times[number] + 1e-9
+            path = np.asarray(jax.vmap(tip)(np.asarray(motions[number].q)[valid]))
+            axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
+            axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
+            axis.set_title(f"{data.label[index]}: {times[number]:.1f} of {t[-1] - t[0]:.1f} s", fontsize=style.SMALL)
+    if len(times):
+        figure.supxlabel(
+            f"black: test, dashed: {model} driven by its torques until the prediction fails; grey: training",
+            fontsize=style.SMALL,
+        )
     return figure
 
 
 def _force_unit(data: Trajectories, joint: int) -> str:
     return "N" if data.needs is not None and data.needs.joints[joint] == "prismatic" else "N m"
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
-    return figure

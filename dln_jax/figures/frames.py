@@ -11,13 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, pictures
-from dln_jax.figures.phase_space import COLOURS
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.flow import Flow
+from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.frames import decoded, encoded, physical_energy, physical_states
 from dln_jax.metrics.phase_space import Motions, predict
@@ -109,32 +108,37 @@ def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
     total = len(injection.level)
     half = total // 2
     side = round(np.sqrt(injection.pairs.shape[1] // 2))
-    figure = Figure(figsize=(1.35 * shown, 6.2), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
+    figure = style.blank(height=5.0)
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.05])[:, 0]
-    colours = "#2e6f95", COLOURS["hnn"]
+    colours = style.BLUE, style.VERMILLION
     rows = upper.subplots(2, shown, squeeze=False)
     for row, first, colour, name in zip(rows, (0, half), colours, ("before", "after"), strict=True):
         for axis, index in zip(row, np.linspace(first, first + half - 1, shown).astype(int), strict=True):
             axis.imshow(injection.pairs[index, : side * side].reshape(side, side), cmap="gray", vmin=0, vmax=1)
             axis.set(xticks=[], yticks=[])
-            axis.set_title(f"{FRAME_TIME * injection.latent.t[index]:.2f} s", fontsize=9, color=colour)
-        row[0].set_ylabel(name, color=colour)
+            time = f"{FRAME_TIME * injection.latent.t[index]:.2f} s"
+            style.title(axis, time, fontsize=style.SMALL, color=colour)
+        row[0].set_ylabel(name, color=colour, fontsize=style.TEXT)
     plane, levels = lower.subplots(1, 2, width_ratios=[1.0, 1.6])
+    joules = levels.twinx()
+    for axis in (plane, levels, joules):
+        style.prepare(axis)
     q, p = injection.latent.q[0, :, 0], injection.latent.p[0, :, 0]
     t = FRAME_TIME * injection.latent.t
-    joules = levels.twinx()
     for part, colour in zip((slice(0, half), slice(half, total)), colours, strict=True):
         plane.plot(q[part], p[part], color=colour, linewidth=1.5)
         levels.plot(t[part], injection.level[part], color=colour, linewidth=5.0, alpha=0.4)
-        joules.plot(t[part], injection.physical[part], ":", color="#111111", linewidth=1.6)
+        joules.plot(t[part], injection.physical[part], ":", color="black", linewidth=1.6)
     plane.annotate("", (q[half], p[half]), (q[half - 1], p[half - 1]), arrowprops={"arrowstyle": "->", "lw": 1.6})
-    plane.set(xlabel="latent z_q", ylabel="latent z_p, per frame", title="path in the latent plane")
-    levels.set(xlabel="t, s", ylabel="latent H / H at the start", title="energy: latent (band), of the frames (dots)")
+    plane.set(xlabel="latent q, 1", ylabel="latent p, 1 per frame")
+    style.title(plane, "path in the latent plane")
+    levels.set(xlabel="t, s", ylabel="latent H / H at the start, 1")
+    style.title(levels, "energy: latent (band), of the frames (dots)")
     joules.set_ylabel("energy of the frames, J")
+    joules.grid(False)
+    joules.spines["right"].set_visible(True)
     start = injection.physical[:half].mean()
-    bottom, top = 0.0, 1.25 * max(float(injection.level.max()), float(injection.physical.max() / start))
-    levels.set_ylim(bottom, top)
-    joules.set_ylim(bottom * start, top * start)
-    levels.grid(True, alpha=0.25)
+    top = 1.25 * max(float(injection.level.max()), float(injection.physical.max() / start))
+    levels.set_ylim(0.0, top)
+    joules.set_ylim(0.0, top * start)
     return figure

@@ -1,25 +1,22 @@
-"""Figures of motions in phase space: paths and energies of the truth, a baseline and a Hamiltonian model."""
+"""Figures of motions in phase space: what each model makes of a motion, over the truth, and what its energy does."""
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dln_jax.figures import style
+from dln_jax.figures.style import TRUTH
 from dln_jax.metrics.phase_space import Motions
-
-TRUTH = "truth"
-COLOURS = {
-    TRUTH: "#111111",
-    "baseline": "#2e6f95",
-    "hnn": "#d1495b",
-    "black-box-hnn": "#e8a33d",
-    "polynomial": "#5b8e3e",
-}
 
 Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(q [N, 1], p [N, 1]) -> (qd, pd)."""
+ROOM = 0.15
+"""Of the largest true value, that an axis shows above and below the truth at least."""
+LEAST = 1e-17
+"""Relative errors below are not drawn apart."""
 
 
 def motion_figure(
@@ -27,56 +24,80 @@ def motion_figure(
     energies: Mapping[str, Float[np.ndarray, "K T"]],
     *,
     fields: Mapping[str, Field] | None = None,
-    quantity: str = "energy",
+    quantity: str = "true energy",
+    units: tuple[str, str, str] = ("", "", ""),
     shown: int = 0,
 ) -> Figure:
-    """One motion as each system has it, a panel each, and its energy (or another `quantity`) against time.
+    """One motion as each model has it over the truth, a panel each; below, its energy or another quantity over time.
 
     With one coordinate a panel is the phase plane, with arrows where `fields` give the rates; with 2 n coordinates it
-    shows the orbits of n bodies in a plane.
+    shows the orbits of n bodies in a plane. The quantity stands beside its error relative to the largest true value.
 
     Args:
         motions: by name; "truth" is drawn behind each of the others.
         energies: the true energy, or the other quantity, along them.
         fields: rates of the systems, one coordinate only.
+        quantity: what `energies` are.
+        units: of q, of p and of the quantity; empty where they have none.
         shown: which motion.
     """
-    figure = Figure(figsize=(3.1 * len(motions) + 4.2, 3.4), layout="constrained", dpi=130)
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(motions) + 1, width_ratios=[3.0] * len(motions) + [4.0])
-    truth = plane_paths(motions[TRUTH], shown)
-    plane = motions[TRUTH].q.shape[2] == 1
+    models = [name for name in motions if name != TRUTH]
+    truth, plane = plane_paths(motions[TRUTH], shown), motions[TRUTH].q.shape[2] == 1
+    figure = style.blank(height=2.1 + 7.0 / max(len(models), 3))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[6.6 / max(len(models), 3), 2.1])[:, 0]
+    panels = above.subplots(1, len(models), sharex=True, sharey=True, squeeze=False)[0]
     corner = 1.25 * max(float(np.abs(path).max()) for path in truth)
-    for axis, (name, moved) in zip(axes, motions.items(), strict=False):
+    for axis, name in zip(panels, models, strict=True):
+        style.prepare(axis)
         for x, y in truth:
-            axis.plot(x, y, color=COLOURS[TRUTH], linewidth=1.0)
-        if name != TRUTH:
-            for x, y in plane_paths(moved, shown):
-                axis.plot(x, y, color=COLOURS.get(name, "C0"), linewidth=1.4)
+            axis.plot(x, y, color="black", linewidth=2.2)
+        for x, y in plane_paths(motions[name], shown):
+            axis.plot(x, y, color=style.colour(name), linewidth=1.2)
         if plane and fields is not None and name in fields:
             _arrows(axis, fields[name], corner)
-        axis.set(xlim=(-corner, corner), ylim=(-corner, corner), aspect="equal", title=name)
-        axis.set_xlabel("q" if plane else "x, m")
-        axis.set_ylabel("p" if plane else "y, m")
-    t = motions[TRUTH].t
-    for name in motions:
-        finite = np.where(np.isfinite(energies[name][shown]), energies[name][shown], np.nan)
-        style = "--" if name == TRUTH else "-"
-        axes[-1].plot(t, finite, style, color=COLOURS.get(name, "C0"), label=name, zorder=3 if name == TRUTH else 2)
-    axes[-1].set(xlabel="t, s", ylabel=quantity, title=f"{'true ' * (quantity == 'energy')}{quantity} along each")
-    axes[-1].set_ylim(*_limits(energies[TRUTH][shown], [each[shown] for each in energies.values()]))
-    axes[-1].grid(True, alpha=0.25)
-    axes[-1].legend(frameon=False, fontsize=8)
+        axis.set(xlim=(-corner, corner), ylim=(-corner, corner), aspect="equal")
+        style.title(axis, name, color=style.colour(name))
+        axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
+    panels[0].set_ylabel(style.with_unit("p", units[1]) if plane else "y, m")
+    of_shown = {name: np.where(np.isfinite(each[shown]), each[shown], np.nan) for name, each in energies.items()}
+    values, errors = below.subplots(1, 2)
+    style.prepare(values)
+    style.prepare(errors)
+    _over_time(values, motions[TRUTH].t, of_shown)
+    values.set_ylabel(style.with_unit(quantity, units[2]))
+    _relative_errors(errors, motions[TRUTH].t, of_shown)
+    errors.set_ylabel("error / largest true value")
     return figure
 
 
-def _limits(truth: np.ndarray, curves: list[np.ndarray]) -> tuple[float, float]:
-    """Room for the truth and for most of what the others do; one that runs away leaves the picture."""
-    every = np.concatenate([each[np.isfinite(each)] for each in curves])
-    low, high = np.quantile(every, [0.03, 0.97])
-    low, high = min(low, truth.min()), max(high, truth.max())
-    margin = 0.1 * max(high - low, 0.05 * float(np.abs(truth).max()))
-    return float(low - margin), float(high + margin)
+def _over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+    """The truth is dashed above the models; one that runs away leaves the picture."""
+    for name, each in values.items():
+        dash, order = ("--", 3) if name == TRUTH else ("-", 2)
+        axis.plot(t, each, dash, color=style.colour(name), linewidth=1.4, zorder=order, label=name)
+    truth, every = values[TRUTH], np.concatenate(list(values.values()))
+    low, high = np.nanquantile(every, [0.03, 0.97])
+    room = ROOM * float(np.abs(truth).max())
+    axis.set_ylim(min(low, truth.min()) - room, max(high, truth.max()) + room)
+    axis.set_xlabel("t, s")
+    lines = axis.get_lines()
+    truths = [line for line in lines if line.get_label() == TRUTH]
+    style.legend(axis, handles=truths, loc="best")
+
+
+def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+    """Logarithmic, as errors of models differ by orders; a value that is exact is drawn at rounding."""
+    truth = values[TRUTH]
+    size = float(np.abs(truth).max()) or 1.0
+    relative = {name: np.maximum(abs(each - truth) / size, LEAST) for name, each in values.items() if name != TRUTH}
+    for name, each in relative.items():
+        axis.plot(t[1:], each[1:], color=style.colour(name), linewidth=1.0)
+    axis.set_yscale("log")
+    every = np.concatenate([each[1:][np.isfinite(each[1:])] for each in relative.values()])
+    high = np.ceil(np.log10(np.quantile(every, 0.99))) if len(every) else 0.0
+    low = np.floor(np.log10(np.quantile(every, 0.02))) if len(every) else -1.0
+    axis.set_ylim(10.0 ** min(low, high - 2), 10.0**high * 2)
+    axis.set_xlabel("t, s")
 
 
 def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -88,7 +109,7 @@ def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarr
     return [(q[:, 2 * body], q[:, 2 * body + 1]) for body in range(q.shape[1] // 2)]
 
 
-def _arrows(axis, field: Field, corner: float) -> None:
+def _arrows(axis: Axes, field: Field, corner: float) -> None:
     grid = np.linspace(-corner, corner, 11)
     q, p = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
     qd, pd = field(q, p)

@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from dln_jax.figures import style
 from dln_jax.locomotion.learning import Record
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of each seed, by the name of the way of learning."""
 
-COLOURS = {"gradient": "C0", "evolution": "C2", "ppo": "C1"}
+COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE}
 
 
 def first_reaching(records: Sequence[Record], distance: float) -> Record | None:
@@ -60,9 +60,7 @@ def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Recor
 
 def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
     """Farthest distance so far against environment steps and against wall seconds: seeds thin, their median thick."""
-    figure = Figure(figsize=(10.6, 4.2), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, [panels] = style.figure(1, 2, height=3.6, sharey=True)
     for axis, field, label in zip(
         panels, ("steps", "seconds"), ("environment steps", "wall time incl. compilation, s"), strict=True
     ):
@@ -74,30 +72,27 @@ def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
     # Room for the legends.
     panels[0].set_ylim(top=1.45 * panels[0].get_ylim()[1])
     panels[0].set_ylabel("distance in one episode, body lengths")
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=style.TEXT)
     return figure
 
 
 def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure:
     """The distance of every evaluation against environment steps, a line for each seed."""
-    figure = Figure(figsize=(6.4, 3.8), layout="constrained", dpi=110)
-    FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    for number, records in enumerate(seeds):
+    figure, [[axis]] = style.figure(height=3.4)
+    for records in seeds:
         places = [record.steps for record in records]
-        axis.plot(places, [record.distance for record in records], color=f"C{number}", linewidth=1.2)
+        distances = [record.distance for record in records]
+        axis.plot(places, distances, color=COLOURS.get(method, style.PURPLE), linewidth=1.2, alpha=0.8)
     axis.axhline(1.0, color="0.6", linewidth=0.8, linestyle="--")
     axis.set(xlabel="environment steps", ylabel="distance in one episode, body lengths")
-    axis.set_title(f"{method}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}", fontsize=10)
-    axis.grid(True, alpha=0.25)
+    style.title(axis, f"{method}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}")
     return figure
 
 
 def _panel(axis: Axes, curves: Curves, field: str, distance: float) -> None:
     axis.axhline(distance, color="0.6", linewidth=0.8, linestyle="--")
-    axis.grid(True, which="major", alpha=0.25)
     for name, seeds in curves.items():
-        colour = COLOURS.get(name, "C3")
+        colour = COLOURS.get(name, style.PURPLE)
         for records in seeds:
             places = [getattr(record, field) for record in records]
             axis.step(places, farthest_so_far(records), where="post", color=colour, linewidth=0.7, alpha=0.5)
@@ -113,6 +108,7 @@ def _panel(axis: Axes, curves: Curves, field: str, distance: float) -> None:
         axis.axvline(max(known), color=COLOURS["gradient"], linewidth=0.9, linestyle=":")
         text = "gradient ahead\nof all from here"
         axis.annotate(
-            text, (max(known), 0.7), xycoords=("data", "axes fraction"), fontsize=7, color=COLOURS["gradient"]
+            text, (max(known), 0.7), xycoords=("data", "axes fraction"), fontsize=style.SMALL, color=COLOURS["gradient"]
         )
-    axis.legend(frameon=False, fontsize=8, loc="upper left", title="median to reach the dashed line", title_fontsize=7)
+    heading = {"title": "median to reach the dashed line", "title_fontsize": style.SMALL}
+    style.legend(axis, loc="upper left", **heading)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
+from dln_jax import figures
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, merged
-from dln_jax.figures import dynamics as figures
 from dln_jax.files import write_figure
 from dln_jax.learning.dynamics_fit import Settings
 from dln_jax.learning.engine.runs import Training
@@ -20,7 +20,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.rollouts import rollout_metrics
+from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
 from dln_jax.precision import data_type
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Needs
@@ -53,7 +53,7 @@ def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: 
     predicted = predictions(load_system(folder), test, dtype)
     latency = latency_of(functions, task)
     if draw:
-        draw_figures(folder, task, training, predicted)
+        draw_figures(folder, task, training, functions, predicted)
     every = range(seeds) if seeds > 1 else ()
     model = build(task.description)
     of_seeds = [
@@ -154,17 +154,23 @@ CEILINGS = {
 """Metrics of a rollout, and the names of what the true plant gets."""
 
 
-def draw_figures(folder: Path, task: Task, training: Training, predicted: dict[str, np.ndarray]) -> None:
+def draw_figures(
+    folder: Path, task: Task, training: Training, functions: Dynamics | PlainDynamics, predicted: dict[str, np.ndarray]
+) -> None:
     """Writes what there is to draw."""
     test = task.sets.test
-    write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted))
+    write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted, model=task.kind))
     if training.history and task.kind != "trigonometric":
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
         write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, **units))
     if task.scene is not None and task.scene.tip is not None:
-        paths = figures.tip_paths(merged(task.sets), task.scene.tip, test=np.unique(test.trajectory).tolist())
+        moving = len(np.unique(test.trajectory)) < len(test.t)
+        dtype = data_type(task.settings.precision)
+        found = recorded_motions(functions, test, torques=["interpolated"], dtype=dtype) if moving else {}
+        motions, every = found.get("interpolated", []), merged(task.sets)
+        paths = figures.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
         write_figure(folder / "tip_paths.png", paths)
 
 

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from dln_jax import figures
 from dln_jax.command_line.progress import progress
 from dln_jax.datasets.pendulum_frames import FrameSplit
-from dln_jax.figures.dynamics import training_curve
+from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.runs import Checkpoint, Progress, fingerprint
 from dln_jax.studies.hamiltonian import pixels as pixel_task

@@ -12,8 +12,9 @@ from rich.table import Table
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import CHOSEN, stored_arguments
 from dln_jax.data.functions import SampleSplit
-from dln_jax.figures import functions as figures
-from dln_jax.figures.dynamics import training_curve
+from dln_jax.figures import ensembles
+from dln_jax.figures import functions as drawing
+from dln_jax.figures.training import training_curve
 from dln_jax.files import CONFIG, write_figure, write_json
 from dln_jax.learning.engine.runs import Checkpoint, Progress, Training, fingerprint, one_after_the_other
 from dln_jax.learning.growth import Trial
@@ -133,14 +134,14 @@ def draw_figures(folder: Path, task: Task, training: Training, trials: list[Tria
     shown = predictions(loaded.layers, task.shown.x, activation=activation(task.settings.activation))
     drawn = {"training": training_figure(training, trials)} if training.history else {}
     if inputs == 1:
-        drawn["curves"] = figures.curves(task.shown, shown.mean)
+        drawn["curves"] = drawing.function_curves(task.shown, shown.mean)
     elif task.name in NAMED:
-        drawn["heat_maps"] = figures.heat_maps(task.shown, shown.mean)
-        drawn["surfaces"] = figures.surfaces(task.shown, shown.mean)
+        drawn["heat_maps"] = drawing.heat_maps(task.shown, shown.mean)
+        drawn["surfaces"] = drawing.surfaces(task.shown, shown.mean)
     else:
-        drawn["parity"] = figures.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
+        drawn["parity"] = drawing.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
     if task.bound is not None and shown.spread is not None:
-        drawn["ensemble"] = figures.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
+        drawn["ensemble"] = ensembles.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
     for name, figure in drawn.items():
         write_figure(folder / f"{name}.png", figure)
 

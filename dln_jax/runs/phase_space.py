@@ -11,13 +11,13 @@ from rich.table import Table
 
 from dln_jax.command_line.progress import progress
 from dln_jax.figures import animations
-from dln_jax.figures.dynamics import training_curve
-from dln_jax.figures.phase_space import TRUTH
+from dln_jax.figures.style import TRUTH
+from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.runs import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.phase_space_task import PhaseTask
-from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once
+from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once, units_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
 from dln_jax.studies.hamiltonian.training import KINDS, MOTIONS, RATES, Trained, stages_of, train
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
@@ -110,7 +110,8 @@ def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained
     write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
     truth = problem.truth[0]
     stride = max(1, len(truth.t) // GIF_FRAMES)
-    animations.write_motion_gif(folder / "motions.gif", {TRUTH: truth, name: seen.motions}, stride=stride)
+    motions, units = {TRUTH: truth, name: seen.motions}, units_of(problem)[:2]
+    animations.write_motion_gif(folder / "motions.gif", motions, stride=stride, units=units)
     history = trained.history
     if len(history) > 1:
         best = history[-1].step - trained.result.history[-1].step + trained.result.best_step

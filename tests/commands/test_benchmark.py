@@ -13,6 +13,7 @@ from dln_jax.commands import benchmark
 from dln_jax.figures.benchmarks import panels, points
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
+from dln_jax.figures.benchmarks import EXACT, FRONT, cost_curves, cost_panels, cost_points
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.delan import make_delan
@@ -78,12 +79,15 @@ def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, cap
 
 
 def test_figures_of_points_and_panels_draw():
-    figure = points(
-        {"a, jit": (1.0, 1e-3), "a, c": (2.0, 1e-3), "b, jit": (3.0, 1e-5)}, x="", y="", title="", front=True
+    places = {"a, jit": (1.0, 1e-3), "a, c": (2.0, 1e-3), "b, jit": (3.0, 1e-20)}
+    figure = cost_points(places, x="", y="", title="", front=True, exact=EXACT)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [FRONT, "jit", "c"]
+    (axis,) = figure.axes
+    assert {text.get_text() for text in axis.texts} == {"a", "b"}
+    assert axis.get_yticklabels()[0].get_text() == "exact" and axis.get_xscale() == "linear"
+    drawn = cost_panels(
+        {"s": {"rk4": ([1.0, 2.0], [1e-3, 1e-4]), "rk4, learned": ([1.0, 2.0], [1e-2, 1e-2])}}, x="", y=""
     )
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["front", "a", "b", "jit", "c"]
-    drawn = panels({"s": {"rk4": ([1.0, 2.0], [1e-3, 1e-4]), "rk4, learned": ([1.0, 2.0], [1e-2, 1e-2])}}, x="", y="")
     one, other = drawn.axes[0].lines
     assert one.get_color() == other.get_color() and one.get_linestyle() != other.get_linestyle()
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax import figures
 from dln_jax.datasets import generators
-from dln_jax.figures import dynamics as figures
 from dln_jax.learning.engine.runs import Progress, one_after_the_other
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors, predictions

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split, partition_labels, split
-from dln_jax.figures.dynamics import error_against_time
+from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.data import letters, published_split, states
 from dln_jax.studies.arm.models import (

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import jax
 from matplotlib.figure import Figure
 
-from dln_jax.figures.phase_space import TRUTH, Field, motion_figure
+from dln_jax.figures.phase_space import Field, motion_figure
+from dln_jax.figures.style import TRUTH
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.studies.hamiltonian.training import Trained
@@ -43,7 +44,15 @@ def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:
     fields = {name: each.rates for name, each in seen.items()}
     if problem.energy is not None:
         heights = {name: energies(problem.energy, each) for name, each in motions.items()}
-        return motion_figure(motions, heights, fields=fields)
-    return motion_figure(
-        motions, {name: each.q[:, :, 0] for name, each in motions.items()}, fields=fields, quantity="q1"
-    )
+        return motion_figure(motions, heights, fields=fields, units=units_of(problem))
+    angles = {name: each.q[:, :, 0] for name, each in motions.items()}
+    return motion_figure(motions, angles, fields=fields, quantity="q1", units=units_of(problem))
+
+
+UNITS = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}
+
+
+def units_of(problem: Problem) -> tuple[str, str, str]:
+    """Of the first coordinate, of its momentum, and of what the task's figure shows over time."""
+    of_q, of_p = UNITS[problem.needs.joints[0]]
+    return (of_q, of_p, "J") if problem.energy is not None else (of_q, f"{of_q}/s", of_q)

@@ -15,7 +15,7 @@ import numpy as np
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
 from dln_jax.figures.animations import write_frame_gif
 from dln_jax.figures.frames import inject_energy, injection_figure
-from dln_jax.figures.phase_space import TRUTH
+from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
 from dln_jax.learning.engine.runs import Checkpoint, Progress, Report, Training, silent
 from dln_jax.learning.frame_matching import Settings, Weights, loss, match_frames, windows

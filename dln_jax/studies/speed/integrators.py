@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import panels
+from dln_jax.figures.benchmarks import cost_panels
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
@@ -61,7 +61,7 @@ def measure(quick: bool) -> Findings:
 
 def draw(lines: dict) -> Figure:
     """Trajectory error against what a simulated second takes, for each scene."""
-    return panels(lines, x="µs per simulated second", y="trajectory error, rms")
+    return cost_panels(lines, x="µs per simulated second", y="trajectory error, rms")
 
 
 def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:

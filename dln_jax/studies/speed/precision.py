@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.figures.benchmarks import points
+from dln_jax.figures.benchmarks import cost_points
 from dln_jax.learning.linear_fit import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
@@ -60,7 +60,7 @@ def measure(quick: bool) -> Findings:
 def draw(shown: dict) -> Figure:
     """What float32 gains in time against what it loses in accuracy."""
     labels = "time of float64 over time of float32, batch 1,000", "largest relative error of float32"
-    return points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
+    return cost_points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
 
 
 def initial(model: Model, kind: str, data: Trajectories) -> Parameters:

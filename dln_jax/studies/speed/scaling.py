@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import curves
+from dln_jax.figures.benchmarks import cost_panels
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.models.delan import make_delan
@@ -36,17 +36,18 @@ def measure(quick: bool) -> Findings:
         bound = 2.0 if quantity == "inverse_p50_us" else None
         rows.append(Row("structured-delan/growth", f"{quantity}_exponent", float(slope), "1", None, bound))
     shown = {
-        "one call, µs": by_quantity["inverse_p50_us"],
-        "training step, ms": by_quantity["training_step_ms"],
-        "compilation of a training step, s": by_quantity["training_compile_seconds"],
-        "memory of a training step, MiB": by_quantity["training_memory_mib"],
+        "one call": (by_quantity["inverse_p50_us"], "µs"),
+        "training step": (by_quantity["training_step_ms"], "ms"),
+        "compilation of a training step": (by_quantity["training_compile_seconds"], "s"),
+        "memory of a training step": (by_quantity["training_memory_mib"], "MiB"),
     }
-    return Findings(rows, {name: (list(map(float, sizes)), values) for name, values in shown.items()})
+    return Findings(rows, {name: (list(map(float, sizes)), *each) for name, each in shown.items()})
 
 
 def draw(lines: dict) -> Figure:
-    """Each cost against the number of joints."""
-    return curves(lines, x="joints", y="cost", title="structured DeLaN, 64x64, float32, batch 512 in training")
+    """Each cost against the number of joints, in a panel of its own."""
+    panels = {name: {"structured-delan": (sizes, values)} for name, (sizes, values, _) in lines.items()}
+    return cost_panels(panels, x="joints", y=[unit for *_, unit in lines.values()])
 
 
 def cost(d: int, *, calls: int, repetitions: int) -> list[tuple[str, float, str]]:

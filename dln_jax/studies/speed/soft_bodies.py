@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import curves
+from dln_jax.figures.benchmarks import cost_curves
 from dln_jax.studies import soft_bodies
 from dln_jax.studies.case import Findings, named
 from dln_jax.studies.soft_bodies.figures import speed_against_error
@@ -21,5 +21,5 @@ def measure(quick: bool) -> Findings:
 def draw(lines: dict) -> Figure:
     """Speed against error, or if quick against the number of lanes."""
     if "crawler" in lines:
-        return curves(lines, x="lanes", y="steps per second", title="28 vertices, float64")
+        return cost_curves(lines, x="lanes", y="steps per second", title="28 vertices, float64")
     return speed_against_error(lines)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 from matplotlib.figure import Figure
 
-from dln_jax.figures.benchmarks import curves
+from dln_jax.figures.benchmarks import cost_curves
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns
@@ -49,7 +49,7 @@ def measure(quick: bool) -> Findings:
 
 def draw(speeds: dict) -> Figure:
     """States per second against the batch."""
-    return curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
+    return cost_curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
 
 
 def hessian_row(d: int, repetitions: int) -> Row:

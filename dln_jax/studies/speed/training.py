@@ -6,7 +6,7 @@ from functools import partial
 from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
-from dln_jax.figures.dynamics import error_against_time
+from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.learning.dynamics_fit import train
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.data import letters, published_split

@@ -1,0 +1,135 @@
+"""Names written into a picture, beside what they name: at the ends of curves, and beside points where there is room."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.transforms import Bbox, BboxBase
+
+from dln_jax.figures.style import SMALL
+
+LINE = {"arrowstyle": "-", "linewidth": 0.5, "shrinkB": 3}
+"""From a label to what it names."""
+
+
+def label_ends(axis: Axes, ends: Mapping[str, tuple[float, float]], *, colours: Mapping[str, str]) -> None:
+    """Names curves at the right edge, each at the height of its end (x, y), moved apart where they would overlap.
+
+    Call it when the limits of the axis and the size of the figure are settled.
+    """
+    drawn = axis.get_figure(root=True)
+    assert drawn is not None
+    fractions = axis.transData + axis.transAxes.inverted()
+    heights = {name: float(np.clip(fractions.transform(end)[1], 0.0, 1.0)) for name, end in ends.items()}
+    share = axis.get_position().height * drawn.get_figheight()
+    places = spread(heights, gap=1.25 * SMALL / 72 / share)
+    for name, place in places.items():
+        axis.annotate(
+            name,
+            ends[name],
+            (1.03, place),
+            textcoords="axes fraction",
+            annotation_clip=False,
+            va="center",
+            fontsize=SMALL,
+            color=colours[name],
+            arrowprops={**LINE, "color": colours[name], "alpha": 0.6},
+        )
+
+
+def spread(heights: Mapping[str, float], *, gap: float) -> dict[str, float]:
+    """The same heights in the same order, moved as little as leaves a gap between neighbours, and within [0, 1]."""
+    names = sorted(heights, key=lambda name: heights[name])
+    gap = min(gap, 1.0 / max(len(names) - 1, 1))
+    # Relative to a ladder of gaps, heights in order need only be nondecreasing: their isotonic regression.
+    blocks: list[tuple[float, int]] = []
+    for rung, name in enumerate(names):
+        blocks.append((heights[name] - rung * gap, 1))
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            (below, many), (above, more) = blocks[-2:]
+            blocks[-2:] = [((below * many + above * more) / (many + more), many + more)]
+    top = 1.0 - gap * (len(names) - 1)
+    flat = [float(np.clip(height, 0.0, top)) for height, count in blocks for _ in range(count)]
+    return {name: height + rung * gap for rung, (name, height) in enumerate(zip(names, flat, strict=True))}
+
+
+class Place(NamedTuple):
+    """Where a label stands, relative to its point."""
+
+    x: int
+    """-1, 0 or 1: to the left, above or below, to the right."""
+    y: int
+    """-1, 0 or 1: below, beside, above."""
+    distance: float
+    """In points."""
+
+    def box(self, at: np.ndarray, width: float, height: float, pixels: float) -> Bbox:
+        """What a text of this size covers, in pixels; `pixels` are those of a point."""
+        left, bottom = at + pixels * self.distance * np.array([self.x, self.y])
+        corner = left + (self.x - 1) / 2 * width, bottom + (self.y - 1) / 2 * height
+        return Bbox.from_bounds(*corner, width, height)
+
+
+BESIDE = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+"""Directions from a point in which its label may stand, the best first."""
+NEAR, FAR = 4.0, (12.0, 22.0, 34.0)
+"""Points from a point to its label; from far a line leads back."""
+
+
+def label_points(
+    axis: Axes,
+    points: Sequence[tuple[str, tuple[float, float]]],
+    *,
+    obstacles: np.ndarray,
+    first: tuple[int, int] = (1, 0),
+    size: float = SMALL,
+    colour: str = "0.25",
+) -> None:
+    """Writes (text, (x, y)) beside each point, where it covers least: no obstacle, no label, no edge of the axes.
+
+    Call it when the figure is complete, since the labels take the free places of the picture that is there.
+
+    Args:
+        axis: of the points.
+        points: in data units.
+        obstacles: points [n, 2] in data units that labels should not cover.
+        first: direction from a point in which its label stands if there is room.
+        size: of the text in points.
+        colour: of the text.
+    """
+    drawn = axis.get_figure(root=True)
+    assert drawn is not None
+    drawn.draw_without_rendering()
+    pixels = drawn.dpi / 72
+    covered, frame, taken = axis.transData.transform(obstacles), axis.get_window_extent(), []
+    for text, point in points:
+        label = axis.annotate(text, point, (0, 0), textcoords="offset points", fontsize=size, color=colour, zorder=100)
+        # Labels move nothing: their places are found in the picture without them.
+        label.set_in_layout(False)
+        extent = label.get_window_extent()
+        at = axis.transData.transform(point)
+
+        def cost(place: Place, at=at, extent=extent) -> float:
+            box = place.box(at, extent.width, extent.height, pixels)
+            crowded = sum(_common(box, other) for other in taken) + box.width * box.height - _common(box, frame)
+            return box.padded(1.0).count_contains(covered) + 0.05 * crowded + 0.02 * place.distance
+
+        best = min(_places(first), key=cost)
+        taken.append(best.box(at, extent.width, extent.height, pixels).padded(2.0))
+        label.set(ha=("center", "left", "right")[best.x], va=("center", "bottom", "top")[best.y])
+        label.set_position((best.distance * best.x, best.distance * best.y))
+        if best.distance > NEAR:
+            away = label.xyann
+            axis.annotate("", point, away, textcoords="offset points", arrowprops={**LINE, "color": colour}, zorder=99)
+
+
+def _places(first: tuple[int, int]) -> Iterator[Place]:
+    for distance in (NEAR, *FAR):
+        yield from (Place(x, y, distance) for x, y in dict.fromkeys((first, *BESIDE)))
+
+
+def _common(one: BboxBase, other: BboxBase) -> float:
+    """Area in square pixels."""
+    both = Bbox.intersection(one, other)
+    return 0.0 if both is None else both.width * both.height

@@ -1,0 +1,123 @@
+"""What all figures have in common: width, sizes of text, a light grid, and one colour and marker for each model.
+
+Nothing here reads or sets Matplotlib's global state: figures are made without pyplot, and what Matplotlib would take
+from its settings later, when it makes ticks, is given to each axis.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+
+WIDTH, DPI = 7.2, 150
+"""In inches, and pixels per inch: 1,080 pixels, the width of a page."""
+TEXT, SMALL = 9.0, 8.0
+"""Points."""
+TRUTH = "truth"
+REFERENCE = "0.55"
+"""Colour of published and other reference values."""
+
+BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, "#555555", "#882255")
+"""Colours of things that are no models (Okabe and Ito 2008, told apart by the colour-blind)."""
+MARKERS = "osv^Ddp*"
+
+MODELS: dict[str, tuple[str, str]] = {
+    "structured-delan": (BLUE, "o"),
+    "black-box-delan": (SKY, "s"),
+    "structured-hnn": (VERMILLION, "^"),
+    "black-box-hnn": (ORANGE, "v"),
+    "trigonometric": (GREEN, "D"),
+    "feed-forward": (PURPLE, "X"),
+    "separable-hnn": ("#B2182B", "^"),
+    "pairwise-hnn": ("#882255", "P"),
+    "polynomial-hamiltonian": ("#44AA99", "D"),
+    "phase-network": ("#7E57A6", "X"),
+    "differential-network": ("#332288", "o"),
+    **dict.fromkeys((TRUTH, "plant"), ("black", ".")),
+    "published": (REFERENCE, "x"),
+}
+"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models green, direct networks purple."""
+UNKNOWN = ("#555555", "h")
+
+
+def colour(name: str) -> str:
+    """Colour of a model, or of a variant "MODEL-..." of it; grey for a name that is not known."""
+    return _look(name)[0]
+
+
+def marker(name: str) -> str:
+    """Marker of a model, likewise."""
+    return _look(name)[1]
+
+
+def _look(name: str) -> tuple[str, str]:
+    known = [each for each in MODELS if name == each or name.startswith(f"{each}-")]
+    return MODELS[max(known, key=len)] if known else UNKNOWN
+
+
+def figure(
+    rows: int = 1, columns: int = 1, *, height: float, width: float = WIDTH, dpi: int = DPI, **options
+) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes [rows, columns], drawn by Agg; sizes in inches, `options` as `Figure.subplots`."""
+    drawn = blank(height=height, width=width, dpi=dpi)
+    axes = drawn.subplots(rows, columns, squeeze=False, **options)
+    for axis in axes.flat:
+        prepare(axis)
+    return drawn, axes
+
+
+def blank(*, height: float, width: float = WIDTH, dpi: int = DPI) -> Figure:
+    """A figure without axes."""
+    drawn = Figure(figsize=(width, height), layout="constrained", dpi=dpi)
+    FigureCanvasAgg(drawn)
+    return drawn
+
+
+def prepare(axis: Axes) -> None:
+    """Gives axes that were added to a figure their sizes of text and their grid."""
+    axis.tick_params(which="both", labelsize=SMALL)
+    for side in (axis.xaxis, axis.yaxis):
+        side.label.set_fontsize(TEXT)
+        side.get_offset_text().set_fontsize(SMALL)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["bottom", "left"]].set_color("0.4")
+    axis.grid(True, which="major", color="0.9", linewidth=0.7)
+    axis.set_axisbelow(True)
+
+
+def title(axis: Axes, text: str, **options) -> None:
+    """A title in the size of the text, which `set_title` would take from Matplotlib's settings."""
+    axis.set_title(text, **{"fontsize": TEXT, **options})
+
+
+def legend(of: Axes | Figure, *args, **options) -> Legend:
+    """A legend without a frame, in the small text."""
+    return of.legend(*args, **{"frameon": False, "fontsize": SMALL, **options})
+
+
+def scale_of(values: Iterable[float | int]) -> str:
+    """ "log" for positive values that span a decade or more, else "linear"."""
+    numbers = np.asarray(list(values), float)
+    numbers = numbers[np.isfinite(numbers)]
+    return "log" if len(numbers) and numbers.min() > 0 and numbers.max() >= 10 * numbers.min() else "linear"
+
+
+def prefixed(size: float | int, unit: str) -> tuple[float, str]:
+    """What a unit is to be multiplied with for numbers of this size, and its name: (1e-6, "µN m") for 3e-5 N m."""
+    prefixes = {1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n", 1e-12: "p", 1e-15: "f"}
+    factor = next((factor for factor in prefixes if size >= factor), 1.0 if size == 0 else 1e-15)
+    return factor, f"{prefixes[factor]}{unit}"
+
+
+def colours_of(names: Iterable[str]) -> dict[str, str]:
+    """Colours in turn, for things that are no models."""
+    return {name: CYCLE[number % len(CYCLE)] for number, name in enumerate(names)}
+
+
+def with_unit(name: str, unit: str) -> str:
+    """The label of an axis, whose quantity may have no unit."""
+    return f"{name}, {unit}" if unit else name

@@ -1,0 +1,78 @@
+"""Figures have one width, one look for each model, and labels that do not cover each other."""
+
+import itertools
+
+import matplotlib
+import numpy as np
+import pytest
+
+from dln_jax.figures import style
+from dln_jax.figures.labels import label_points, spread
+
+# How the colour-blind see linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
+SEEN = {
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "neither": np.eye(3).tolist(),
+}
+TOGETHER = (
+    ("structured-delan", "black-box-delan", "structured-hnn", "black-box-hnn", "trigonometric", "feed-forward"),
+    ("separable-hnn", "black-box-hnn", "polynomial-hamiltonian", "phase-network"),
+    ("pairwise-hnn", "black-box-hnn", "phase-network"),
+)
+"""Models that one figure shows."""
+
+
+def seen_as(colour: str, matrix: list[list[float]]) -> np.ndarray:
+    encoded = np.array(matplotlib.colors.to_rgb(colour))
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(matrix) @ linear, 0, 1)
+    return np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("eyes", SEEN)
+def test_models_of_one_figure_are_told_apart(eyes):
+    for models in TOGETHER:
+        colours = [seen_as(style.colour(name), SEEN[eyes]) for name in models]
+        assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(colours, 2)) > 0.15
+        assert len({style.marker(name) for name in models}) == len(models)
+
+
+def test_a_variant_looks_like_its_model_and_an_unknown_name_is_grey():
+    assert style.colour("structured-delan-64x64") == style.colour("structured-delan")
+    assert style.colour("structured") == style.UNKNOWN[0] and style.colour("truth") == "black"
+
+
+def test_a_figure_is_as_wide_as_a_page_and_settings_stay():
+    before = dict(matplotlib.rcParams)
+    figure, [[axis]] = style.figure(height=2.0)
+    axis.plot([0.0, 1.0], [0.0, 1.0])
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() * figure.dpi == pytest.approx(1080)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_logarithms_are_for_a_decade_or_more_and_prefixes_for_small_numbers():
+    assert style.scale_of([1.0, 5.0]) == "linear" and style.scale_of([1.0, 10.0, np.nan]) == "log"
+    assert style.scale_of([0.0, 10.0]) == "linear" and style.scale_of([]) == "linear"
+    assert style.prefixed(3e-5, "N m") == (1e-6, "µN m") and style.prefixed(5e3, "J") == (1e3, "kJ")
+    assert style.prefixed(0.0, "J") == (1.0, "J") and style.prefixed(1e-18, "J") == (1e-15, "fJ")
+
+
+def test_heights_are_moved_apart_in_order():
+    found = spread({"b": 0.5, "a": 0.5, "c": 0.9, "d": 2.0}, gap=0.1)
+    assert found["c"] == pytest.approx(0.9) and found["d"] == pytest.approx(1.0)
+    assert abs(found["a"] - found["b"]) == pytest.approx(0.1) and (found["a"] + found["b"]) / 2 == pytest.approx(0.5)
+    assert sorted(spread(dict.fromkeys("abcd", 0.0), gap=0.9).values()) == pytest.approx([0, 1 / 3, 2 / 3, 1])
+
+
+def test_labels_of_points_cover_neither_each_other_nor_obstacles():
+    figure, [[axis]] = style.figure(height=2.0)
+    axis.set(xlim=(0, 1), ylim=(0, 1))
+    wall = np.stack([np.full(200, 0.52), np.linspace(0, 1, 200)], axis=-1)
+    label_points(axis, [("one", (0.5, 0.5)), ("two", (0.5, 0.5))], obstacles=wall)
+    figure.draw_without_rendering()
+    one, two = (text.get_window_extent() for text in axis.texts if text.get_text())
+    assert not one.overlaps(two)
+    covered = axis.transData.transform(wall)
+    assert one.count_contains(covered) == two.count_contains(covered) == 0
