@@ -14,9 +14,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, pictures
+from dln_jax.figures import style
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.flow import Flow
-from dln_jax.figures import style
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics.frames import decoded, encoded, physical_energy, physical_states
 from dln_jax.metrics.phase_space import Motions, predict

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from dln_jax import figures
 from dln_jax.command_line.progress import progress
 from dln_jax.datasets.pendulum_frames import FrameSplit
 from dln_jax.figures.training import training_curve

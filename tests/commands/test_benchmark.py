@@ -10,10 +10,9 @@ import pytest
 from calls import command, refused
 
 from dln_jax.commands import benchmark
-from dln_jax.figures.benchmarks import panels, points
+from dln_jax.figures.benchmarks import EXACT, FRONT, cost_panels, cost_points
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
-from dln_jax.figures.benchmarks import EXACT, FRONT, cost_curves, cost_panels, cost_points
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.delan import make_delan
@@ -65,7 +64,9 @@ def test_halving_the_step_of_a_sweep_gains_by_the_order(method, order):
 def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, capsys):
     rows = [Row("a/b", "p50_us", 3.0, "us", None, 2.0), Row("a/b", "ratio", 2.0, "1"), Row("c", "ratio", 4.0, "1")]
     monkeypatch.setitem(
-        SUBJECTS, "scaling", (lambda quick: Findings(rows, {"x": ([1.0, 2.0], [3.0, 4.0])}), SUBJECTS["scaling"][1])
+        SUBJECTS,
+        "scaling",
+        (lambda quick: Findings(rows, {"x": ([1.0, 2.0], [3.0, 4.0], "s")}), SUBJECTS["scaling"][1]),
     )
     command(benchmark, "scaling", "--quick", "--out", str(tmp_path / "out"))
     report = json.loads((tmp_path / "out" / "report.json").read_text())

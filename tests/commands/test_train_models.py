@@ -114,7 +114,7 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     command(train_hnn, *QUICK, "--out", "hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
     H = hamiltonian_of(load_system(workplace / "hamiltonian"))
-    assert np.isfinite(H(np.ones(1), np.ones(1)))
+    assert np.isfinite(H(jnp.ones(1), jnp.ones(1)))
     command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--out", "bare")
     assert "no momenta p in the data" in capsys.readouterr().out
 
