@@ -54,7 +54,13 @@ def no_program_has_options_of_its_own(pytestconfig):
 LONGEST = (
     "test_compilation",
     *("test_softbody_report", "test_train_delan", "test_stability", "test_locomotion", "test_hnn_tasks", "test_pixels"),
-    *("test_soft_body_identification", "test_train_models", "test_gauss_newton", "test_train_diffnet", "test_readme"),
+    *(
+        "test_soft_body_identification",
+        "test_train_models",
+        "test_levenberg_marquardt",
+        "test_train_diffnet",
+        "test_readme",
+    ),
     *("test_minimise", "test_soft_steps", "test_soft_energies", "test_simulate", "test_export_c", "test_delan"),
     "test_arm_table",
     *("test_mechanics", "test_n_body"),

@@ -12,7 +12,7 @@ from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import CONFIG, run_folder, write_json
 from dln_jax.runs.frames import train_into
-from dln_jax.studies.hamiltonian.pixels import RECIPE, pixel_data
+from dln_jax.studies.hamiltonian.pixels import STEPS, pixel_data
 from dln_jax.types import require_positive, require_seed
 
 
@@ -33,7 +33,7 @@ class Arguments(Resumable, Drawn):
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
     require_seed(given.seed)
-    steps = RECIPE.steps if given.steps is None else given.steps
+    steps = STEPS if given.steps is None else given.steps
     require_positive(steps=steps)
     if given.trajectories is not None:
         require_positive(trajectories=given.trajectories)

@@ -17,6 +17,7 @@ import numpy as np
 
 from dln_jax.data import archive
 from dln_jax.data.archive import numeric
+from dln_jax.data.splits import held_out
 from dln_jax.types import InputError, require_positive
 
 KEYS = ("x", "y", "dy", "d2y")
@@ -84,12 +85,8 @@ def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0
 
     For samples that are independent of each other. Raises InputError for a share outside (0, 1), or a single sample.
     """
-    if not 0 < validation_share < 1:
-        raise InputError(f"validation share is {validation_share}; expected a number between 0 and 1")
     samples = len(data.x)
-    if samples < 2:
-        raise InputError(f"there is {samples} sample to train on and to validate by; expected at least 2: add samples")
-    count = min(max(1, round(validation_share * samples)), samples - 1)
+    count = held_out(samples, validation_share, "samples")
     order = np.random.default_rng((seed, samples)).permutation(samples)
     return SampleSplit(train=select(data, np.sort(order[count:])), validation=select(data, np.sort(order[:count])))
 

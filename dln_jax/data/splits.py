@@ -68,13 +68,35 @@ def split(
             "and validation; at least 3 in all are needed: record more, or cut long ones and index the parts"
         )
     require_no_copies(select(data, rest), select(data, test_indices))
-    count = min(max(1, round(validation_share * len(rest))), len(rest) - 1)
-    validation = np.random.default_rng(seed).choice(rest, size=count, replace=False)
-    return Split(
-        train=select(data, np.setdiff1d(rest, validation)),
-        validation=select(data, validation),
-        test=select(data, test_indices),
+    train, validation = hold_out(select(data, rest), validation_share, seed)
+    return Split(train, validation, test=select(data, test_indices))
+
+
+def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories, Trajectories]:
+    """Training and validation trajectories, at least one of each, drawn by the seed.
+
+    Raises:
+        InputError: fewer than two trajectories, a share outside (0, 1), or a seed out of range.
+    """
+    require_seed(seed)
+    present = np.unique(data.trajectory)
+    drawn = np.random.default_rng(seed).choice(
+        present, size=held_out(len(present), share, "trajectories"), replace=False
     )
+    return select(data, np.setdiff1d(present, drawn)), select(data, drawn)
+
+
+def held_out(count: int, share: float, what: str) -> int:
+    """How many of so many are held out for validation: at least one, and at least one is left to train on.
+
+    Raises:
+        InputError: fewer than two, or a share outside (0, 1).
+    """
+    if count < 2:
+        raise InputError(f"there are {count} {what} to train on and to validate by; expected at least 2: add {what}")
+    if not 0 < share < 1:
+        raise InputError(f"validation_share is {share}; expected a number between 0 and 1")
+    return min(max(1, round(share * count)), count - 1)
 
 
 def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[list[str]]:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
-from dln_jax.learning.engine.runs import Progress
+from dln_jax.learning.engine.problem import Progress
 
 LEAST_SHARE = 0.2
 """Of the steps, from which a stage's name is written above it, else upright."""

@@ -1,1 +1,45 @@
-"""Learning: what is made small, and how."""
+"""Learning: problems, what is made small, and the one loop that solves them.
+
+    training = fit(dynamics.problem(model, split(data)), GaussNewton())
+
+`dynamics`, `rates`, `motions`, `frames` and `functions` build problems; what is linear in its parameters needs no loop.
+"""
+
+from dln_jax.learning import dynamics, frames, functions, motions, rates
+from dln_jax.learning.basis_degrees import choose_degrees
+from dln_jax.learning.engine.checkpoint import Checkpoint, identity
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
+from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
+from dln_jax.learning.growth import grow
+from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
+from dln_jax.learning.rates import match_linear
+
+__all__ = [
+    "BOTH_WAYS",
+    "CANONICAL",
+    "TORQUE",
+    "Adam",
+    "Checkpoint",
+    "GaussNewton",
+    "Objective",
+    "Optimiser",
+    "Problem",
+    "Progress",
+    "Stop",
+    "Training",
+    "choose_degrees",
+    "dynamics",
+    "fit",
+    "fit_linear",
+    "frames",
+    "functions",
+    "grow",
+    "identity",
+    "match_linear",
+    "motions",
+    "objective_of",
+    "rates",
+    "suited",
+]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial, grow, significantly_better
-from dln_jax.learning.linear_fit import LinearFit, fit_linear
+from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.learning.objectives import TORQUE, arrays, residuals
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.solvers.normal_equations import count

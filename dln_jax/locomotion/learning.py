@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
-from dln_jax.learning.engine.runs import has_checkpoint, stored_rows
+from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
 from dln_jax.types import InputError

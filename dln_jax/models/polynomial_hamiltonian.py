@@ -5,7 +5,7 @@
 The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacement of each prismatic
 joint, and of cos(n q_j) and sin(n q_j), of degree n, for each revolute joint; without the constant, which no motion
 shows. Hamilton's equations are linear in c, so that rates of states identify it by linear least squares
-(`learning.field_matching.match_linear`). The count of terms grows with the degree to the power of the coordinates.
+(`learning.rates.match_linear`). The count of terms grows with the degree to the power of the coordinates.
 """
 
 import itertools

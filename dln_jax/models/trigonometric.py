@@ -7,7 +7,7 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 
     tau = M qdd + dM/dt qd - ½ d(qdᵀ M qd)/dq + dV/dq + friction * qd
 
-is linear in all parameters, so that a linear least-squares problem identifies them (`learning.linear_fit`), as Atkeson,
+is linear in all parameters, so that a linear least-squares problem identifies them (`learning.linear`), as Atkeson,
 An and Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
 Rigid links on revolute joints are within the basis: V has degree 1 in each angle, and M degree 1 if the chain is
 planar, 2 if not. M is definite only where the data make it so; a singular M gives non-finite accelerations.

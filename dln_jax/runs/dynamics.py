@@ -2,20 +2,25 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.data.splits import merged
 from dln_jax.files import CONFIG, write_json
+from dln_jax.learning import dynamics
 from dln_jax.learning.basis_degrees import choose_degrees
-from dln_jax.learning.dynamics_fit import train, validation_errors
-from dln_jax.learning.engine.runs import Progress, Stop, Training
-from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.engine.checkpoint import Checkpoint
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam
+from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import TORQUE
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target
@@ -43,7 +48,7 @@ def train_into(
     elif given.target is not None:
         task, training = grow_to_target(task, given.target, folder, console, resume=resume)
     else:
-        training = fit(task, folder, seeds=given.seeds, resume=resume)
+        training = train(task, folder, resume=resume)
     if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
         raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
     chosen, best = best_seed(training, given.seeds)
@@ -52,7 +57,7 @@ def train_into(
     if low_latency:
         metrics |= low_latency_metrics(folder, latency_states(task), console.print)
     write_json(folder / "metrics.json", metrics)
-    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": {**task.description, **task.settings._asdict()}})
+    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": chosen(task)})
     console.print(results_table(metrics, task))
     if given.seeds > 1:
         console.print(f"the run keeps seed {given.seed + best}, the best in validation")
@@ -71,24 +76,29 @@ def announce(console: Console, task: Task) -> None:
         console.print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
     if task.kind.endswith("hnn") and task.objective is TORQUE:
         console.print("no momenta p in the data: the Hamiltonian is fitted to torques")
-    if task.kind != "trigonometric":
-        why = f" ({task.optimizer_reason})" if task.optimizer_reason else ""
-        console.print(f"{task.kind}, {task.settings.precision}, {task.settings.optimizer}{why}")
+    if task.optimiser is not None:
+        why = f" ({task.optimiser_reason})" if task.optimiser_reason else ""
+        console.print(f"{task.kind}, {task.precision}, {name_of(task.optimiser)}{why}")
 
 
-def fit(task: Task, folder: Path, *, seeds: int, resume: bool) -> Training:
+def chosen(task: Task) -> dict[str, Any]:
+    """What the arguments came to, for config.json."""
+    optimiser = {} if task.optimiser is None else {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
+    return {**task.description, **optimiser, "seeds": task.seeds}
+
+
+def train(task: Task, folder: Path, *, resume: bool) -> Training:
     """Trains the task's model, one seed or several."""
-    total, first = task.settings.steps, task.settings.seed
+    assert task.problem is not None and task.optimiser is not None
+    total = task.optimiser.steps
+    identity = dynamics.identity_of(task.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
-        return train(
-            build(task.description),
-            task.sets,
-            task.settings,
-            objective=task.objective,
-            seeds=None if seeds == 1 else tuple(range(first, first + seeds)),
-            directory=folder,
-            resume=resume,
+        return fit(
+            task.problem,
+            task.optimiser,
+            checkpoint=Checkpoint(folder, identity, resume),
             report=lambda at: show(min(int(np.max(at.step)), total), shown(at)),
+            seconds=task.seconds,
         )
 
 
@@ -106,13 +116,13 @@ def fit_trigonometric(task: Task, console: Console, *, grown: bool) -> tuple[Tas
         tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
         console.print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
         task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
-    model, dtype = build(task.description), data_type(task.settings.precision)
+    model, dtype = build(task.description), data_type(task.precision)
     fitted = chosen.outcome if chosen is not None else fit_linear(model, task.sets.train)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), fitted.parameters)
     console.print(
         f"least squares: {fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
     )
-    errors = validation_errors(model, task.sets, parameters, task.settings, task.objective)
+    errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)
     at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), time.perf_counter() - began)
     return task, Training(parameters, [at], Stop("finished", 1), 1, 0.0)
 
@@ -136,7 +146,7 @@ def warn(console: Console, task: Task, training: Training, folder: Path) -> None
         console.print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
     if training.stop.reason == "not finite":
         remedy = (
-            "lower --learning-rate or use --precision f64" if task.settings.optimizer == "adam" else "check the data"
+            "lower --learning-rate or use --precision f64" if isinstance(task.optimiser, Adam) else "check the data"
         )
         raise InputError(
             f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"

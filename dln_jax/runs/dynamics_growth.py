@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.table import Table
 
+from dln_jax import learning
 from dln_jax.files import write_json
-from dln_jax.learning.dynamics_fit import train
-from dln_jax.learning.engine.runs import Training
+from dln_jax.learning.engine.checkpoint import Checkpoint
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_results import Task, latency_of
@@ -66,10 +68,15 @@ def _try(task: Task, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Tr
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
     name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"
-    training = train(
-        model, task.sets, task.settings, objective=task.objective, directory=folder, name=name, resume=resume
+    assert task.optimiser is not None
+    identity = learning.dynamics.identity_of(task.optimiser, task.sets, task.objective, seeds=task.seeds)
+    training = fit(
+        learning.dynamics.problem(model, task.sets, task.objective, seeds=task.seeds),
+        task.optimiser,
+        checkpoint=Checkpoint(folder, identity, resume, name),
+        seconds=task.seconds,
     )
-    system = compiled(dynamics(model.energies(training.parameters)), data_type(task.settings.precision))
+    system = compiled(dynamics(model.energies(training.parameters)), data_type(task.precision))
     candidate = Candidate(
         width=wanted["width"],
         depth=wanted["depth"],

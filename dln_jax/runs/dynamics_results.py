@@ -12,8 +12,8 @@ from dln_jax import figures
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, merged
 from dln_jax.files import write_figure
-from dln_jax.learning.dynamics_fit import Settings
-from dln_jax.learning.engine.runs import Training
+from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.learning.objectives import Objective
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
@@ -40,14 +40,26 @@ class Task(NamedTuple):
     description: dict[str, Any]
     """Of the model, for `dln_jax.zoo.kinds.build`."""
     objective: Objective
-    settings: Settings
-    optimizer_reason: str
+    optimiser: Optimiser | None
+    """`None` for the trigonometric model, which is one least-squares problem."""
+    optimiser_reason: str
     """Why the optimiser is the one it is; empty where the user chose."""
+    seeds: int | tuple[int, ...]
+    """One, or several in one program."""
+    problem: Problem | None
+    """What the optimiser solves."""
+    seconds: float
+    """Of training, after which to stop."""
+
+    @property
+    def precision(self) -> str:
+        """f32 or f64, of the model and its training."""
+        return self.description["precision"]
 
 
 def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
     """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
-    dtype = data_type(task.settings.precision)
+    dtype = data_type(task.precision)
     functions = load_run(folder)
     test = task.sets.test
     predicted = predictions(load_system(folder), test, dtype)
@@ -102,7 +114,7 @@ def latency_of(functions: Dynamics | PlainDynamics, task: Task, *, calls: int = 
 
 def latency_states(task: Task) -> tuple[np.ndarray, ...]:
     """q, qd and qdd of the test, in the precision of the model."""
-    test, dtype = task.sets.test, data_type(task.settings.precision)
+    test, dtype = task.sets.test, data_type(task.precision)
     return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
 
 
@@ -134,7 +146,7 @@ def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float
     if len(np.unique(test.trajectory)) == len(test.t):
         return {}
     try:
-        found = rollout_metrics(functions, test, dtype=data_type(task.settings.precision))
+        found = rollout_metrics(functions, test, dtype=data_type(task.precision))
     except InputError as error:
         # The model is trained: what its test cannot tell is left out, not refused.
         print(f"no rollouts: {error}")
@@ -167,7 +179,7 @@ def draw_figures(
         write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, **units))
     if task.scene is not None and task.scene.tip is not None:
         moving = len(np.unique(test.trajectory)) < len(test.t)
-        dtype = data_type(task.settings.precision)
+        dtype = data_type(task.precision)
         found = recorded_motions(functions, test, torques=["interpolated"], dtype=dtype) if moving else {}
         motions, every = found.get("interpolated", []), merged(task.sets)
         paths = figures.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
@@ -204,7 +216,7 @@ def results_table(metrics: dict[str, float], task: Task) -> Table:
     units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
     columns = ("quantity", "value", *(["true plant"] if known else []), "unit")
-    table = Table(*columns, title=f"test on {task.name}, {task.settings.precision}")
+    table = Table(*columns, title=f"test on {task.name}, {task.precision}")
     for column in table.columns[1:-1]:
         column.justify = "right"
 

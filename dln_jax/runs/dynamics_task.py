@@ -1,17 +1,21 @@
 """From options to a task of dynamics: the data, what they need, the model, and how it is trained."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.optimisers import name_of, optimiser_named
 from dln_jax.command_line.options import Limited
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
-from dln_jax.learning.dynamics_fit import Settings, automatic_optimizer, check, check_start
+from dln_jax.learning import dynamics
+from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.problem import require_finite_start
 from dln_jax.learning.objectives import Objective, objective_of
 from dln_jax.runs.dynamics_results import Task
 from dln_jax.scenes.registry import SCENES, scene_named
@@ -22,7 +26,6 @@ from dln_jax.zoo.kinds import build, describe
 
 OF_NETWORKS = ("width", "depth", "activation")
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
-DEFAULT_STEPS = {"adam": 20_000, "gauss-newton": 150}
 
 
 @dataclass(frozen=True)
@@ -93,39 +96,19 @@ def prepare(given: Options, kinds: dict[str, str]) -> Task:
         )
     sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
     objective = objective_of(kind, sets.train)
-    description, settings, reason = model_and_settings(given, kind, sets, needs, objective)
-    check(sets, settings, objective)
-    if kind != "trigonometric":
-        check_start(build(description), sets, settings, objective)
-    return Task(name, kind, sets, scene, needs, origin, description, objective, settings, reason)
-
-
-def model_and_settings(
-    given: Options, kind: str, sets: Split, needs: Needs, objective: Objective
-) -> tuple[dict[str, Any], Settings, str]:
-    """Description of the model, how to train it, and why by that optimiser."""
-    check_options(given, kind)
-    precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
-    if kind == "trigonometric":
-        keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
-        description = describe(kind, sets.train, needs, precision=precision, **keywords)
-        build(description)
-        return description, Settings(precision=precision, seed=given.seed), ""
-    keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
-    require_positive(width=keywords["width"], depth=keywords["depth"])
-    description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    description, optimiser, reason = model_and_optimiser(given, kind, sets, needs, objective)
+    seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
+    seconds = math.inf if given.seconds is None else given.seconds
+    require_positive(seconds=seconds)
     model = build(description)
-    optimizer, reason = given.optimizer, ""
-    if optimizer == "auto":
-        optimizer, reason = automatic_optimizer(model, sets, objective)
-        precision = given.precision or ("f32" if optimizer == "adam" else "f64")
-        description["precision"] = precision
-    if optimizer == "gauss-newton":
-        chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
-        refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
-    defaults = {name: Settings._field_defaults[name] for name in (*OF_ADAM, "seconds", "target")}
-    numbers = resolved(given, {**defaults, "steps": DEFAULT_STEPS[optimizer]})
-    return description, Settings(optimizer=optimizer, precision=precision, seed=given.seed, **numbers), reason
+    everything = dynamics.samples(model, sets, objective)
+    problem = None
+    if optimiser is not None:
+        problem = dynamics.problem(model, sets, objective, seeds=seeds)
+        require_finite_start(problem, everything)
+    return Task(
+        name, kind, sets, scene, needs, origin, description, objective, optimiser, reason, seeds, problem, seconds
+    )
 
 
 def check_options(given: Options, kind: str) -> None:
@@ -164,3 +147,30 @@ def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tup
     if data.needs is not None:
         return data.needs, "the data file"
     return Needs(joints=("revolute",) * data.degrees_of_freedom), "assumed: nothing states the needs"
+
+
+def model_and_optimiser(
+    given: Options, kind: str, sets: Split, needs: Needs, objective: Objective
+) -> tuple[dict[str, Any], Optimiser | None, str]:
+    """Description of the model, its optimiser, and why that one."""
+    check_options(given, kind)
+    precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
+    if kind == "trigonometric":
+        keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
+        description = describe(kind, sets.train, needs, precision=precision, **keywords)
+        return description, None, ""
+    keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
+    require_positive(width=keywords["width"], depth=keywords["depth"])
+    description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    model = build(description)
+    optimizer, reason = given.optimizer, ""
+    if optimizer == "auto":
+        suited, reason = dynamics.suited_optimiser(model, sets, objective)
+        optimizer = name_of(suited)
+        precision = given.precision or ("f32" if optimizer == "adam" else "f64")
+        description["precision"] = precision
+    if optimizer == "gauss-newton":
+        chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
+        refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
+    settings = {name: getattr(given, name) for name in (*OF_ADAM, "steps", "target")}
+    return description, optimiser_named(optimizer, precision=precision, **settings), reason

@@ -9,7 +9,8 @@ from dln_jax.command_line.progress import progress
 from dln_jax.datasets.pendulum_frames import FrameSplit
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
-from dln_jax.learning.engine.runs import Checkpoint, Progress, fingerprint
+from dln_jax.learning.engine.checkpoint import Checkpoint, identity
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.zoo.load_latent import save_latent
 
@@ -39,17 +40,15 @@ def train_into(
     """
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"pixels: {len(data.train.q)} films to train on, {len(data.validation.q)} to select by; {kind}, f32")
-    identity = {
-        "settings": {"model": kind, "seed": seed, "steps": steps},
-        "data": fingerprint([data.train.frames, data.validation.frames]),
-    }
-    with progress(steps) as show:
+    optimiser = pixel_task.optimiser_of(steps)
+    known = identity(optimiser, [data.train.frames, data.validation.frames], model=kind, seed=seed)
+    with progress(optimiser.steps) as show:
         numbers, seen = pixel_task.measure_pixels(
             kind,
             seed=seed,
             steps=steps,
             trajectories=trajectories,
-            checkpoint=Checkpoint(folder, identity, resume),
+            checkpoint=Checkpoint(folder, known, resume),
             report=lambda at: show(at.step, shown(at)),
         )
     save_latent(folder, kind, seen.components, seen.parameters)

@@ -6,9 +6,11 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.learning.regression import LOSSES, WIDTHS, Settings, check
+from dln_jax.learning.engine.optimisers import GaussNewton, Optimiser
+from dln_jax.learning.functions import GAUSS_NEWTON, LOSSES, WIDTHS, Network, published_adam, targets
 from dln_jax.learning.standardisation import Units, own_units, standard_units, to_units
 from dln_jax.nn.activations import ALL
 from dln_jax.types import InputError, require_seed
@@ -80,7 +82,8 @@ class Task(NamedTuple):
     bound: float | None
     """Half the width of the box of the training data, where the shown grid is wider."""
     units: Units
-    settings: Settings
+    network: Network
+    optimiser: Optimiser
     grown: bool
     """Whether the width is chosen by validation."""
 
@@ -88,7 +91,7 @@ class Task(NamedTuple):
 def prepare(given: Options) -> Task:
     """Reads and checks everything that the arguments name, before anything is written."""
     require_seed(given.seed)
-    settings, function, several = settings_from(given), given.function, given.ensemble > 1
+    network, function, several = network_from(given), given.function, given.ensemble > 1
     if function in NAMED:
         generate, grid = NAMED[function]
         bound = np.pi * (SHARE_OF_DATA if several else 1)
@@ -105,10 +108,12 @@ def prepare(given: Options) -> Task:
         data, test = functions.split(everything, seed=given.seed)
         shown, bound, units = test, None, standard_units(data)
     depth = given.depth if given.depth is not None else min(data.inputs, 2)
-    settings = settings._replace(depth=depth)
-    check(to_units(data, units), settings)
-    grown = given.width is None and settings.optimizer == "gauss-newton"
-    return Task(function, functions.split(data, seed=given.seed), test, shown, bound, units, settings, grown)
+    network = network._replace(depth=depth)
+    sets = functions.split(data, seed=given.seed)
+    optimiser = optimiser_from(given, len(sets.train.x), network.precision)
+    targets(to_units(data, units), network)
+    grown = given.width is None and isinstance(optimiser, GaussNewton)
+    return Task(function, sets, test, shown, bound, units, network, optimiser, grown)
 
 
 def of_named(given: Options) -> dict[str, Any]:
@@ -116,13 +121,21 @@ def of_named(given: Options) -> dict[str, Any]:
     return resolved(given, OF_NAMED) if given.function in NAMED else {}
 
 
-def settings_from(given: Options) -> Settings:
-    """The settings that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
+def network_from(given: Options) -> Network:
+    """The network that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
+    newton = given.optimizer == "gauss-newton"
+    own = {"width": WIDTHS[0] if newton else 128, "precision": "f64" if newton else "f32", "depth": 1}
+    defaults = {key: value for key, value in Network._field_defaults.items() if hasattr(given, key)}
+    return Network(**resolved(given, defaults | own), members=given.ensemble)
+
+
+def optimiser_from(given: Options, samples: int, precision: str) -> Optimiser:
+    """The optimiser that the arguments name, for so many samples."""
     newton = given.optimizer == "gauss-newton"
     if newton:
         refuse_given(given, OF_ADAM, "for adam: add --optimizer adam")
     else:
         refuse_given(given, OF_NEWTON, "for gauss-newton")
-    own = {"width": WIDTHS[0] if newton else 128, "precision": "f64" if newton else "f32", "depth": 1}
-    defaults = {key: value for key, value in Settings._field_defaults.items() if hasattr(given, key)}
-    return Settings(**resolved(given, defaults | own), members=given.ensemble)
+    stated = {name: value for name in (*OF_ADAM, *OF_NEWTON) if (value := getattr(given, name)) is not None}
+    own = GAUSS_NEWTON if newton else published_adam(samples, **stated)
+    return optimiser_named(given.optimizer, precision=precision, **{**own._asdict(), **stated})

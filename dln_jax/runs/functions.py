@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import CHOSEN, stored_arguments
 from dln_jax.data.functions import SampleSplit
@@ -16,9 +17,11 @@ from dln_jax.figures import ensembles
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
 from dln_jax.files import CONFIG, write_figure, write_json
-from dln_jax.learning.engine.runs import Checkpoint, Progress, Training, fingerprint, one_after_the_other
+from dln_jax.learning.engine.checkpoint import Checkpoint, identity
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Progress, Training, one_after_the_other
+from dln_jax.learning.functions import WIDTHS, Network, grow_width, train
 from dln_jax.learning.growth import Trial
-from dln_jax.learning.regression import WIDTHS, Settings, grow_width, steps_of, train
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
 from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.metrics.latency import one_step
@@ -37,75 +40,79 @@ def train_into(folder: Path, task: Task, given: Options, *, resume: bool = False
     console = Console(highlight=False, soft_wrap=True)
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
-    settings, training, trials = fit(task, folder, resume=resume, console=console)
-    task = task._replace(settings=settings)
-    write_json(folder / CONFIG, {**stored_arguments(given), CHOSEN: {**settings._asdict(), **of_named(given)}})
+    network, training, trials = fit(task, folder, resume=resume, console=console)
+    task = task._replace(network=network)
+    optimiser = {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
+    chosen = {**network._asdict(), **optimiser, **of_named(given)}
+    write_json(folder / CONFIG, {**stored_arguments(given), CHOSEN: chosen})
     if training.stop.reason == "not finite":
         console.print("the loss stopped being finite; the run keeps the best parameters before that")
     layers = layers_in_own_units(training.parameters, task.units)
-    save_function(folder, layers, activation=task.settings.activation, precision=task.settings.precision)
+    save_function(folder, layers, activation=task.network.activation, precision=task.network.precision)
     metrics = evaluate(folder, task, training)
     if figures:
         draw_figures(folder, task, training, trials)
     write_json(folder / "metrics.json", metrics)
     console.print(results_table(metrics, task))
-    if task.settings.activation == "relu":
+    if task.network.activation == "relu":
         console.print(RELU)
     console.print(f"run folder: {folder}")
 
 
-def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Settings, Training, list[Trial]]:
-    """Trains at the width asked for, or at growing ones: the settings chosen, their training, and all trials."""
+def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Network, Training, list[Trial]]:
+    """Trains at the width asked for, or at growing ones: the network chosen, its training, and all trials."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
-    identity = {"data": fingerprint(array for data in standard for array in data)}
+    optimiser, total = task.optimiser, task.optimiser.steps
+    if isinstance(optimiser, GaussNewton) and optimiser.has_coarse_stage(len(standard.train.x)):
+        total += optimiser.coarse_steps
 
-    def train_one(settings: Settings) -> Training:
-        total = steps_of(task.sets, settings)
-        name = f"checkpoint_width_{settings.width}"
-        checkpoint = Checkpoint(folder, {"settings": settings._asdict(), **identity}, resume, name)
+    def train_one(network: Network) -> Training:
+        known = identity(optimiser, (array for data in standard for array in data), **network._asdict())
+        checkpoint = Checkpoint(folder, known, resume, f"checkpoint_width_{network.width}")
         with progress(total) as show:
             return train(
                 standard,
-                settings,
+                network,
+                optimiser,
                 checkpoint=checkpoint,
-                report=lambda at: show(min(at.step, total), shown(settings, at)),
+                report=lambda at: show(min(at.step, total), shown(network, at)),
             )
 
     if not task.grown:
-        return task.settings, train_one(task.settings), []
-    chosen, trials = grow_width(standard, task.settings, train_one, widths=WIDTHS)
+        return task.network, train_one(task.network), []
+    chosen, trials = grow_width(standard, task.network, train_one, widths=WIDTHS)
     tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
     console.print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
     return chosen.candidate, chosen.outcome, trials
 
 
-def shown(settings: Settings, at: Progress) -> str:
+def shown(network: Network, at: Progress) -> str:
     """A line of progress, with what is trained on what."""
     stage = f", {at.stage}" if at.stage else ""
-    return f"width {settings.width}{stage}: loss {at.loss:.3e}  validation {at.validation:.3e}"
+    return f"width {network.width}{stage}: loss {at.loss:.3e}  validation {at.validation:.3e}"
 
 
 def announce(console: Console, task: Task) -> None:
     """Says what is trained on what."""
-    data, settings = task.sets.train, task.settings
+    data, network = task.sets.train, task.network
     counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
-    terms = ["value", *(["gradient"] if settings.loss == "type1" else []), *(["Hessian"] * (settings.derivative == 2))]
-    width = "grown" if task.grown else str(settings.width)
-    layers = " x ".join([str(data.inputs), *[width] * settings.depth, str(data.outputs)])
-    networks = f"{settings.members} networks" if settings.members > 1 else "network"
+    terms = ["value", *(["gradient"] if network.loss == "type1" else []), *(["Hessian"] * (network.derivative == 2))]
+    width = "grown" if task.grown else str(network.width)
+    layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
+    networks = f"{network.members} networks" if network.members > 1 else "network"
     console.print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
     console.print(
-        f"{networks} {layers}, {settings.activation}; {settings.loss}: {', '.join(terms)}; "
-        f"{settings.optimizer}, {settings.precision}"
+        f"{networks} {layers}, {network.activation}; {network.loss}: {', '.join(terms)}; "
+        f"{name_of(task.optimiser)}, {network.precision}"
     )
-    if settings.activation == "relu" and settings.derivative == 2:
+    if network.activation == "relu" and network.derivative == 2:
         console.print(RELU)
 
 
 def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
     """Loads the stored model as a user would, and measures it on the test samples."""
     loaded = load_function(folder)
-    function = activation(task.settings.activation)
+    function = activation(task.network.activation)
     tested = predictions(loaded.layers, task.test.x, activation=function)
     metrics = errors(tested.mean, task.test)
     spread = predictions(loaded.layers, task.shown.x, activation=function).spread if task.bound is not None else None
@@ -117,7 +124,7 @@ def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
     return {
         **metrics,
         "validation_loss": float(training.validation),
-        "width": task.settings.width,
+        "width": task.network.width,
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.layers)),
         "steps": training.stop.step,
         "best_step": training.best_step,
@@ -131,7 +138,7 @@ def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
 def draw_figures(folder: Path, task: Task, training: Training, trials: list[Trial]) -> None:
     """Writes what fits the number of inputs."""
     inputs, loaded = task.test.inputs, load_function(folder)
-    shown = predictions(loaded.layers, task.shown.x, activation=activation(task.settings.activation))
+    shown = predictions(loaded.layers, task.shown.x, activation=activation(task.network.activation))
     drawn = {"training": training_figure(training, trials)} if training.history else {}
     if inputs == 1:
         drawn["curves"] = drawing.function_curves(task.shown, shown.mean)
@@ -172,7 +179,7 @@ UNITS = {
 
 def results_table(metrics: dict[str, float], task: Task) -> Table:
     """The figures that a user wants to see, with units."""
-    table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.settings.precision}")
+    table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.network.precision}")
     table.columns[1].justify = "right"
     for key, value in metrics.items():
         unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else UNITS.get(key, "")

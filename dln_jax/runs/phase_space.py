@@ -14,7 +14,7 @@ from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
-from dln_jax.learning.engine.runs import Progress
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.phase_space_task import PhaseTask
 from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once, units_of

@@ -6,18 +6,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Limited
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.studies.hamiltonian.tasks import MEASURED, TASKS, Problem, problem_of
 from dln_jax.studies.hamiltonian.training import (
     KINDS,
-    LEARNING_RATE,
     MOTIONS,
     POLYNOMIAL,
     check,
     description_of,
-    settings_of,
     stages_of,
 )
 from dln_jax.types import InputError, require_positive, require_seed
@@ -75,13 +74,11 @@ def prepare(given: Options) -> PhaseTask:
     size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
     description = description_of(problem, given.model, **size)
     check_suited(given, problem, description)
-    training: dict[str, Any] = {
-        "seed": given.seed,
-        "optimizer": "adam" if given.optimizer == "adam" else "gauss-newton",
-        "steps": given.steps,
-        **resolved(given, {"learning_rate": LEARNING_RATE, "seconds": math.inf}),
-    }
-    check(problem, description, settings_of(problem, description, **training))
+    name = "gauss-newton" if given.optimizer == "auto" else given.optimizer
+    optimiser = optimiser_named(name, precision=description["precision"], learning_rate=given.learning_rate)
+    training: dict[str, Any] = {"seed": given.seed, "optimiser": optimiser, "steps": given.steps}
+    training |= resolved(given, {"seconds": math.inf})
+    check(problem, description, seed=given.seed)
     return PhaseTask(problem, description, training)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dln_jax.types import InputError
 
@@ -84,34 +84,31 @@ def check_precision(tree: Any, what: str) -> None:
         )
 
 
-def check_data(
-    sample_residual: SampleResidual, parameters: Any, arrays: tuple[Array, ...], rows: int | None
-) -> tuple[int, int]:
-    """Samples of an iteration, and residuals of a sample.
+def check_data(sample_residual: SampleResidual, parameters: Any, arrays: tuple[Array, ...]) -> tuple[int, int]:
+    """Samples, and residuals of a sample.
 
     Raises:
-        InputError: something is not float64, arrays differ in length, or there are fewer samples than `rows`.
+        InputError: something is not float64, or arrays differ in length.
     """
     check_precision(parameters, "parameters")
     lengths = [array.shape[0] if array.ndim else 0 for array in arrays]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise InputError(f"data arrays have {lengths} samples on axis 0; expected the same positive number in each")
-    if rows is not None and not 1 <= rows <= lengths[0]:
-        raise InputError(f"rows is {rows}; expected 1 to {lengths[0]}, the number of samples")
     residual = jax.eval_shape(sample_residual, parameters, *(array[0] for array in arrays))
     check_precision(residual, "residuals")
-    return rows or lengths[0], residual.size
+    return lengths[0], residual.size
 
 
-def split(arrays: tuple[Array, ...], order: Int[Array, "n"], chunk_size: int) -> Chunks:
-    """The samples `order` of each array, in as few equal chunks of at most `chunk_size` as hold them."""
-    pieces = -(-order.shape[0] // chunk_size)
-    length = -(-order.shape[0] // pieces)
-    fillers = pieces * length - order.shape[0]
-    padded = jnp.concatenate([order, jnp.broadcast_to(order[0], (fillers,))])
-    weights = jnp.concatenate([jnp.ones(order.shape), jnp.zeros(fillers)])
+def split(arrays: tuple[Array, ...], chunk_size: int) -> Chunks:
+    """The samples in as few equal chunks of at most `chunk_size` as hold them; fillers are the first sample."""
+    samples = arrays[0].shape[0]
+    pieces = -(-samples // chunk_size)
+    length = -(-samples // pieces)
+    fillers = pieces * length - samples
+    rows = jnp.concatenate([jnp.arange(samples), jnp.zeros(fillers, int)])
+    weights = jnp.concatenate([jnp.ones(samples), jnp.zeros(fillers)])
     return Chunks(
-        tuple(array[padded].reshape(pieces, length, *array.shape[1:]) for array in arrays),
+        tuple(array[rows].reshape(pieces, length, *array.shape[1:]) for array in arrays),
         weights.reshape(pieces, length),
     )
 

@@ -12,6 +12,7 @@ from dln_jax.command_line.running import stored_arguments
 from dln_jax.commands import hnn_table, train_hnn, train_hnn_task
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.mechanics.flow import Flow
 from dln_jax.metrics.phase_space import Motions
@@ -49,8 +50,8 @@ def quick_prediction(model, parameters, q, p, t):
 
 def quick_training(problem, description, **options):
     """By Adam where rates are matched, whose programs compile sooner."""
-    optimizer = "gauss-newton" if problem.name == hnn_tasks.REAL else "adam"
-    return hnn_models.train(problem, description, optimizer=optimizer, **options)
+    optimiser = GaussNewton() if problem.name == hnn_tasks.REAL else Adam()
+    return hnn_models.train(problem, description, optimiser=optimiser, **options)
 
 
 def quick_pixels(kind):

@@ -40,7 +40,8 @@ from dln_jax.commands import (
 from dln_jax.data import archive, functions, meshes, schema
 from dln_jax.data.splits import split
 from dln_jax.files import CONFIG, LOCK, write_json
-from dln_jax.learning.engine.runs import Checkpoint, Progress, restore, store
+from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.nn import ensembles
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.kinds import build

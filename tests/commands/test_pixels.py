@@ -12,8 +12,10 @@ from dln_jax.datasets import pendulum_frames
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
 from dln_jax.figures import animations
 from dln_jax.figures import frames as frame_figures
-from dln_jax.learning import frame_matching
-from dln_jax.learning.frame_matching import Settings, Weights, match_frames, terms, windows
+from dln_jax.learning import frames as learning_frames
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam
+from dln_jax.learning.frames import Matching, Weights, problem, terms, windows
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -171,8 +173,8 @@ def test_loss_by_hand(relative):
     np.testing.assert_allclose(found.coordinate, np.mean(change**2) / sizes[2], rtol=1e-9)
     by_hand = np.mean((moved - q)[:, 1:] ** 2) / sizes[1] + np.mean((pushed - p)[:, 1:] ** 2) / sizes[2]
     np.testing.assert_allclose(found.field, by_hand / 2, rtol=1e-4)
-    settings = Settings(weights=Weights(2.0, 3.0, 5.0), relative=relative)
-    total = frame_matching.loss(oscillator(scale), settings, {"factor": jnp.array([factor])}, jnp.asarray(frames))
+    matching = Matching(weights=Weights(2.0, 3.0, 5.0), relative=relative)
+    total = learning_frames.loss(oscillator(scale), matching, {"factor": jnp.array([factor])}, jnp.asarray(frames))
     np.testing.assert_allclose(total, 2 * found[0] + 3 * found[1] + 5 * found[2], rtol=1e-9)
 
 
@@ -328,13 +330,16 @@ def test_training_lowers_the_loss(data):
     coefficients = compress(principal_components(data.frames, 8), data.frames)
     model = make_latent_phase(latent_field("hnn", width=6, depth=1), np.zeros(16), width=8, scale=1.5)
     parameters = jax.jit(model.init)(jax.random.key(0))
-    settings = Settings(steps=100, window=3, batch=6, learning_rate=1e-2)
-    training = match_frames(model, coefficients[:5], coefficients[5:], settings)
+    matching = Matching(window=3)
+    training = fit(
+        problem(model, coefficients[:5], coefficients[5:], matching),
+        Adam(steps=100, batch=6, learning_rate=1e-2, steps_per_dispatch=100),
+    )
     held_out = jnp.asarray(windows(coefficients[5:], 4))
-    before = frame_matching.loss(model, settings, parameters, held_out)
+    before = learning_frames.loss(model, matching, parameters, held_out)
     assert training.validation < 0.8 * before
     np.testing.assert_allclose(
-        frame_matching.loss(model, settings, training.parameters, held_out), training.validation, rtol=1e-4
+        learning_frames.loss(model, matching, training.parameters, held_out), training.validation, rtol=1e-4
     )
 
 
@@ -351,9 +356,8 @@ def test_mistakes_are_named(data, untrained, tmp_path):
         (lambda: make_latent_phase(latent_field("hnn"), mean, width=0), "width is 0"),
         (lambda: make_latent_phase(latent_field("hnn"), np.zeros(3)), "mean has 3 pixels"),
         (lambda: principal_components(frames, 0), "components is 0"),
-        (lambda: match_frames(model, frames, frames, Settings(window=1)), "window is 1"),
-        (lambda: match_frames(model, frames, frames, Settings(window=20)), "expected at least the 21 of a window"),
-        (lambda: match_frames(model, frames, frames, Settings(steps=0)), "steps is 0"),
+        (lambda: problem(model, frames, frames, Matching(window=1)), "window is 1"),
+        (lambda: problem(model, frames, frames, Matching(window=20)), "expected at least the 21 of a window"),
         (lambda: frame_figures.inject_energy(baseline, {"field": {}}, mean), "the model has no energy to raise"),
         (lambda: frame_figures.inject_energy(model, parameters, mean, factor=0.0), "factor is 0"),
         (lambda: animations.write_frame_gif(tmp_path / "a.gif", {}, np.zeros(2)), "no motion to show"),

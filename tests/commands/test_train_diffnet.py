@@ -11,7 +11,8 @@ from calls import command, refused
 
 from dln_jax.commands import diffnet_report, diffnet_table, train_diffnet
 from dln_jax.data import functions
-from dln_jax.learning.engine import first_order, runs, second_order
+from dln_jax.learning.engine import checkpoint
+from dln_jax.learning.engine import fit as engine_fit
 from dln_jax.runs import function_task
 from dln_jax.runs import functions as function_runs
 from dln_jax.studies.differential_networks import one_pass, table
@@ -127,7 +128,7 @@ def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, 
     wanted = ("--function", "mine.npz", "--loss", "type2", "--depth", "1", "--optimizer", optimizer)
     monkeypatch.setattr(function_runs, "WIDTHS", (2,))
     command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
-    stored = runs.store
+    stored = checkpoint.store
     left = iter(range(1))
 
     def store_and_die(*arguments):
@@ -135,13 +136,11 @@ def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, 
         if next(left, None) is None:
             raise KeyboardInterrupt
 
-    for module in (first_order, second_order):
-        monkeypatch.setattr(module, "store", store_and_die)
+    monkeypatch.setattr(engine_fit, "store", store_and_die)
     with pytest.raises(SystemExit) as exit_:
         command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "broken")
     assert exit_.value.code == 130 and not (workplace / "broken" / "model.json").exists()
-    for module in (first_order, second_order):
-        monkeypatch.setattr(module, "store", stored)
+    monkeypatch.setattr(engine_fit, "store", stored)
     line = refused(capsys, train_diffnet, "--resume", "--out", "broken", "--seed", "3")
     assert "started with seed = 0; leave --seed out" in line
     command(train_diffnet, "--resume", "--no-figures", "--out", "broken")
@@ -205,7 +204,7 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     """With training stubbed: each row of the published table gets the best of ours and its bound."""
     numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
     costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
-    monkeypatch.setattr(table, "trained", lambda sets, test, settings: {**numbers, **costs})
+    monkeypatch.setattr(table, "trained", lambda *given: {**numbers, **costs})
     command(diffnet_table, "--samples", "50", "--out", "table")
     report = json.loads((workplace / "table" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}

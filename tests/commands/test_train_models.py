@@ -16,7 +16,9 @@ from dln_jax.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.data.splits import split
 from dln_jax.datasets import generators
-from dln_jax.learning.dynamics_fit import Settings, train
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import hamiltonian_of
@@ -136,43 +138,21 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     assert "--target grows one structured network" in line
 
 
-@pytest.mark.parametrize("optimizer", ["adam", "gauss-newton"])
-def test_seeds_in_one_program_equal_single_runs(workplace, optimizer):
+@pytest.mark.parametrize("optimiser", [Adam(12, batch=32), GaussNewton(12)])
+def test_seeds_in_one_program_equal_single_runs(workplace, optimiser):
     sets = split(schema.load("swing.npz"))
     description = describe(
         "structured-delan", sets.train, sets.train.needs, precision="f64", width=3, depth=1, activation="tanh"
     )
     model = build(description)
-    settings = Settings(optimizer=optimizer, precision="f64", steps=12, batch=32)
-    together = train(model, sets, settings, seeds=(4, 7))
+    together = fit(problem(model, sets, seeds=(4, 7)), optimiser)
     for index, seed in enumerate((4, 7)):
-        alone = train(model, sets, settings._replace(seed=seed))
+        alone = fit(problem(model, sets, seeds=seed), optimiser)
         assert np.ravel(together.best_step)[index] == alone.best_step
         assert together.validation[index] == pytest.approx(alone.validation, rel=1e-6)
         ours = jax.tree.map(lambda leaf, index=index: leaf[index], together.parameters)
         for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(alone.parameters), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
-
-
-def test_gauss_newton_resumes_bit_for_bit(workplace, tmp_path):
-    sets = split(schema.load("swing.npz"))
-    keywords = {"width": 3, "depth": 1, "activation": "tanh"}
-    model = build(describe("structured-delan", sets.train, sets.train.needs, precision="f64", **keywords))
-    settings = Settings(optimizer="gauss-newton", precision="f64", steps=12)
-    unbroken = train(model, sets, settings)
-    seen = []
-
-    def stop_after_two(at):
-        seen.append(at)
-        if len(seen) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(model, sets, settings, directory=tmp_path, report=stop_after_two)
-    resumed = train(model, sets, settings, directory=tmp_path, resume=True)
-    assert [at.step for at in resumed.history] == [at.step for at in unbroken.history] == [5, 10, 12]
-    for one, other in zip(jax.tree.leaves(resumed.parameters), jax.tree.leaves(unbroken.parameters), strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):

@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.learning import regression
-from dln_jax.learning.regression import Settings, mean_loss, residual, targets
+from dln_jax.learning import functions as regression
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.functions import GAUSS_NEWTON, Network, mean_loss, published_adam, residual, targets
 from dln_jax.learning.standardisation import layers_in_own_units, own_units, standard_units, to_units
 from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.nn import differential_mlp, ensembles
@@ -144,7 +146,7 @@ SINE = ((jnp.ones((1, 1)), jnp.array([-jnp.pi / 2])), (jnp.ones((1, 1)), jnp.zer
 @pytest.mark.parametrize("derivative", [1, 2])
 def test_an_exact_model_has_no_loss_and_a_wrong_one_that_of_its_terms(loss, derivative):
     grid = functions.sine_grid(points=50)
-    batch = targets(grid, Settings(loss=loss, derivative=derivative, precision="f64"))
+    batch = targets(grid, Network(loss=loss, derivative=derivative, precision="f64"))
     assert float(mean_loss(SINE, batch, activation=cos)) < 1e-30
     terms = 1 + (loss == "type1") + (derivative == 2)
     sample = jax.tree.map(lambda array: array[0], batch)
@@ -161,17 +163,21 @@ def test_settings_that_make_no_sense_are_named():
     for given, changes, message in [
         (data, {"loss": "type3"}, "loss is 'type3'"),
         (data, {"derivative": 3}, "derivative is 3"),
-        (data, {"optimizer": "sgd"}, "optimizer is 'sgd'"),
         (data, {"activation": "sigmoidal"}, "unknown activation"),
-        (data, {"optimizer": "gauss-newton", "precision": "f32"}, "needs f64"),
         (data, {"members": 0}, "members is 0"),
-        (data, {"epochs": -1}, "epochs is -1"),
         (bare, {"loss": "type1"}, "no dy"),
         (bare, {"loss": "type2", "derivative": 2}, "no d2y"),
     ]:
         with pytest.raises(InputError, match=message):
-            regression.check(given, Settings(**changes))
-    regression.check(bare, Settings(loss="type2"))
+            targets(given, Network(**changes))
+    assert targets(bare, Network(loss="type2")).dy is None
+    for call, message in (
+        (lambda: optimiser_named("sgd", precision="f64"), "optimizer is 'sgd'"),
+        (lambda: optimiser_named("gauss-newton", precision="f32"), "needs f64"),
+        (lambda: published_adam(10, epochs=-1), "epochs is -1"),
+    ):
+        with pytest.raises(InputError, match=message):
+            call()
 
 
 def test_a_network_of_standard_units_is_the_same_in_the_users_units():
@@ -210,8 +216,8 @@ def test_metrics_sum_over_components_and_ensembles_average():
 
 def test_gauss_newton_reaches_the_noise_and_selects_by_validation():
     sets = functions.split(functions.sine(samples=1000))
-    settings = Settings(optimizer="gauss-newton", precision="f64", width=4, steps=40)
-    training = regression.train(sets, settings)
+    settings = Network(precision="f64", width=4)
+    training = regression.train(sets, settings, GAUSS_NEWTON)
     predicted = predictions(training.parameters, functions.sine_grid().x, activation=cos).mean
     found = errors(predicted, functions.sine_grid())
     assert found["value_mse"] < 1e-7 and found["hessian_mse"] < 1e-5
@@ -223,15 +229,15 @@ def test_gauss_newton_reaches_the_noise_and_selects_by_validation():
 def test_members_of_an_ensemble_train_as_if_alone():
     """Adam on the sum of losses moves each member as it would move by itself, on the same batches."""
     sets = functions.split(functions.sine(samples=200))
-    settings = Settings(width=3, members=2, epochs=4, batch=20, precision="f64", activation="tanh")
-    together = regression.train(sets, settings)
+    settings = Network(width=3, members=2, precision="f64", activation="tanh")
+    optimiser = published_adam(len(sets.train.x), epochs=4, batch=20)
+    together = regression.train(sets, settings, optimiser)
     first = ensembles.init(jax.random.key(0), (1, 3, 1), members=2)
     assert not np.allclose(*first[0][0])
-    optimiser = regression._by_adam
+    given = regression.problem(sets, settings._replace(members=1), each_member_by_itself=False)
     for index in range(2):
         start = jax.tree.map(lambda leaf, index=index: leaf[index : index + 1], first)
-        ours = [targets(data, settings) for data in sets]
-        alone = optimiser(start, *ours, settings._replace(members=1), None, lambda at: None)
+        alone = fit(given._replace(parameters=start), optimiser)
         assert alone.best_step == together.best_step == 36
         for one, both in zip(jax.tree.leaves(alone.parameters), jax.tree.leaves(together.parameters), strict=True):
             np.testing.assert_allclose(one[0], both[index], rtol=1e-9, atol=1e-12)
@@ -239,7 +245,7 @@ def test_members_of_an_ensemble_train_as_if_alone():
 
 def test_a_network_learns_from_hessians_alone_what_relu_cannot():
     grid = functions.sine_grid(points=20)
-    settings = Settings(loss="type2", derivative=2, precision="f64")
+    settings = Network(loss="type2", derivative=2, precision="f64")
     layers = differential_mlp.init(jax.random.key(0), (1, 8, 1))
     batch = targets(grid, settings)._replace(y=None, dy=None)
 

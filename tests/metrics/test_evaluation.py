@@ -9,7 +9,7 @@ import pytest
 
 from dln_jax import figures
 from dln_jax.datasets import generators
-from dln_jax.learning.engine.runs import Progress, one_after_the_other
+from dln_jax.learning.engine.problem import Progress, one_after_the_other
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step

@@ -1,1 +1,1 @@
-"""The optimisers' loops: resumable at any dispatch, the best parameters by validation."""
+"""The one loop of all trainings: `fit`, its optimisers as records, and how a run is stored."""

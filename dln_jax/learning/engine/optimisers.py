@@ -1,41 +1,113 @@
-"""First-order optimisers."""
+"""The optimisers that `fit` takes, as records of all their settings, and which of them suits a problem."""
 
 import math
+from typing import Any, NamedTuple
 
 import optax
 
+from dln_jax.solvers.levenberg_marquardt import CHUNK
+from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
 
-
-def check_adamw(*, learning_rate: float, weight_decay: float = 0.0) -> None:
-    """Raises `InputError` unless the rate is positive, the decay is not negative, and both are finite."""
-    require_positive(learning_rate=learning_rate)
-    for name, value in (("learning_rate", learning_rate), ("weight_decay", weight_decay)):
-        if not 0 <= value < math.inf:
-            raise InputError(f"{name} is {value}; expected a finite number, zero or positive")
+MOST_PARAMETERS = 2_000
+"""Above, an iteration's P³ is more than a thousand steps of Adam: `suited` prefers those."""
+MOST_BYTES = 2**31
+"""Of the normal equations and a piece of the Jacobian, for `suited`."""
 
 
-def adamw(
-    *,
-    steps: int,
-    learning_rate: float = 5e-3,
-    weight_decay: float = 1e-5,
-    second_moment_decay: float = 0.99,
-    warm_up_share: float = 0.02,
-    final_share: float = 1e-3,
-) -> optax.GradientTransformation:
-    """AdamW with linear warm-up to `learning_rate` and cosine decay to `final_share` of it after `steps` steps.
+class Adam(NamedTuple):
+    """AdamW on minibatches: linear warm-up of the rate, then cosine decay.
 
     The default decay of the second moment forgets within a hundred steps; residuals shrink by orders of magnitude
     during a run, and a longer memory keeps the steps too small (validation torque MSE 9e-7, against 4e-6 with
     0.999 and the best of three learning rates).
     """
-    warm_up = max(1, round(warm_up_share * steps))
-    schedule = optax.warmup_cosine_decay_schedule(
-        init_value=learning_rate / warm_up,
-        peak_value=learning_rate,
-        warmup_steps=warm_up,
-        decay_steps=max(steps, warm_up + 1),
-        end_value=final_share * learning_rate,
-    )
-    return optax.adamw(schedule, b2=second_moment_decay, weight_decay=weight_decay)
+
+    steps: int = 20_000
+    """Rounded up to whole epochs."""
+    batch: int = 512
+    """Samples of a step, drawn without replacement; at most all of them."""
+    learning_rate: float = 5e-3
+    """The largest."""
+    weight_decay: float = 1e-5
+    """Decoupled."""
+    patience: int = 10_000
+    """Steps without a lower score after which training stops."""
+    second_moment_decay: float = 0.99
+    warm_up_share: float = 0.02
+    """Of the steps; 0 with a final share of 1 is a constant rate."""
+    final_share: float = 1e-3
+    """Of the rate, after the last step."""
+    steps_per_dispatch: int = 200
+    """Between two scores; rounded up to whole epochs."""
+
+
+class GaussNewton(NamedTuple):
+    """Levenberg-Marquardt on all samples at once, in float64.
+
+    With many more samples than parameters, the first iterations need not see them all: a run may start on a part of
+    them, at a fraction of the cost, and end on all.
+    """
+
+    steps: int = 150
+    """Iterations on all samples, at most."""
+    coarse_steps: int = 0
+    """Iterations before, at most, on `coarse_samples`."""
+    coarse_samples: int = 2_048
+    """The first ones, so they must be in random order. Sets of less than twice as many skip that stage."""
+    improvement: float = 0.0
+    """Relative decrease of the loss in an iteration at which a stage ends."""
+    target: float = -math.inf
+    """Score at which to stop; of several seeds the worst counts."""
+    steps_per_dispatch: int = 5
+    """Iterations between two scores."""
+
+    def has_coarse_stage(self, samples: int) -> bool:
+        """Whether a run on so many samples starts on a part of them."""
+        return self.coarse_steps > 0 and samples >= 2 * self.coarse_samples
+
+
+Optimiser = Adam | GaussNewton
+
+
+def check(optimiser: Optimiser) -> None:
+    """Raises `InputError` for settings out of range."""
+    require_positive(steps=optimiser.steps, steps_per_dispatch=optimiser.steps_per_dispatch)
+    if isinstance(optimiser, GaussNewton):
+        require_positive(coarse_samples=optimiser.coarse_samples)
+        if optimiser.coarse_steps < 0:
+            raise InputError(f"coarse_steps is {optimiser.coarse_steps}; expected 0 for none or a positive number")
+        return
+    require_positive(batch=optimiser.batch, patience=optimiser.patience, learning_rate=optimiser.learning_rate)
+    for name in ("learning_rate", "weight_decay"):
+        if not 0 <= (value := getattr(optimiser, name)) < math.inf:
+            raise InputError(f"{name} is {value}; expected a finite number, zero or positive")
+
+
+def transformation(adam: Adam) -> optax.GradientTransformation:
+    """AdamW of these settings."""
+    rate = adam.learning_rate
+    if (adam.warm_up_share, adam.final_share) != (0, 1):
+        warm_up = max(1, round(adam.warm_up_share * adam.steps))
+        rate = optax.warmup_cosine_decay_schedule(
+            init_value=adam.learning_rate / warm_up,
+            peak_value=adam.learning_rate,
+            warmup_steps=warm_up,
+            decay_steps=max(adam.steps, warm_up + 1),
+            end_value=adam.final_share * adam.learning_rate,
+        )
+    return optax.adamw(rate, b2=adam.second_moment_decay, weight_decay=adam.weight_decay)
+
+
+def suited(parameters: Any, samples: int, residuals: int) -> tuple[type[Adam] | type[GaussNewton], str]:
+    """The optimiser for parameters of these shapes, and why, in a sentence.
+
+    Gauss-Newton takes P parameters to 1e-8 and below in seconds while its P x P equations are small; Adam's steps grow
+    with P only.
+    """
+    size = count(parameters)
+    needed = jacobian_bytes(parameters, samples, residuals, chunk_size=CHUNK, keep=False)
+    if size <= MOST_PARAMETERS and needed <= MOST_BYTES:
+        return GaussNewton, f"{size:,} parameters: the normal equations take {needed / 2**20:,.0f} MiB"
+    limit = f"{MOST_PARAMETERS:,} parameters" if size > MOST_PARAMETERS else f"{MOST_BYTES / 2**30:.0f} GiB"
+    return Adam, f"{size:,} parameters need {needed / 2**20:,.0f} MiB of normal equations; the limit is {limit}"

@@ -11,9 +11,11 @@ from jax import Array
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
 from dln_jax.datasets import generators
-from dln_jax.learning.dynamics_fit import Settings, train
-from dln_jax.learning.engine.runs import Training
-from dln_jax.learning.linear_fit import LinearFit, fit_linear
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.engine.problem import Training
+from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.learning.objectives import TORQUE, objective_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import Driven, dynamics
@@ -156,8 +158,9 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Driven]]:
     """Gauss-Newton on several seeds in one program, and the energies of each."""
-    model, settings = prepared(kind, sets, SIZES[kind], steps)
-    training = train(model, sets, settings, objective=objective_of(kind, sets.train), seeds=tuple(range(seeds)))
+    model, optimiser = prepared(kind, sets, SIZES[kind], steps)
+    objective = objective_of(kind, sets.train)
+    training = fit(problem(model, sets, objective, seeds=tuple(range(seeds))), optimiser)
     each = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
     return training, [model.energies(parameters) for parameters in each]
 
@@ -176,7 +179,7 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
     """The published protocol: one seed, two layers of 64, batch 512, float32."""
     model = build(described(kind, sets.train, precision="f32", width=64, depth=2))
-    training = train(model, sets, Settings(steps=steps), objective=objective_of(kind, sets.train))
+    training = fit(problem(model, sets, objective_of(kind, sets.train)), Adam(steps=steps))
     energies = model.energies(training.parameters)
     system = compiled(dynamics(energies), jnp.float32)
     numbers = {
@@ -195,19 +198,19 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
     Also the cost of ten seeds in one program in units of a single run, compilation included.
     """
     kind = "structured-delan"
-    model, settings = prepared(kind, sets, SIZES[kind], steps)
+    model, optimiser = prepared(kind, sets, SIZES[kind], steps)
     times: dict[float, list[float]] = {target: [] for target in TARGETS}
     final, singles = [], []
     for seed in range(seeds):
         jax.clear_caches()
-        training = train(model, sets, settings._replace(seed=seed))
+        training = fit(problem(model, sets, seeds=seed), optimiser)
         for target in TARGETS:
             reached = [at.seconds for at in training.history if at.monitor <= target]
             times[target].append(training.compile_seconds + reached[0] if reached else float("inf"))
         final.append(torque_mse(dynamics(model.energies(training.parameters)), sets.test))
         singles.append(training.compile_seconds + training.train_seconds)
     jax.clear_caches()
-    ten = train(model, sets, settings, seeds=tuple(range(10)))
+    ten = fit(problem(model, sets, seeds=tuple(range(10))), optimiser)
     return {
         **{f"seconds_to_{target:g}": float(np.median(values)) for target, values in times.items()},
         "torque_mse": float(np.median(final)),
@@ -217,10 +220,10 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
     }, None
 
 
-def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Model, Settings]:
-    """The model of a kind, and Gauss-Newton's settings for it."""
+def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Model, GaussNewton]:
+    """The model of a kind, and its optimiser."""
     model = build(described(kind, sets.train, width=size.width, depth=size.depth, activation=size.activation))
-    return model, Settings(optimizer="gauss-newton", precision="f64", steps=steps or size.steps)
+    return model, GaussNewton(steps=steps or size.steps)
 
 
 def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:

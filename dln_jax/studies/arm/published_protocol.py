@@ -12,7 +12,9 @@ import numpy as np
 
 from dln_jax.command_line.progress import progress
 from dln_jax.data.splits import Split
-from dln_jax.learning.dynamics_fit import Settings, train
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
@@ -42,19 +44,18 @@ def cases(name: str, sets: Sequence[Split], *, steps: int) -> list[Case]:
     found = [Case(f"textbook/{two_link_arm().name}", partial(textbook, two_link_arm()))]
     for seed, each in enumerate(sets):
         case = f"{KIND}/{name}/seed-{seed}"
-        found.append(Case(case, partial(trained, case, each, Settings(steps=steps, seed=seed))))
+        found.append(Case(case, partial(trained, case, each, seed=seed, steps=steps)))
     return found
 
 
-def trained(case: str, sets: Split, settings: Settings) -> Findings:
+def trained(case: str, sets: Split, *, seed: int, steps: int) -> Findings:
     """Trains one seed and measures everything that the published table has."""
-    model = build(described(KIND, sets.train, precision=settings.precision, width=64, depth=2))
-    with progress(settings.steps) as show:
-        training = train(
-            model,
-            sets,
-            settings,
-            report=lambda at: show(min(int(at.step), settings.steps), f"{case}  loss {at.loss:.2e}"),
+    model = build(described(KIND, sets.train, precision="f32", width=64, depth=2))
+    with progress(steps) as show:
+        training = fit(
+            problem(model, sets, seeds=seed),
+            Adam(steps=steps),
+            report=lambda at: show(min(int(at.step), steps), f"{case}  loss {at.loss:.2e}"),
         )
     energies = model.energies(training.parameters)
     system = compiled(dynamics(energies), jnp.float32)

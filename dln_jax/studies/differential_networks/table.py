@@ -11,7 +11,17 @@ from rich.table import Table
 
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
-from dln_jax.learning.regression import WIDTHS, Settings, check, grow_width, train
+from dln_jax.learning.engine import optimisers
+from dln_jax.learning.engine.optimisers import Adam, Optimiser
+from dln_jax.learning.functions import (
+    GAUSS_NEWTON,
+    WIDTHS,
+    Network,
+    grow_width,
+    published_adam,
+    targets,
+    train,
+)
 from dln_jax.metrics.functions import errors, predictions
 from dln_jax.nn.activations import activation
 from dln_jax.studies.case import Case, Findings, by_case, measure, rows_of, say_numbers, stored_findings
@@ -72,41 +82,48 @@ def cases(given: Extent = Extent()) -> list[Case]:  # noqa: B008  a tuple
     for optimizer, function, loss, name in itertools.product(OPTIMIZERS, problems, LOSSES, ACTIVATIONS):
         if (optimizer, name) == ("gauss-newton", "relu"):
             continue
-        case, chosen = f"{function}/{loss}/{name}/{optimizer}", settings(given, function, loss, name, optimizer)
-        check(problems[function][0], chosen)
-        job = partial(findings, case, *problems[function], chosen)
+        data, test = problems[function]
+        sets = functions.split(data, seed=given.seed)
+        network, optimiser = network_of(given, function, loss, name, optimizer), optimiser_of(given, sets, optimizer)
+        targets(data, network)
+        optimisers.check(optimiser)
+        case = f"{function}/{loss}/{name}/{optimizer}"
+        job = partial(findings, case, sets, test, network, optimiser)
         found.append(Case(case, job, {case: (*QUANTITIES, "width", "job_seconds")}))
     return found
 
 
-def findings(case: str, data: FunctionSamples, test: FunctionSamples, settings: Settings) -> Findings:
+def findings(case: str, sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> Findings:
     """The numbers of one network."""
-    return Findings(rows_of(case, trained(functions.split(data, seed=settings.seed), test, settings)))
+    return Findings(rows_of(case, trained(sets, test, network, optimiser)))
 
 
-def settings(given: Extent, function: str, loss: str, name: str, optimizer: str) -> Settings:
-    """The published recipe, or Gauss-Newton on a small network of as many layers."""
-    depth = 1 if function == "sin" else 2
-    common = Settings(loss=loss, activation=name, depth=depth, seed=given.seed, epochs=given.epochs)
+def network_of(given: Extent, function: str, loss: str, name: str, optimizer: str) -> Network:
+    """The published network, or for Gauss-Newton a small one of as many layers."""
+    published = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=given.seed)
+    return published if optimizer == "adam" else published._replace(width=WIDTHS[0], precision="f64")
+
+
+def optimiser_of(given: Extent, sets: SampleSplit, optimizer: str) -> Optimiser:
+    """The published recipe, or Gauss-Newton."""
     if optimizer == "adam":
-        return common
-    iterations = {"steps": given.steps, "coarse_steps": given.coarse_steps}
-    return common._replace(optimizer=optimizer, width=WIDTHS[0], precision="f64", **iterations)
+        return published_adam(len(sets.train.x), epochs=given.epochs)
+    return GAUSS_NEWTON._replace(steps=given.steps, coarse_steps=given.coarse_steps)
 
 
-def trained(sets: SampleSplit, test: FunctionSamples, settings: Settings) -> dict[str, float]:
+def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> dict[str, float]:
     """Trains one network, at the width that validation chooses or the published one, and measures it on the grid."""
     began = time.perf_counter()
-    if settings.optimizer == "gauss-newton":
-        chosen, trials = grow_width(sets, settings, lambda candidate: train(sets, candidate))
-        settings, training, every = chosen.candidate, chosen.outcome, [trial.outcome for trial in trials]
-    else:
-        training = train(sets, settings)
+    if isinstance(optimiser, Adam):
+        training = train(sets, network, optimiser)
         every = [training]
-    predicted = predictions(training.parameters, test.x, activation=activation(settings.activation))
+    else:
+        chosen, trials = grow_width(sets, network, lambda candidate: train(sets, candidate, optimiser))
+        network, training, every = chosen.candidate, chosen.outcome, [trial.outcome for trial in trials]
+    predicted = predictions(training.parameters, test.x, activation=activation(network.activation))
     return {
         **errors(predicted.mean, test),
-        "width": settings.width,
+        "width": network.width,
         "train_seconds": sum(each.train_seconds for each in every),
         "compile_seconds": sum(each.compile_seconds for each in every),
         "job_seconds": time.perf_counter() - began,

@@ -17,8 +17,12 @@ from dln_jax.figures.animations import write_frame_gif
 from dln_jax.figures.frames import inject_energy, injection_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
-from dln_jax.learning.engine.runs import Checkpoint, Progress, Report, Training, silent
-from dln_jax.learning.frame_matching import Settings, Weights, loss, match_frames, windows
+from dln_jax.learning import frames as learning_frames
+from dln_jax.learning.engine.checkpoint import Checkpoint
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam
+from dln_jax.learning.engine.problem import Progress, Report, Training, silent
+from dln_jax.learning.frames import Matching, Weights, loss, windows
 from dln_jax.metrics.frames import FrameMotions, energy_errors, energy_floor, frame_errors, late_energy_errors, recoded
 from dln_jax.metrics.phase_space import summary
 from dln_jax.models.latent_phase import LatentModel
@@ -27,10 +31,11 @@ from dln_jax.models.principal_components import Components, compress, principal_
 from dln_jax.zoo.load_latent import build_latent
 
 KINDS = ("hnn", "baseline")
-RECIPE = Settings(weights=Weights(field=10.0))
+MATCHING = Matching(weights=Weights(field=10.0))
 """The same for both models. Weight, components and length of training were chosen with seed 0 by validation films; one
 step at a time, the published form, in place of windows of ten steps, with which both models were alike (1e-6 J² over a
 hundred frames, their decoder's error), with numbers of test films in view."""
+STEPS = 12_000
 
 
 COMPONENTS = 32
@@ -65,9 +70,15 @@ def train_pixels(
     report: Report = silent,
 ) -> Training:
     """The fit of a model of coefficients."""
-    settings = RECIPE._replace(seed=seed, steps=steps or RECIPE.steps)
     fitted, held_out = (compress(components, part.frames) for part in (data.train, data.validation))
-    return match_frames(model, fitted, held_out, settings, checkpoint=checkpoint, report=report)
+    problem = learning_frames.problem(model, fitted, held_out, MATCHING, seed=seed)
+    return fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)
+
+
+def optimiser_of(steps: int | None = None) -> Adam:
+    """The same for both models, by default for `STEPS`."""
+    steps = steps or STEPS
+    return Adam(steps=steps, batch=50, learning_rate=2e-3, patience=steps, steps_per_dispatch=100)
 
 
 def measure_pixels(
@@ -87,8 +98,8 @@ def measure_pixels(
     training = train_pixels(inner, components, data, seed=seed, steps=steps, checkpoint=checkpoint, report=report)
     parameters = training.parameters
     numbers, motions = frame_errors(model, parameters, data.test)
-    tested = jnp.asarray(windows(compress(components, data.test.frames), RECIPE.window + 1))
-    numbers["test_loss"] = float(jax.jit(functools.partial(loss, inner, RECIPE))(parameters, tested))
+    tested = jnp.asarray(windows(compress(components, data.test.frames), MATCHING.window + 1))
+    numbers["test_loss"] = float(jax.jit(functools.partial(loss, inner, MATCHING))(parameters, tested))
     numbers["autoencoder_energy_mse"] = float(np.mean(energy_errors(recoded(model, parameters, data.test), data.test)))
     numbers |= summary("late_energy_mse", late_energy_errors(model, parameters, data.test))
     numbers["energy_floor"] = energy_floor(data.test)

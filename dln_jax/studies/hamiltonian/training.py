@@ -5,7 +5,6 @@ trajectories with free starts, which takes away the bias of the noise. The other
 alone. Measurements have no rates, only finite differences for a first fit: the result is that to trajectories.
 """
 
-import json
 import math
 import time
 from pathlib import Path
@@ -15,21 +14,22 @@ import numpy as np
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import PER_SAMPLE
-from dln_jax.learning import field_matching, trajectory_matching
-from dln_jax.learning.engine.runs import (
-    Checkpoint,
+from dln_jax.data.splits import PER_SAMPLE, hold_out
+from dln_jax.learning import motions, rates
+from dln_jax.learning.engine.checkpoint import Checkpoint, identity
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
+from dln_jax.learning.engine.problem import (
     Progress,
     Report,
     Training,
-    fingerprint,
     one_after_the_other,
+    require_finite_start,
     silent,
 )
-from dln_jax.learning.engine.second_order import Budget
-from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
 from dln_jax.learning.growth import grow
-from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories
+from dln_jax.learning.motions import Weights, cut_windows
+from dln_jax.learning.rates import match_linear
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, WINDOW, Problem
 from dln_jax.types import InputError
 from dln_jax.zoo.phase_kinds import build_phase, describe_phase
@@ -50,8 +50,8 @@ KINDS = {
 DEGREES = range(2, 7)
 RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
-LEARNING_RATE = 5e-3
-"""Of Adam."""
+WINDOWS_OF_A_STEP = 64
+"""Of Adam, when it fits motions."""
 VALIDATION_SHARE = 0.15
 """Of the trajectories for training."""
 
@@ -168,40 +168,15 @@ def stages_of(problem: Problem, description: dict[str, Any], steps: int | None =
     return {**rates, **({MOTIONS: steps or recipe.trajectory_steps} if recipe.trajectory_steps else {})}
 
 
-def settings_of(
-    problem: Problem,
-    description: dict[str, Any],
-    *,
-    seed: int,
-    optimizer: str = "gauss-newton",
-    steps: int | None = None,
-    learning_rate: float = LEARNING_RATE,
-    seconds: float = math.inf,
-) -> Settings:
-    """How the rates are fitted; `check` and `train` take it."""
+def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
+    """Raises `InputError` for all that `train` would refuse in the data."""
     recipe = RECIPES[problem.name]
-    return Settings(
-        optimizer=optimizer,
-        precision=description["precision"],
-        steps=steps or recipe.steps,
-        samples=recipe.samples,
-        seconds=seconds,
-        learning_rate=learning_rate,
-        validation_share=VALIDATION_SHARE,
-        seed=seed,
-    )
-
-
-def check(problem: Problem, description: dict[str, Any], settings: Settings) -> None:
-    """Raises `InputError` for all that `train` would refuse."""
-    recipe = RECIPES[problem.name]
-    field_matching.check(problem.fitted, settings)
-    field_matching.check_start(build_phase(description), problem.fitted, settings)
+    parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
+    fitted = rates.problem(build_phase(description), *parts, seed=seed, most_samples=recipe.samples)
+    require_finite_start(fitted, rates.samples(problem.fitted))
     if recipe.trajectory_steps:
-        parts = hold_out(problem.fitted, VALIDATION_SHARE, settings.seed)
-        weights = recipe.weights or deviations(parts[0])
         windows, validation = (cut_windows(part, recipe.window) for part in parts)
-        trajectory_matching.check(windows, validation, weights)
+        motions.arrays(windows, validation, recipe.weights or deviations(parts[0]))
 
 
 def train(
@@ -209,66 +184,71 @@ def train(
     description: dict[str, Any],
     *,
     seed: int,
-    optimizer: str = "gauss-newton",
+    optimiser: Optimiser = GaussNewton(),  # noqa: B008
     steps: int | None = None,
-    learning_rate: float = LEARNING_RATE,
     seconds: float = math.inf,
     directory: Path | None = None,
     resume: bool = False,
     report: Report = silent,
 ) -> Trained:
-    """Fits a model to rates, and then to trajectories where the recipe says so.
+    """Fits a model to rates, and then to trajectories where the recipe says so, by as many steps as it or `steps` says.
 
     `seconds` are those of both, compilation included. Where they are over after the rates, or the fit of motions is not
     finite from its start, the fit of rates is the result.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build_phase(description)
-    settings = settings_of(
-        problem,
-        description,
-        seed=seed,
-        optimizer=optimizer,
-        steps=steps,
-        learning_rate=learning_rate,
-        seconds=seconds,
-    )
-    # As JSON reads it back, lists for tuples, so that a resumed run is recognised.
-    stated = json.loads(json.dumps({**settings._asdict(), "model": description, "seconds": None}))
-    numbers = fingerprint(getattr(problem.fitted, key) for key in PER_SAMPLE)
+    numbers = [getattr(problem.fitted, key) for key in PER_SAMPLE]
 
-    def checkpoint(name: str) -> Checkpoint | None:
-        identity = {"settings": stated, "data": numbers}
-        return None if directory is None else Checkpoint(directory, identity, resume, f"checkpoint_{name}")
+    def checkpoint(name: str, optimiser: Optimiser) -> Checkpoint | None:
+        if directory is None:
+            return None
+        known = identity(optimiser, numbers, model=description, seed=seed, samples=recipe.samples)
+        return Checkpoint(directory, known, resume, f"checkpoint_{name}")
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     if description["kind"] == KINDS[POLYNOMIAL]:
-        rates = match_linear(model, parts[0], validation=parts[1])[0]
+        first = match_linear(model, parts[0], validation=parts[1])[0]
     else:
-        at_rates = _of_stage(RATES, report)
-        rates = match_field(model, problem.fitted, settings, checkpoint=checkpoint("rates"), report=at_rates)
-    fits = {RATES: _named(RATES, rates)}
+        own = _with_steps(optimiser, steps or recipe.steps)
+        first = fit(
+            rates.problem(model, *parts, seed=seed, most_samples=recipe.samples),
+            own,
+            checkpoint=checkpoint("rates", own),
+            report=_of_stage(RATES, report),
+            seconds=seconds,
+        )
+    fits = {RATES: _named(RATES, first)}
     left = seconds - (time.perf_counter() - began)
-    if not recipe.trajectory_steps or rates.stop.reason == "not finite":
-        return Trained(description, fits, _ending(RATES, rates), rates.stop.reason == "not finite")
-    if rates.stop.reason == "time" or left <= 0:
+    if not recipe.trajectory_steps or first.stop.reason == "not finite":
+        return Trained(description, fits, _ending(RATES, first), first.stop.reason == "not finite")
+    if first.stop.reason == "time" or left <= 0:
         return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
-    windows = (cut_windows(part, recipe.window) for part in parts)
-    first_order = trajectory_matching.Adam(learning_rate=learning_rate, seed=seed)
-    motions = match_trajectories(
-        model,
-        rates.parameters,
-        *windows,
-        weights=recipe.weights or deviations(parts[0]),
-        budget=Budget(steps or recipe.trajectory_steps, seconds=left),
-        adam=first_order if optimizer == "adam" else None,
-        substeps=recipe.substeps,
-        checkpoint=checkpoint("trajectories"),
+    windows, validation = (cut_windows(part, recipe.window) for part in parts)
+    weights = recipe.weights or deviations(parts[0])
+    own = _with_steps(optimiser, steps or recipe.trajectory_steps)
+    own = own._replace(batch=WINDOWS_OF_A_STEP) if isinstance(own, Adam) else own
+    second = fit(
+        motions.problem(
+            model, first.parameters, windows, validation, weights=weights, substeps=recipe.substeps, seed=seed
+        ),
+        own,
+        checkpoint=checkpoint("trajectories", own),
         report=_of_stage(MOTIONS, report),
+        seconds=left,
+        must_start=False,
     )
-    if motions.stop.step and np.isfinite(motions.validation):
-        fits[MOTIONS] = _named(MOTIONS, motions)
-    return Trained(description, fits, _ending(MOTIONS, motions), motions.stop.reason == "not finite")
+    second = second._replace(parameters=second.parameters["model"])
+    if second.stop.step and np.isfinite(second.validation):
+        fits[MOTIONS] = _named(MOTIONS, second)
+    return Trained(description, fits, _ending(MOTIONS, second), second.stop.reason == "not finite")
+
+
+def _with_steps(optimiser: Optimiser, steps: int) -> Optimiser:
+    """So many steps, all of them."""
+    if isinstance(optimiser, Adam):
+        return optimiser._replace(steps=steps, patience=steps)
+    return optimiser._replace(steps=steps)
 
 
 def _of_stage(stage: str, report: Report) -> Report:

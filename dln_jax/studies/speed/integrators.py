@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import cost_panels
+from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
@@ -69,7 +70,7 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
 
     If quick, by a few steps of Adam, whose program compiles sooner.
     """
-    options = {"optimizer": "adam", "steps": 50} if quick else {}
+    options = {"optimiser": Adam(), "steps": 50} if quick else {}
     trained = train(problem, description_of(problem, "hnn"), seed=0, **options)
     return hamiltonian_of(build_phase(trained.description).energies(trained.result.parameters))
 

@@ -12,8 +12,10 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
 from dln_jax.figures.benchmarks import EXACT, cost_points
-from dln_jax.learning.dynamics_fit import Settings, train
-from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.studies.arm.data import letters, published_split
@@ -88,9 +90,8 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     if kind == TRIGONOMETRIC:
         parameters = fit_linear(model, sets.train).parameters
     else:
-        optimizer = "adam" if wide else "gauss-newton"
-        settings = Settings(optimizer=optimizer, precision=precision, steps=max(5, steps // 100) if quick else steps)
-        parameters = train(model, sets, settings, objective=objective_of(kind, sets.train)).parameters
+        optimiser = (Adam if wide else GaussNewton)(steps=max(5, steps // 100) if quick else steps)
+        parameters = fit(problem(model, sets, objective_of(kind, sets.train)), optimiser).parameters
     save_model(folder, description, parameters)
     return folder
 

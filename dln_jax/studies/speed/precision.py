@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.figures.benchmarks import cost_points
-from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.models.model import Model, Parameters

@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
 from dln_jax.figures.benchmarks import error_against_time
-from dln_jax.learning.dynamics_fit import train
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import (
@@ -67,8 +68,8 @@ def linear_alone(sets: Split) -> Measured:
 
 def gauss_newton_alone(sets: Split, *, steps: int) -> Measured:
     """A few steps of a small network, likewise."""
-    model, settings = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
-    training = train(model, sets, settings)
+    model, optimiser = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
+    training = fit(problem(model, sets), optimiser)
     seconds = training.compile_seconds + training.train_seconds
     trained = dynamics(model.energies(training.parameters))
     numbers = {"torque_mse": torque_mse(trained, sets.test), "train_seconds": seconds}

@@ -9,7 +9,7 @@ import numpy as np
 from dln_jax.data import schema
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.datasets import generators
-from dln_jax.learning.linear_fit import fit_linear
+from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics

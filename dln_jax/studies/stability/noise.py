@@ -12,7 +12,7 @@ import numpy as np
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.datasets import generators
-from dln_jax.learning.linear_fit import LinearFit, fit_linear
+from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
 from dln_jax.metrics.misfit import velocity_misfit

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.learning.engine.second_order import Budget
-from dln_jax.learning.field_matching import match_linear
-from dln_jax.learning.trajectory_matching import Weights, cut_windows, match_trajectories, stretches, take
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.motions import Weights, cut_windows, problem, stretches, take
+from dln_jax.learning.rates import match_linear
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
@@ -58,18 +59,20 @@ def test_a_noisy_oscillator_is_recovered_without_the_bias_of_its_noise():
     model = make_polynomial_hamiltonian(NEEDS, degree=2, dtype=jnp.float64)
     biased = match_linear(model, data)[0].parameters
     windows = cut_windows(data, 30)
-    fitted = match_trajectories(
-        model,
-        biased,
-        take(windows, range(10)),
-        take(windows, range(10, 12)),
-        weights=Weights(0.1),
-        budget=Budget(12),
-        free_starts=True,
+    fitted = fit(
+        problem(
+            model,
+            biased,
+            take(windows, range(10)),
+            take(windows, range(10, 12)),
+            weights=Weights(0.1),
+            free_starts=True,
+        ),
+        GaussNewton(12),
     )
     # Terms in the order p, p², q, qp, q².
     true = np.array([0, 1, 0, 0, 1.0])
-    error, bias = (np.abs(np.asarray(c) - true).max() for c in (fitted.parameters, biased))
+    error, bias = (np.abs(np.asarray(c) - true).max() for c in (fitted.parameters["model"], biased))
     assert error < 0.03 < bias
     assert fitted.validation < 3
 
@@ -93,42 +96,29 @@ def test_a_damped_oscillator_is_recovered_from_its_positions():
     p = -np.exp(-b * t / 2) * (b / 2 * np.cos(w * t) + w * np.sin(w * t))
     arrays = {"t": t, "q": q[:, None], "qd": p[:, None], "qdd": p[:, None], "p": p[:, None] + 0.2}
     windows = cut_windows(schema.from_arrays({**arrays, "trajectory": np.zeros(60)}), 15)
-    training = match_trajectories(
-        damped(),
-        jnp.array([3.0, 0.0]),
-        windows,
-        windows,
-        weights=Weights((0.01, np.inf)),
-        budget=Budget(15),
-        substeps=8,
-    )
-    np.testing.assert_allclose(training.parameters, [k, b], rtol=1e-4)
+    start = jnp.array([3.0, 0.0])
+    given = problem(damped(), start, windows, windows, weights=Weights((0.01, np.inf)), substeps=8)
+    training = fit(given, GaussNewton(15))
+    np.testing.assert_allclose(training.parameters["model"], [k, b], rtol=1e-4)
     right = windows._replace(state=windows.state - [0, 0.2])
-    fit = {"weights": Weights(0.01), "budget": Budget(15), "free_starts": False, "substeps": 8}
-    from_measured = match_trajectories(damped(), jnp.array([3.0, 0.0]), right, right, **fit)
-    np.testing.assert_allclose(from_measured.parameters, [k, b], rtol=1e-4)
+    given = problem(damped(), start, right, right, weights=Weights(0.01), free_starts=False, substeps=8)
+    np.testing.assert_allclose(fit(given, GaussNewton(15)).parameters["model"], [k, b], rtol=1e-4)
 
 
 def test_mistakes_are_named():
     data = motion_of(np.arange(8))
     windows = cut_windows(data, 4)
-    fit = {"weights": Weights(0.1), "budget": Budget(1)}
+    weights = Weights(0.1)
     start = jnp.ones(2)
     refused = [
         (lambda: cut_windows(data, 1), "length is 1"),
         (lambda: cut_windows(data._replace(p=None), 4), "no p"),
         (lambda: stretches(data, gap=0.9), "gap is 0.9"),
         (lambda: stretches(motion_of([0, 0], [0, 1])), "no trajectory has two samples"),
-        (lambda: match_trajectories(damped(), start, windows, take(windows, []), **fit), "0 to validate"),
-        (lambda: match_trajectories(damped(), start, windows, windows, substeps=0, **fit), "substeps is 0"),
-        (
-            lambda: match_trajectories(damped(), start, windows, windows, weights=Weights(0.0), budget=Budget(1)),
-            "state_weight is 0",
-        ),
-        (
-            lambda: match_trajectories(damped(), start, windows, windows, weights=Weights(1.0, 1.0), budget=Budget(1)),
-            "which the windows lack",
-        ),
+        (lambda: problem(damped(), start, windows, take(windows, []), weights=weights), "0 to validate"),
+        (lambda: problem(damped(), start, windows, windows, substeps=0, weights=weights), "substeps is 0"),
+        (lambda: problem(damped(), start, windows, windows, weights=Weights(0.0)), "state_weight is 0"),
+        (lambda: problem(damped(), start, windows, windows, weights=Weights(1.0, 1.0)), "which the windows lack"),
     ]
     for call, message in refused:
         with pytest.raises(InputError, match=message):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from motions import quick_motion
 
+from dln_jax.data.splits import hold_out
 from dln_jax.datasets import hamiltonian_tasks, phase_samples
-from dln_jax.learning import field_matching
-from dln_jax.learning.field_matching import Settings, hold_out, match_field, match_linear
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.rates import match_linear, problem
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -99,15 +101,15 @@ def test_the_polynomial_recovers_the_pendulum(swing):
     assert len(coefficients) == 2 + 2 + 1 + 1 + 2
 
 
-@pytest.mark.parametrize(("optimizer", "steps", "below"), [("gauss-newton", 20, 1e-3), ("adam", 400, 0.7)])
-def test_networks_learn_the_field(swing, optimizer, steps, below):
+@pytest.mark.parametrize(("optimiser", "below"), [(GaussNewton(20), 1e-3), (Adam(400, batch=32), 0.7)])
+def test_networks_learn_the_field(swing, optimiser, below):
     model = make_separable_hamiltonian(Needs(joints=("revolute",)), **SMALL)
-    training = match_field(model, swing.train.data, Settings(optimizer=optimizer, steps=steps, batch=32))
+    training = fit(problem(model, *hold_out(swing.train.data, 0.1, 0)), optimiser)
     found = phase_metrics.field_errors(model, training.parameters, swing.test)
     assert found["loss"] == pytest.approx(found["clean_field_mse"])
     # A field of zero has an error of 5.
     assert found["clean_field_mse"] < below
-    if optimizer == "adam":
+    if isinstance(optimiser, Adam):
         return
     data = swing.test.data
     predicted = phase_metrics.predict(model, training.parameters, data.q[:1], data.p[:1], swing.t)
@@ -146,10 +148,9 @@ def test_mistakes_are_named(swing):
     data, needs = swing.train.data, Needs(joints=("revolute",))
     model = make_phase_network(needs, **SMALL)
     refused = [
-        (lambda: match_field(model, data, Settings(optimizer="newton")), "optimizer is 'newton'"),
-        (lambda: match_field(model, data, Settings(steps=0)), "steps is 0"),
-        (lambda: match_field(model, data, Settings(precision="f32")), "needs f64"),
-        (lambda: match_field(model, data._replace(p=None), Settings()), "no p and pd"),
+        (lambda: problem(model, data, data, most_samples=0), "most_samples is 0"),
+        (lambda: problem(model, data, data, seed=-1), "seed is -1"),
+        (lambda: problem(model, data._replace(p=None), data), "no p and pd"),
         (lambda: hold_out(data, 1.5, 0), "validation_share is 1.5"),
         (lambda: hold_out(data._replace(trajectory=0 * data.trajectory), 0.1, 0), "there are 1 trajectories"),
         (lambda: make_polynomial_hamiltonian(needs, degree=1), "degree is 1"),
@@ -161,4 +162,3 @@ def test_mistakes_are_named(swing):
     for call, message in refused:
         with pytest.raises(InputError, match=message):
             call()
-    assert field_matching.OPTIMIZERS == ("adam", "gauss-newton")

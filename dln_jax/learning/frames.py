@@ -8,7 +8,7 @@
 Samples are windows of frames after each other, k = 0 .. W - 1, and x_k are the frames k and k + 1. In place of the
 published forward difference, z_1 - z_0 = rates(z_0), which is off by the square of the time of a frame, the field is
 integrated by RK4 from a window's first state to each of the next: with a window of two that is the published term made
-exact, and longer ones weigh what grows in a motion. Adam has a cosine schedule; published was a constant rate.
+exact, and longer ones weigh what grows in a motion. Our rate falls by a cosine; the published one is constant.
 
 Latent states have no scale of their own: CC and HNN fall when the plane shrinks, and AE does not notice. So that
 nothing is gained by shrinking, every error is taken relative to the variance in the batch of what it is an error of
@@ -16,7 +16,6 @@ nothing is gained by shrinking, every error is taken relative to the variance in
 in place of 0.1 before the motions, and not the decoder, are as good as they can be.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -25,13 +24,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.learning.engine.first_order import train_first_order
-from dln_jax.learning.engine.optimisers import adamw
-from dln_jax.learning.engine.runs import Checkpoint, Report, Training, silent
+from dln_jax.learning.engine.problem import Problem, unmonitored
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
-from dln_jax.types import InputError, Scalar, require_positive
+from dln_jax.types import InputError, Scalar
 
 
 class Weights(NamedTuple):
@@ -42,21 +39,14 @@ class Weights(NamedTuple):
     field: float = 0.1
 
 
-class Settings(NamedTuple):
-    """How to fit; in float32."""
+class Matching(NamedTuple):
+    """What is made small."""
 
-    steps: int = 12_000
     window: int = 2
     """Pictures (of two frames) of a window."""
-    batch: int = 50
-    """Windows of a step."""
-    learning_rate: float = 2e-3
-    """The largest; it falls to a thousandth by a cosine."""
     weights: Weights = Weights()
     relative: bool = True
     """Whether errors of latent states are relative to their variances; published ones are not."""
-    seed: int = 0
-    """Of the initial parameters and the order of the samples."""
 
 
 class Terms(NamedTuple):
@@ -91,9 +81,9 @@ def terms(
     )
 
 
-def loss(model: LatentModel, settings: Settings, parameters: Parameters, windows: Array) -> Scalar:
+def loss(model: LatentModel, matching: Matching, parameters: Parameters, windows: Array) -> Scalar:
     """The weighted sum of `terms`."""
-    found, weights = terms(model, parameters, windows, settings.relative), settings.weights
+    found, weights = terms(model, parameters, windows, matching.relative), matching.weights
     return weights.autoencoder * found.autoencoder + weights.coordinate * found.coordinate + weights.field * found.field
 
 
@@ -110,42 +100,33 @@ def windows(frames: Float[np.ndarray, "K T pixels"], length: int) -> Float[np.nd
     return frames[:, : count * length].reshape(K * count, length, pixels)
 
 
-def match_frames(
+def problem(
     model: LatentModel,
     train: Float[np.ndarray, "K T pixels"],
     validation: Float[np.ndarray, "V T pixels"],
-    settings: Settings = Settings(),  # noqa: B008
+    matching: Matching = Matching(),  # noqa: B008
     *,
-    checkpoint: Checkpoint | None = None,
-    report: Report = silent,
-) -> Training:
-    """Fits a model to the frames of trajectories; others select the parameters, by the same loss.
+    seed: int = 0,
+) -> Problem:
+    """The fit of a model to the frames of trajectories, for Adam; others select the parameters, by the same loss.
+
+    The seed is that of the initial parameters and the order of the windows.
 
     Raises:
         InputError: settings out of range, or trajectories shorter than a window.
     """
-    require_positive(steps=settings.steps, batch=settings.batch, learning_rate=settings.learning_rate)
-    if settings.window < 2:
-        raise InputError(f"window is {settings.window}; expected at least 2 pictures, one to predict the other from")
-    fitted = jnp.asarray(windows(train, settings.window + 1))
-    held_out = jnp.asarray(windows(validation, settings.window + 1))
-    objective = functools.partial(loss, model, settings)
+    if matching.window < 2:
+        raise InputError(f"window is {matching.window}; expected at least 2 pictures, one to predict the other from")
+    fitted, held_out = (jnp.asarray(windows(frames, matching.window + 1)) for frames in (train, validation))
 
     def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
-        return objective(parameters, held_out), jnp.full((), jnp.nan)
+        return unmonitored(loss(model, matching, parameters, held_out))
 
-    parameters = jax.jit(model.init)(jax.random.key(settings.seed))
-    return train_first_order(
-        objective,
-        adamw(steps=settings.steps, learning_rate=settings.learning_rate),
-        parameters,
-        fitted,
+    return Problem(
+        residual=None,
+        parameters=jax.jit(model.init)(jax.random.key(seed)),
+        arrays=(fitted,),
         score=score,
-        seed=settings.seed,
-        steps=settings.steps,
-        batch=min(settings.batch, len(fitted)),
-        patience=settings.steps,
-        steps_per_dispatch=100,
-        checkpoint=checkpoint,
-        report=report,
+        seed=seed,
+        loss=lambda parameters, batch: loss(model, matching, parameters, *batch),
     )

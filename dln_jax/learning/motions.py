@@ -24,10 +24,7 @@ from jaxtyping import Float
 
 from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.engine.first_order import train_first_order
-from dln_jax.learning.engine.optimisers import adamw, check_adamw
-from dln_jax.learning.engine.runs import Checkpoint, Report, Training, silent
-from dln_jax.learning.engine.second_order import Budget, train_second_order
+from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.integrators import rk4, rollout
@@ -61,16 +58,6 @@ class Weights(NamedTuple):
     """Of q and p, one number or 2 d; infinite for what was not measured."""
     rate: float | None = None
     """Of qd and pd; `None` leaves measured rates out."""
-
-
-class Adam(NamedTuple):
-    """Settings of first-order training."""
-
-    batch: int = 64
-    """Windows of a step."""
-    learning_rate: float = 5e-3
-    seed: int = 0
-    """Of the order of the windows."""
 
 
 def stretches(data: Trajectories, *, gap: float = GAP) -> list[np.ndarray]:
@@ -145,61 +132,37 @@ def window_residual(
     return jnp.concatenate([jnp.ravel(error) for error in errors])
 
 
-def check(windows: Windows, validation: Windows, weights: Weights) -> None:
-    """Raises `InputError` unless there are windows, with all that the weights count, and these are positive."""
-    for deviation in np.ravel(weights.state):
-        require_positive(state_weight=float(deviation))
-    if weights.rate is not None:
-        require_positive(rate_weight=weights.rate)
-        if windows.rate is None or validation.rate is None:
-            raise InputError("the weights count rates, which the windows lack; leave their weight out")
-    if not len(windows.t) or not len(validation.t):
-        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
-    for each in (windows, validation):
-        _arrays(each, weights)
-
-
-def match_trajectories(
+def problem(
     model: Model,
     parameters: Parameters,
     windows: Windows,
     validation: Windows,
     *,
     weights: Weights,
-    budget: Budget,
-    adam: Adam | None = None,
     free_starts: bool = True,
     substeps: int = 4,
-    checkpoint: Checkpoint | None = None,
-    report: Report = silent,
-) -> Training:
-    """Fits a model to windows, in float64; the `Training` holds the model's parameters alone.
+    seed: int = 0,
+) -> Problem:
+    """The fit of a model to windows, in float64; the training's parameters are {"model": ..., "starts": ...}.
 
     Selected are the parameters whose motions come closest to the validation windows, whose starts are fitted too where
     starts are free.
 
     Args:
         model: a phase model with float64 parameters.
-        parameters: to start from, such as those of derivative matching.
+        parameters: to start from, such as those of a fit of rates.
         windows: to fit.
         validation: to select by.
         weights: of the residuals.
-        budget: when to stop; its `steps` and `seconds` are also Adam's.
-        adam: to take Adam in place of Gauss-Newton.
         free_starts: whether starts are unknowns; otherwise windows start where they were measured to.
         substeps: of RK4 between two samples.
-        checkpoint: where to store the run after every dispatch, and whether to continue one.
-        report: called after every dispatch.
+        seed: of the order of the windows.
 
     Raises:
-        InputError: no windows, weights that are not positive, rates that the windows lack, or parameters in float32.
+        InputError: no windows, weights that are not positive, or rates that the windows lack.
     """
     require_positive(substeps=substeps)
-    if adam is not None:
-        require_positive(batch=adam.batch)
-        check_adamw(learning_rate=adam.learning_rate)
-    check(windows, validation, weights)
-    fitted, held_out = (_arrays(each, weights) for each in (windows, validation))
+    fitted, held_out = arrays(windows, validation, weights)
     error = functools.partial(window_residual, weights=weights, substeps=substeps)
 
     def residual(unknowns, index: Array, *window: Array) -> Array:
@@ -216,31 +179,27 @@ def match_trajectories(
             start = window[1][0]
             return from_start(_nearest(from_start, start) if free_starts else start)
 
-        errors = jax.vmap(closest)(*held_out)
-        return jnp.mean(jnp.sum(errors**2, axis=1)), jnp.full((), jnp.nan)
+        return unmonitored(mean_square(closest, held_out))
 
     unknowns = {"model": parameters} | ({"starts": fitted[1][:, 0]} if free_starts else {})
-    samples = (jnp.arange(len(windows.t)), *fitted)
-    if adam is None:
-        training = train_second_order(
-            residual, unknowns, samples, score=score, budget=budget, checkpoint=checkpoint, report=report
-        )
-    else:
-        training = train_first_order(
-            lambda unknowns, batch: jnp.mean(jax.vmap(lambda *each: jnp.sum(residual(unknowns, *each) ** 2))(*batch)),
-            adamw(steps=budget.steps, learning_rate=adam.learning_rate),
-            unknowns,
-            samples,
-            score=score,
-            seed=adam.seed,
-            steps=budget.steps,
-            batch=min(adam.batch, len(windows.t)),
-            patience=budget.steps,
-            seconds=budget.seconds,
-            checkpoint=checkpoint,
-            report=report,
-        )
-    return training._replace(parameters=training.parameters["model"])
+    return Problem(residual, unknowns, (jnp.arange(len(windows.t)), *fitted), score, seed)
+
+
+def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
+    """What a fit reads of each, on the device.
+
+    Raises:
+        InputError: as `problem`.
+    """
+    for deviation in np.ravel(weights.state):
+        require_positive(state_weight=float(deviation))
+    if weights.rate is not None:
+        require_positive(rate_weight=weights.rate)
+        if windows.rate is None or validation.rate is None:
+            raise InputError("the weights count rates, which the windows lack; leave their weight out")
+    if not len(windows.t) or not len(validation.t):
+        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+    return [_arrays(each, weights) for each in (windows, validation)]
 
 
 def _arrays(windows: Windows, weights: Weights) -> tuple[Array, ...]:

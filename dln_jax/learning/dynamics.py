@@ -1,0 +1,102 @@
+"""Models of dynamics fitted to trajectories: the problem that `engine.fit` solves.
+
+training = fit(problem(model, sets, objective), GaussNewton())
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.splits import Split
+from dln_jax.learning import objectives
+from dln_jax.learning.engine import optimisers
+from dln_jax.learning.engine.checkpoint import identity
+from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.problem import Problem
+from dln_jax.learning.objectives import TORQUE, Objective
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import require_seed
+
+
+def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0) -> Problem:
+    """The fit of a model to an objective, in the precision of the model.
+
+    Args:
+        model: from `dln_jax.models`.
+        sets: what to fit, to select by, and to monitor.
+        objective: what to make small, from `learning.objectives`.
+        seeds: of the initial parameters and the order of the samples. Several train in one program, and the result has
+            them on the leading axis.
+
+    Raises:
+        InputError: the data cannot determine the model, lack what it is fitted to, or overflow in its precision.
+    """
+    for seed in (seeds,) if isinstance(seeds, int) else seeds:
+        require_seed(seed)
+    scale, (fitted, selected_by, monitored) = _read(model, sets, objective)
+    held_out = tuple(map(lambda *pair: jnp.concatenate(pair), selected_by, monitored))
+
+    def residual(parameters: Parameters, *sample: Array) -> Array:
+        return objective.residual(model.energies(parameters), *sample) / scale
+
+    def score(parameters: Parameters) -> tuple[Array, Array]:
+        squares = _squares(objective, model, parameters, held_out, scale)
+        return squares[: len(selected_by[0])].mean(), squares[len(selected_by[0]) :].mean()
+
+    seed = seeds if isinstance(seeds, int) else jnp.asarray(seeds)
+    return Problem(residual, initial_parameters(model, seeds), fitted, score, seed)
+
+
+def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[Array, ...]:
+    """All that is read, for fitting, selecting and monitoring, in the model's precision."""
+    return tuple(map(lambda *parts: jnp.concatenate(parts), *_read(model, sets, objective)[1]))
+
+
+def identity_of(
+    optimiser: Optimiser, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0
+) -> dict[str, Any]:
+    """By what a `Checkpoint` of a training recognises it."""
+    return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
+
+
+def initial_parameters(model: Model, seeds: int | Sequence[int]) -> Parameters:
+    """The parameters that training starts from; with a leading axis for a sequence of seeds."""
+    if isinstance(seeds, int):
+        return jax.jit(model.init)(jax.random.key(seeds))
+    return jax.jit(lambda numbers: jax.lax.map(lambda seed: model.init(jax.random.key(seed)), numbers))(
+        jnp.asarray(seeds)
+    )
+
+
+def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[type[Optimiser], str]:
+    """The optimiser for a model of this size and data, and why."""
+    return optimisers.suited(_shapes(model), len(sets.train.t), len(objective.scale(sets.train)))
+
+
+def validation_errors(
+    model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE
+) -> Float[np.ndarray, " N"]:
+    """Squared error of each validation sample, whose mean is what selects."""
+    scale, (_, batch, _) = _read(model, sets, objective)
+    return np.asarray(jax.jit(lambda given: _squares(objective, model, given, batch, scale))(parameters))
+
+
+def _shapes(model: Model) -> Parameters:
+    return jax.eval_shape(model.init, jax.random.key(0))
+
+
+def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[tuple[Array, ...]]]:
+    """The unit of each residual, and the arrays of each set."""
+    dtype = jnp.result_type(*jax.tree.leaves(_shapes(model)))
+    return objective.scale(sets.train).astype(dtype), [objectives.arrays(objective, data, dtype) for data in sets]
+
+
+def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
+    """Squared error of each sample of a batch, in the units that the objective selects by."""
+    errors = objectives.residuals(objective, model.energies(parameters), batch)
+    return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

@@ -1,0 +1,101 @@
+"""Gauss-Newton (Levenberg-Marquardt) as stages of `fit`: on some samples, where there are many, and on all."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Best, Problem, Stop, better_of, no_best
+from dln_jax.learning.engine.stage import Dispatch, Stage
+from dln_jax.solvers import levenberg_marquardt
+from dln_jax.solvers.levenberg_marquardt import Arrays, Status
+from dln_jax.types import InputError
+
+SOME, ALL = "some samples", "all samples"
+"""The stages of a run that starts on a part of the samples."""
+
+
+class State(NamedTuple):
+    """Everything that a run needs to continue."""
+
+    solver: levenberg_marquardt.State
+    earlier: Array
+    """[] iterations of the stage before."""
+    best: Best
+
+    @property
+    def step(self) -> Array:
+        """[] iterations done, of several seeds the most."""
+        return self.earlier + jnp.max(self.solver.iteration)
+
+
+def stages(problem: Problem, optimiser: GaussNewton) -> list[Stage]:
+    """One stage, or two."""
+    if problem.residual is None:
+        raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
+    arrays = tuple(map(jnp.asarray, problem.arrays))
+    if not optimiser.has_coarse_stage(len(arrays[0])):
+        return [_stage(problem, optimiser, "", arrays, optimiser.steps)]
+    some = tuple(array[: optimiser.coarse_samples] for array in arrays)
+    return [
+        _stage(problem, optimiser, SOME, some, optimiser.coarse_steps),
+        _stage(problem, optimiser, ALL, arrays, optimiser.steps),
+    ]
+
+
+def _stage(problem: Problem, optimiser: GaussNewton, name: str, arrays: Arrays, iterations: int) -> Stage:
+    def start(before: State | None) -> State:
+        of_seeds = jax.vmap if problem.several else lambda function: function
+        if before is None:
+            parameters = problem.parameters
+            best, earlier = of_seeds(no_best)(jax.tree.map(jnp.array, parameters)), jnp.zeros((), int)
+        else:
+            parameters, best, earlier = before.best.parameters, before.best, before.step
+        return State(of_seeds(levenberg_marquardt.init)(parameters), earlier, best)
+
+    def ended(state: State) -> Stop | None:
+        if np.all(np.asarray(state.solver.status) == Status.NON_FINITE):
+            return Stop("not finite", int(state.step))
+        done = not _remaining(state, iterations) or np.all(np.asarray(state.best.validation) <= optimiser.target)
+        return Stop("finished", int(state.step)) if done else None
+
+    return Stage(name, start, functools.partial(_compile, problem, optimiser, arrays, iterations), ended)
+
+
+def _compile(problem: Problem, optimiser: GaussNewton, arrays: Arrays, iterations: int, state: State) -> Dispatch:
+    """Iterations, their score and the best so far: three programs, of which the first is to be compiled quickly."""
+    assert problem.residual is not None
+    advance = jax.jit(
+        functools.partial(levenberg_marquardt.run, problem.residual, improvement=optimiser.improvement),
+        compiler_options=quick_compilation(),
+    )
+    advance = advance.lower(state.solver, arrays, jnp.asarray(0)).compile()
+
+    def score(parameters: Any) -> Array:
+        return jnp.stack(problem.score(parameters))
+
+    # One seed after the other: a score that calls LAPACK must not do so for a batch (see the solver).
+    evaluate = jax.jit((lambda stacked: lax.map(score, stacked)) if problem.several else score)
+    evaluate = evaluate.lower(state.solver.parameters).compile()
+    keep = jax.jit(jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of)
+
+    def dispatch(state: State) -> tuple[State, Array]:
+        steps = min(optimiser.steps_per_dispatch, _remaining(state, iterations))
+        state = state._replace(solver=advance(state.solver, arrays, jnp.asarray(steps)))
+        scores = evaluate(state.solver.parameters)
+        best = keep(state.best, state.solver.parameters, scores[..., 0], state.step.astype(jnp.int32))
+        return state._replace(best=best), jnp.concatenate([state.solver.loss[..., None], scores], axis=-1)
+
+    return dispatch
+
+
+def _remaining(state: State, iterations: int) -> int:
+    """Iterations that the seeds which still run have to go."""
+    solver = state.solver
+    done = np.ravel(solver.iteration)[np.ravel(solver.status) == Status.RUNNING]
+    return max(iterations - int(done.min()), 0) if done.size else 0

@@ -1,0 +1,237 @@
+"""Fitting a differential network, or an ensemble of them, to samples of a function and of its derivatives.
+
+Losses: type 1 reads values and Jacobians, type 2 values only (the published names); derivative 2 adds the Hessian to
+either. All are means over samples of sums of squares over components, without weights between the terms:
+
+    r = [y_hat - y, dy_hat/dx - dy/dx, d²y_hat/dx² - d²y/dx²],   loss = mean over samples of |r|².
+
+The published recipe (Adam with decoupled weight decay, minibatches, constant rate) is for wide networks;
+Levenberg-Marquardt on all samples at once is for small ones, whose errors go down to what the noise leaves.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.data.magnitudes import on_device
+from dln_jax.learning.engine.checkpoint import Checkpoint
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
+from dln_jax.learning.engine.problem import Problem, Progress, Report, Training, mean_square, silent, unmonitored
+from dln_jax.learning.growth import Trial, grow
+from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn.activations import Activation, activation
+from dln_jax.nn.differential_mlp import Layers
+from dln_jax.precision import data_type
+from dln_jax.types import InputError, Scalar, require_network, require_positive, require_seed
+
+LOSSES = ("type1", "type2")
+WIDTHS = (2, 4, 8, 16)
+"""Of hidden layers, for `grow_width`."""
+GAUSS_NEWTON = GaussNewton(steps=40, coarse_steps=200, improvement=1e-7)
+"""For networks of `WIDTHS`."""
+
+
+class Network(NamedTuple):
+    """What is fitted to what; the defaults are the published ones."""
+
+    loss: str = "type1"
+    """type1 or type2."""
+    derivative: int = 1
+    """2 adds the Hessian to the loss."""
+    activation: str = "cos"
+    width: int = 128
+    depth: int = 1
+    """Hidden layers."""
+    members: int = 1
+    """Networks of the ensemble, which differ in their initial parameters."""
+    precision: str = "f32"
+    """f32 or f64; Gauss-Newton needs f64."""
+    seed: int = 0
+    """Of the initial parameters and the order of the samples."""
+
+
+class Targets(NamedTuple):
+    """What a loss reads, samples on axis 0; `None` is what it does not read, and is never computed."""
+
+    x: Array
+    """[N, n]"""
+    y: Array
+    """[N, m]"""
+    dy: Array | None = None
+    """[N, m, n]"""
+    d2y: Array | None = None
+    """[N, m, n, n]"""
+
+
+def published_adam(
+    samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3, weight_decay: float = 1e-6
+) -> Adam:
+    """The published recipe for so many samples: a constant rate, and no early stop."""
+    require_positive(epochs=epochs, batch=batch)
+    steps = epochs * (samples // min(batch, samples))
+    return Adam(
+        steps=steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        weight_decay=weight_decay,
+        patience=steps,
+        second_moment_decay=0.999,
+        warm_up_share=0,
+        final_share=1,
+        steps_per_dispatch=max(1, min(450, steps // 20)),
+    )
+
+
+def targets(data: FunctionSamples, network: Network) -> Targets:
+    """The arrays that the loss reads, on the device.
+
+    Raises:
+        InputError: settings out of range, a derivative that the data lack, or numbers whose squares overflow.
+    """
+    require_positive(members=network.members)
+    require_seed(network.seed)
+    require_network(width=network.width, depth=network.depth)
+    activation(network.activation)
+    dtype = data_type(network.precision)
+    return Targets(**{key: on_device(key, getattr(data, key), dtype) for key in _needed(data, network)})
+
+
+def residual(layers: Layers, sample: Targets, *, activation: Activation) -> Float[Array, "r"]:
+    """r of one sample, as far as the sample has targets: value, Jacobian and Hessian, flat, one after the other."""
+    if sample.d2y is not None:
+        predicted = differential_mlp.value_jacobian_and_hessian(layers, sample.x, activation=activation)
+    elif sample.dy is not None:
+        predicted = differential_mlp.value_and_jacobian(layers, sample.x, activation=activation)
+    else:
+        predicted = (differential_mlp.value(layers, sample.x, activation=activation),)
+    pairs = zip(predicted, sample[1:], strict=False)
+    return jnp.concatenate([(ours - theirs).ravel() for ours, theirs in pairs if theirs is not None])
+
+
+def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scalar:
+    """Mean over samples of |r|²."""
+    residuals = jax.vmap(lambda sample: residual(layers, sample, activation=activation))(batch)
+    return jnp.mean(jnp.sum(residuals**2, axis=-1))
+
+
+def train(
+    sets: SampleSplit,
+    network: Network,
+    optimiser: Optimiser,
+    *,
+    checkpoint: Checkpoint | None = None,
+    report: Report = silent,
+) -> Training:
+    """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
+
+    The result's parameters are layers with the ensemble's members on the leading axis, also when there is one. Adam
+    shows all members the same batches and keeps one step for all; Gauss-Newton keeps the best of each. Reports and
+    history are means over the members.
+
+    Raises:
+        InputError: what `targets` and `fit` refuse.
+    """
+    members = network.members if isinstance(optimiser, Adam) else 1
+
+    def mean(at: Progress) -> Progress:
+        return at._replace(
+            loss=float(np.mean(at.loss)) / members, validation=float(np.mean(at.validation)), monitor=np.nan
+        )
+
+    given = problem(sets, network, each_member_by_itself=not isinstance(optimiser, Adam))
+    training = fit(given, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)))
+    return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
+
+
+def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool) -> Problem:
+    """The fit of an ensemble: its members as seeds of one program, for Gauss-Newton, or the sum of their losses.
+
+    Raises:
+        InputError: what `targets` refuses.
+    """
+    ours, theirs = (targets(data, network) for data in sets)
+    sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
+    layers = ensembles.init(
+        jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
+    )
+    function, keys = activation(network.activation), [key for key, each in ours._asdict().items() if each is not None]
+    arrays = tuple(getattr(ours, key) for key in keys)
+
+    held_out = tuple(getattr(theirs, key) for key in keys)
+
+    def of_sample(member: Layers, *sample: Array) -> Array:
+        return residual(member, Targets(**dict(zip(keys, sample, strict=True))), activation=function)
+
+    def of_member(member: Layers, batch: tuple[Array, ...]) -> Scalar:
+        return mean_square(functools.partial(of_sample, member), batch)
+
+    def together(layers: Layers, batch: tuple[Array, ...]) -> Scalar:
+        """A sum, so that each member's gradient, and with it its training, is the same as alone."""
+        if network.members == 1:
+            # An axis of one member would make every product a batch of products, at two or three times the cost.
+            return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
+        return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
+
+    if each_member_by_itself:
+        seeds = jnp.full(network.members, network.seed)
+        return Problem(of_sample, layers, arrays, lambda member: unmonitored(of_member(member, held_out)), seeds)
+
+    def score(layers: Layers) -> tuple[Scalar, Scalar]:
+        return unmonitored(together(layers, held_out) / network.members)
+
+    return Problem(None, layers, arrays, score, network.seed, together)
+
+
+def _needed(data: FunctionSamples, network: Network) -> list[str]:
+    """Keys of the data that the loss reads."""
+    if network.loss not in LOSSES:
+        raise InputError(f"loss is '{network.loss}'; expected one of {', '.join(LOSSES)}")
+    if network.derivative not in (1, 2):
+        raise InputError(f"derivative is {network.derivative}; expected 1, or 2 to fit the Hessian too")
+    needed = ["x", "y"]
+    if network.loss == "type1":
+        if data.dy is None:
+            raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
+        needed.append("dy")
+    if network.derivative == 2:
+        if data.d2y is None:
+            raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
+        needed.append("d2y")
+    return needed
+
+
+def grow_width(
+    sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
+) -> tuple[Trial, list[Trial]]:
+    """Trains networks of growing width by `fit` and chooses the smallest that the validation calls enough.
+
+    The outcome of each trial is its `Training`.
+    """
+
+    def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
+        training = fit(candidate)
+        return training, validation_errors(sets, candidate, training.parameters)
+
+    return grow([network._replace(width=width) for width in widths], fit_and_judge)
+
+
+def validation_errors(sets: SampleSplit, network: Network, layers: Layers) -> Float[np.ndarray, " N"]:
+    """|r|² of each validation sample, the mean over the ensemble's members."""
+    function = activation(network.activation)
+
+    @jax.jit
+    def squares(batch: Targets) -> Array:
+        def of_member(member: Layers) -> Array:
+            return jax.vmap(lambda sample: jnp.sum(residual(member, sample, activation=function) ** 2))(batch)
+
+        return jnp.mean(jax.vmap(of_member)(layers), axis=0)
+
+    return np.asarray(squares(targets(sets.validation, network)))

@@ -1,0 +1,119 @@
+"""Derivative matching: a phase field is fitted to measured rates (qd, pd) of states (q, p).
+
+    loss = mean over samples and components of |rates(q, p) - (qd, pd)|²
+
+the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). By Gauss-Newton, Adam, or, for a
+field that is linear in its parameters, by one least-squares problem. The parameters kept are those with the lowest
+loss on validation trajectories, which are drawn from those for training; no test is looked at.
+
+Where states carry noise and rates do not, the loss has a bias that more data do not remove: it flattens the field
+(regression dilution). `learning.motions` has not.
+"""
+
+import functools
+import math
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.magnitudes import on_device
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, mean_square, unmonitored
+from dln_jax.mechanics.equations import flow
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers import least_squares
+from dln_jax.types import InputError, Scalar, require_positive, require_seed
+
+FIELD = ("q", "p", "qd", "pd")
+"""Arrays that a fit reads."""
+
+
+def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
+    """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d], whose sum of squares is the sample's part of the loss."""
+    velocity, force = flow(model.energies(parameters)).rates(q, p)
+    return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
+
+
+def loss(model: Model, parameters: Parameters, arrays: tuple[Array, ...]) -> Scalar:
+    """Mean square of rates - (qd, pd) over samples and components; arrays are q, p, qd, pd, [N, d] each."""
+    return mean_square(functools.partial(residual, model, parameters), arrays)
+
+
+def problem(
+    model: Model, train: Trajectories, validation: Trajectories, *, seed: int = 0, most_samples: int = 10_000
+) -> Problem:
+    """The fit of a model to the rates of trajectories, in the precision of the model.
+
+    Args:
+        model: a phase model.
+        train: with p and pd.
+        validation: likewise, to select by; `data.splits.hold_out` draws some.
+        seed: of the initial parameters, of the samples that are drawn, and of their order.
+        most_samples: to fit, and to select by, drawn from the trajectories where those have more.
+
+    Raises:
+        InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.
+    """
+    require_positive(most_samples=most_samples)
+    require_seed(seed)
+    parameters = jax.jit(model.init)(jax.random.key(seed))
+    dtype = jnp.result_type(*jax.tree.leaves(parameters))
+    fitted, held_out = (_drawn(part, seed, most_samples, dtype) for part in (train, validation))
+
+    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+        return unmonitored(loss(model, parameters, held_out))
+
+    return Problem(functools.partial(residual, model), parameters, fitted, score, seed)
+
+
+def match_linear(
+    model: Model, data: Trajectories, *, validation: Trajectories | None = None
+) -> tuple[Training, Float[np.ndarray, " N"]]:
+    """The least-squares fit of a field that is linear in its parameters, and the squared errors of the validation.
+
+    In float64; the errors are of each sample, and those of the fitted samples without a validation.
+
+    Raises:
+        InputError: no p or pd in the data, or numbers that are not finite or whose squares are not.
+    """
+    began = time.perf_counter()
+    with jax.enable_x64(True):
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+        columns = jax.jit(jax.jacrev(lambda c, *sample: residual(model, c, *sample)))
+        arrays = samples(data)
+        design = np.asarray(jax.jit(jax.vmap(columns, in_axes=(None, 0, 0, 0, 0)))(zero, *arrays))
+        target = -np.asarray(jax.jit(jax.vmap(functools.partial(residual, model, zero)))(*arrays))
+        found = least_squares.solve(design.reshape(-1, design.shape[-1]), target.ravel())
+        seconds = time.perf_counter() - began
+        judged = arrays if validation is None else samples(validation)
+        errors = jax.vmap(functools.partial(residual, model, jnp.asarray(found.x)))(*judged)
+        squares = np.sum(np.asarray(errors) ** 2, axis=1)
+    fitted = found.residual**2 / len(arrays[0])
+    at = Progress(1, fitted, float(squares.mean()), float("nan"), seconds)
+    return Training(jnp.asarray(found.x), [at], Stop("finished", 1), 1, 0.0), squares
+
+
+def samples(data: Trajectories, dtype: Any = jnp.float64) -> tuple[Array, ...]:
+    """q, p, qd, pd on the device.
+
+    Raises:
+        InputError: no p or pd in the data, or numbers whose squares overflow.
+    """
+    return tuple(on_device(name, array, dtype) for name, array in zip(FIELD, _arrays(data), strict=True))
+
+
+def _drawn(data: Trajectories, seed: int, most: int, dtype: Any) -> tuple[Array, ...]:
+    """At most so many samples, in random order."""
+    chosen = np.random.default_rng(seed).permutation(len(data.t))[:most]
+    return tuple(on_device(name, array[chosen], dtype) for name, array in zip(FIELD, _arrays(data), strict=True))
+
+
+def _arrays(data: Trajectories) -> tuple[np.ndarray, ...]:
+    if data.p is None or data.pd is None:
+        raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
+    return data.q, data.p, data.qd, data.pd

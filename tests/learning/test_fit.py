@@ -1,0 +1,330 @@
+"""The loop of all trainings on problems with known answers: its stops, its stages, its continuation bit for bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from dln_jax.data.splits import split
+from dln_jax.datasets import generators
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine import descent, newton, optimisers
+from dln_jax.learning.engine.checkpoint import Checkpoint, fingerprint, identity
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.engine.problem import Problem, Stop
+from dln_jax.learning.objectives import TORQUE, arrays, mean_loss, torque_scale
+from dln_jax.models.delan import make_delan
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError, Needs
+
+X = jnp.linspace(-1, 1, 50)
+LINE = (X, 3 * X - 1)
+
+
+def line(validate=None, parameters=(0.0, 0.0), seed=0):
+    """Least squares of a line, whose answer is slope 3 and offset -1."""
+
+    def residual(parameters, x, y):
+        return parameters[0] * x + parameters[1] - y
+
+    def score(parameters):
+        value = jnp.mean(residual(parameters, *LINE) ** 2)
+        return (validate(parameters) if validate else value), value
+
+    return Problem(residual, jnp.asarray(parameters), LINE, score, seed)
+
+
+def bumps(parameters, seed=0):
+    """A sum of tanh, for Gauss-Newton, on random places; the score prefers what the path only passes."""
+    x = jax.random.uniform(jax.random.key(1), (64,), minval=-2.0, maxval=2.0)
+
+    def residual(parameters, x, y):
+        heights, places = parameters
+        return heights @ jnp.tanh(x - places) - y
+
+    def score(parameters):
+        return abs(parameters[0][0] - 1.2), jnp.sum(parameters[1])
+
+    return Problem(residual, parameters, (x, jnp.sin(2 * x)), score, seed)
+
+
+BUMPS = (jnp.array([0.5, 1.0, -0.7]), jnp.array([-1.0, 0.1, 0.8]))
+
+
+@pytest.fixture
+def takes(monkeypatch):
+    """Another transformation in place of AdamW."""
+    return lambda optimiser: monkeypatch.setattr(optimisers, "transformation", lambda adam: optimiser)
+
+
+def test_it_finds_the_line_and_counts_whole_epochs(takes):
+    takes(optax.adam(0.1))
+    training = fit(line(), Adam(steps=301, batch=16, steps_per_dispatch=100))
+    np.testing.assert_allclose(training.parameters, [3.0, -1.0], atol=1e-3)
+    assert training.stop == Stop("finished", 303)  # 3 batches of 16 in 50 samples
+    assert [at.step for at in training.history] == [102, 204, 303]
+    assert training.train_seconds > 0 and training.compile_seconds > 0
+
+
+@pytest.mark.parametrize(
+    "optimiser", [Adam(steps=300, batch=16, steps_per_dispatch=3), GaussNewton(14, steps_per_dispatch=1)]
+)
+def test_the_best_parameters_are_those_of_the_best_validation(takes, optimiser):
+    """Validation prefers a point that the path passes on its way to the answer."""
+    takes(optax.sgd(0.05))
+    if isinstance(optimiser, Adam):
+        given = line(lambda parameters: jnp.abs(parameters[0] - 1.5))
+        value = lambda parameters: abs(parameters[0] - 1.5)  # noqa: E731
+    else:
+        given, value = bumps(BUMPS), lambda parameters: abs(parameters[0][0] - 1.2)
+    training = fit(given, optimiser)
+    validations = [at.validation for at in training.history]
+    best = int(np.argmin(validations))
+    assert best < len(validations) - 1 and training.best_step == training.history[best].step
+    assert training.validation == validations[best] == pytest.approx(float(value(training.parameters)), rel=1e-12)
+
+
+def test_it_stops_early_without_improvement(takes):
+    takes(optax.sgd(0.0))
+    training = fit(line(), Adam(steps=3000, batch=16, steps_per_dispatch=30, patience=100))
+    assert training.stop.reason == "no improvement" and 130 <= training.stop.step < 200
+    assert len(training.history) == training.stop.step // 30
+
+
+@pytest.mark.parametrize(("explosion", "dispatches"), [(50, 1), (59, 1), (60, 2)])
+def test_a_loss_that_stops_being_finite_ends_at_the_last_good_parameters(takes, explosion, dispatches):
+    takes(optax.sgd(lambda step: jnp.where(step < explosion, 0.01, 1e200)))
+    training = fit(line(), Adam(steps=300, batch=16, steps_per_dispatch=30))
+    assert training.stop.reason == "not finite" and explosion < training.stop.step <= explosion + 3
+    assert [at.step for at in training.history] == [30 * (number + 1) for number in range(dispatches)]
+    takes(optax.sgd(0.01))
+    good = fit(line(), Adam(steps=30 * dispatches, batch=16, steps_per_dispatch=30))
+    np.testing.assert_array_equal(training.parameters, good.parameters)
+
+
+@pytest.mark.parametrize("optimiser", [Adam(), GaussNewton()])
+def test_a_start_that_is_not_finite_is_an_error_or_a_result(optimiser):
+    given = line()
+    given = given._replace(arrays=(X, LINE[1].at[7].set(jnp.nan)))
+    with pytest.raises(InputError, match="not finite before training"):
+        fit(given, optimiser)
+    training = fit(given, optimiser, must_start=False)
+    assert training.stop.reason == "not finite" and not training.history
+    np.testing.assert_array_equal(training.parameters, 0)
+
+
+class Interruption(Exception):
+    pass
+
+
+def broken_and_continued(given, optimiser, folder, dispatches):
+    """The training of a run that ends after some dispatches, and is continued."""
+
+    def break_(at):
+        seen.append(at)
+        if len(seen) == dispatches:
+            raise Interruption
+
+    seen, checkpoint = [], Checkpoint(folder, identity(optimiser, given.arrays))
+    with pytest.raises(Interruption):
+        fit(given, optimiser, checkpoint=checkpoint, report=break_)
+    return fit(given, optimiser, checkpoint=checkpoint._replace(resume=True))
+
+
+SEVERAL = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.3 * leaf, -leaf]), BUMPS)
+NEWTON = GaussNewton(8, coarse_steps=5, coarse_samples=20, steps_per_dispatch=2)
+RESUMED = {
+    "adam": (line(), Adam(steps=300, batch=16, steps_per_dispatch=50), 3),
+    "adam, seeds": (
+        line(parameters=((0.0, 0.0), (1.0, 2.0)), seed=jnp.arange(2)),
+        Adam(90, 16, steps_per_dispatch=30),
+        2,
+    ),
+    "newton, some samples": (bumps(BUMPS), NEWTON, 2),
+    "newton, between the stages": (bumps(BUMPS), NEWTON, 3),
+    "newton, all samples": (bumps(BUMPS), NEWTON, 5),
+    "newton, seeds": (bumps(SEVERAL, jnp.arange(3)), NEWTON, 4),
+}
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_a_continued_run_equals_an_unbroken_one_bit_for_bit(tmp_path, name):
+    given, optimiser, dispatches = RESUMED[name]
+    unbroken = fit(given, optimiser)
+    continued = broken_and_continued(given, optimiser, tmp_path, dispatches)
+    assert continued.stop == unbroken.stop and len(continued.history) == len(unbroken.history) > dispatches
+    for one, other in zip(continued.history, unbroken.history, strict=True):
+        np.testing.assert_equal(one._replace(seconds=0.0), other._replace(seconds=0.0))
+    np.testing.assert_array_equal(continued.best_step, unbroken.best_step)
+    for one, other in zip(jax.tree.leaves(continued.parameters), jax.tree.leaves(unbroken.parameters), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_run_of_other_settings_or_data_is_not_continued(tmp_path):
+    optimiser = GaussNewton(3, steps_per_dispatch=1)
+    known = identity(optimiser, LINE)
+    fit(line(), optimiser, checkpoint=Checkpoint(tmp_path, known))
+    for other, named in (
+        (identity(optimiser._replace(steps=4), LINE), "other settings"),
+        (identity(Adam(), LINE), "other settings"),
+        (identity(optimiser, LINE, seed=3), "other settings"),
+        (identity(optimiser, (X,)), "other data"),
+    ):
+        with pytest.raises(InputError, match=named):
+            fit(line(), optimiser, checkpoint=Checkpoint(tmp_path, other, resume=True))
+    finished = fit(line(), optimiser, checkpoint=Checkpoint(tmp_path, known, resume=True))
+    assert finished.stop.reason == "finished" and finished.compile_seconds == 0
+
+
+def test_seeds_in_one_program_equal_single_runs():
+    together = fit(bumps(SEVERAL, jnp.arange(3)), NEWTON)
+    assert [at.stage for at in together.history] == 3 * [newton.SOME] + 4 * [newton.ALL]
+    assert [at.step for at in together.history] == [2, 4, 5, 7, 9, 11, 13]
+    for seed in range(3):
+        alone = fit(bumps(jax.tree.map(lambda leaf, seed=seed: leaf[seed], SEVERAL)), NEWTON)
+        assert together.validation[seed] == pytest.approx(alone.validation, rel=1e-6)
+        assert together.best_step[seed] == alone.best_step
+
+
+def test_the_best_of_some_samples_starts_the_stage_on_all(monkeypatch):
+    started = []
+    solver = newton.levenberg_marquardt.init
+    monkeypatch.setattr(newton.levenberg_marquardt, "init", lambda x: started.append(x) or solver(x))
+    optimiser = NEWTON._replace(steps_per_dispatch=1)
+    training = fit(bumps(BUMPS), optimiser)
+    some = [at for at in training.history if at.stage == newton.SOME]
+    best = min(some, key=lambda at: at.validation)
+    assert best is not some[-1] and abs(float(started[1][0][0]) - 1.2) == pytest.approx(best.validation, rel=1e-12)
+    few = fit(bumps(BUMPS), optimiser._replace(coarse_samples=40))
+    assert {at.stage for at in few.history} == {""}
+
+
+def test_a_target_and_time_end_a_run_between_dispatches():
+    optimiser = NEWTON._replace(steps_per_dispatch=1)
+    whole = fit(bumps(BUMPS), optimiser)
+    validations = np.minimum.accumulate([at.validation for at in whole.history])
+    for place in (1, 6):
+        reached = fit(bumps(BUMPS), optimiser._replace(target=float(validations[place])))
+        first = int(np.argmax(validations <= validations[place]))
+        assert reached.stop == Stop("finished", first + 1) and len(reached.history) == first + 1
+    for short in (optimiser, Adam(steps=300, batch=16, steps_per_dispatch=30)):
+        given = bumps(BUMPS) if short is optimiser else line()
+        late = fit(given, short, seconds=1e-6)
+        assert late.stop == Stop("time", late.history[0].step) and len(late.history) == 1
+
+
+def test_dispatches_of_any_length_are_one_compilation():
+    stage = descent.stages(line(), Adam(steps=100, batch=16, steps_per_dispatch=30))[0]
+    state = stage.start(None)
+    dispatch = stage.compile(state)
+    steps = []
+    while not stage.ended(state):  # 30, 30, 30 and what is left
+        state, _ = dispatch(state)
+        steps.append(int(state.step))
+    assert steps == [30, 60, 90, 102]
+
+
+@pytest.mark.parametrize(("batch", "whole"), [(25, True), (16, False)])
+def test_every_epoch_is_another_permutation_without_repetition(takes, batch, whole):
+    """At learning rate zero an epoch of all samples has the loss of the set; one that leaves two out, another."""
+    takes(optax.sgd(0.0))
+    training = fit(line(), Adam(steps=60, batch=batch, steps_per_dispatch=1))
+    losses = np.array([at.loss for at in training.history])
+    full = float(jnp.mean((3 * X - 1) ** 2))
+    assert len(losses) >= 20
+    if whole:
+        np.testing.assert_allclose(losses, full, rtol=1e-12)
+    else:
+        assert len(set(losses)) == len(losses)
+
+
+def test_the_order_of_many_samples_is_not_that_of_the_file(takes):
+    """Two samples that meet in a batch of two are as often in the file's order as not."""
+    samples = 2**16
+    takes(optax.sgd(1.0))  # each pair in order takes 1 from the parameter
+    given = Problem(
+        residual=None,
+        parameters=jnp.zeros(()),
+        arrays=(jnp.arange(samples),),
+        score=lambda parameters: (parameters, parameters),
+        loss=lambda parameters, batch: jnp.where(batch[0][0] < batch[0][1], parameters, 0.0),
+    )
+    in_order = -float(fit(given, Adam(steps=samples // 2, batch=2, steps_per_dispatch=samples // 2)).parameters)
+    assert abs(in_order - samples / 4) < 5 * np.sqrt(samples / 8)  # standard deviations
+
+
+def test_a_constant_rate_is_one():
+    """The published recipe of differential networks, against optax."""
+    rates = [
+        optimisers.transformation(Adam(steps=9, warm_up_share=0, final_share=1, learning_rate=0.1)),
+        optax.adamw(0.1, b2=0.99, weight_decay=1e-5),
+    ]
+    moves = [rate.update(jnp.ones(2), rate.init(jnp.ones(2)), jnp.ones(2))[0] for rate in rates]
+    np.testing.assert_array_equal(*moves)
+
+
+def test_torque_scale_never_divides_by_zero():
+    data = generators.uniform(cart_pole(), samples=100)
+    scale = torque_scale(data)
+    assert scale[0] == pytest.approx(data.tau[:, 0].std()) and scale[1] == pytest.approx(scale[0])
+    constant = data._replace(tau=np.full_like(data.tau, 7.3))
+    with pytest.raises(InputError, match="tau is constant in every training sample"):
+        torque_scale(constant)
+
+
+def test_the_textbook_has_no_torque_residual():
+    data = generators.uniform(two_link_arm(), samples=100)
+    scale = torque_scale(data)
+    assert mean_loss(TORQUE, two_link_arm().energies, arrays(TORQUE, data, jnp.float64), scale) < 1e-24
+
+
+@pytest.fixture(scope="module")
+def pendulum_sets():
+    return split(generators.uniform(pendulum(friction=0.5), samples=300, rate_bound=3.0, acceleration_bound=5.0))
+
+
+@pytest.mark.parametrize("friction", [True, False])
+def test_training_learns_a_plant_and_misfit_shows_what_the_model_lacks(pendulum_sets, friction):
+    needs = Needs(("revolute",), friction=friction)
+    model = make_delan(needs, width=16, depth=1, dtype=jnp.float64)
+    training = fit(problem(model, pendulum_sets), Adam(steps=1500, batch=64, learning_rate=1e-2))
+    # The friction torque 0.5 qd, uniform within ±3 /s, has a mean square of 0.75.
+    validation = min(at.validation for at in training.history)
+    assert validation < 1e-2 if friction else 0.4 < validation < 1.2
+    assert training.stop.reason == "finished" and training.train_seconds > 0
+
+
+WRONG = [
+    (Adam(steps=0), "steps"),
+    (Adam(batch=-1), "batch"),
+    (Adam(learning_rate=0.0), "learning_rate"),
+    (Adam(weight_decay=-1.0), "weight_decay"),
+    (GaussNewton(steps_per_dispatch=0), "steps_per_dispatch"),
+    (GaussNewton(coarse_steps=-1), "coarse_steps"),
+]
+
+
+@pytest.mark.parametrize(("optimiser", "named"), WRONG, ids=str)
+def test_settings_out_of_range_are_refused(optimiser, named):
+    with pytest.raises(InputError, match=named):
+        fit(line(), optimiser)
+
+
+def test_what_gauss_newton_does_not_take_is_refused():
+    with pytest.raises(InputError, match="residuals of a sample"):
+        fit(line()._replace(residual=None), GaussNewton())
+    with pytest.raises(InputError, match="neither a residual nor a loss"):
+        fit(line()._replace(residual=None), Adam())
+    with pytest.raises(InputError, match="parameters are float32"):
+        fit(line()._replace(parameters=jnp.zeros(2, jnp.float32)), GaussNewton())
+    with pytest.raises(InputError, match="seconds is 0"):
+        fit(line(), Adam(), seconds=0)
+
+
+def test_the_fingerprint_follows_the_numbers(pendulum_sets):
+    tau = pendulum_sets.test.tau
+    assert fingerprint([tau, None]) == fingerprint([tau.copy()]) != fingerprint([tau + 1e-15])
