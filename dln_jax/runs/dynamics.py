@@ -51,8 +51,8 @@ def train_into(
         training = train(task, folder, resume=resume)
     if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
         raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
-    chosen, best = best_seed(training, given.seeds)
-    save_model(folder, task.description, chosen)
+    parameters, best = best_seed(training, given.seeds)
+    save_model(folder, task.description, parameters)
     metrics = evaluate(folder, task, training, seeds=given.seeds, draw=figures)
     if low_latency:
         metrics |= low_latency_metrics(folder, latency_states(task), console.print)
