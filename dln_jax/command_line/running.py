@@ -15,9 +15,10 @@ import tyro
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.data.schema import needs_from_text
-from dln_jax.files import CONFIG, is_file, matches, read_json
+from dln_jax.files import is_file, matches, read_json
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, Needs
+from dln_jax.zoo.run_folder import CONFIG
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""

@@ -14,11 +14,12 @@ import numpy as np
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Resumable
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_bytes, write_figure, write_json
+from dln_jax.files import write_bytes, write_figure, write_json
 from dln_jax.studies.arm import table
 from dln_jax.studies.case import Case, measure, say_numbers, stored_findings
 from dln_jax.studies.report import conditions, publish
 from dln_jax.types import require_positive
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

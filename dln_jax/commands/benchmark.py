@@ -13,10 +13,11 @@ from typing import Literal
 import tyro
 
 from dln_jax.command_line.options import Folder
-from dln_jax.files import run_folder, write_bytes
+from dln_jax.files import write_bytes
 from dln_jax.studies.case import Done, draw, measure
 from dln_jax.studies.report import Row, conditions, markdown, publish
 from dln_jax.studies.speed.subjects import cases
+from dln_jax.zoo.run_folder import run_folder
 
 
 @dataclass(frozen=True)

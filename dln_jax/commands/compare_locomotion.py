@@ -14,13 +14,14 @@ from rich.console import Console
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.methods import METHODS, settings_of
 from dln_jax.locomotion.task import FALLEN, Task
 from dln_jax.runs.locomotion import GOAL, Options, announce, learned, prepare, write_run
 from dln_jax.studies.locomotion.methods import comparison_rows
 from dln_jax.studies.report import conditions, print_report, write_report
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

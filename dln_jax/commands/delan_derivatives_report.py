@@ -8,10 +8,10 @@ gradients of the torque loss at batch 512, single calls are one state. `mechanic
 from dataclasses import dataclass
 
 from dln_jax.command_line.options import Folder
-from dln_jax.files import run_folder
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.speed.derivatives import cases
+from dln_jax.zoo.run_folder import run_folder
 
 
 @dataclass(frozen=True)

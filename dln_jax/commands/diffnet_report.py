@@ -12,10 +12,10 @@ from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Folder
-from dln_jax.files import run_folder
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.differential_networks.one_pass import PLAIN, Timed, cases
 from dln_jax.studies.report import conditions, publish
+from dln_jax.zoo.run_folder import run_folder
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from typing import ClassVar
 
 from dln_jax.command_line.options import Resumable
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.files import write_json
 from dln_jax.studies.differential_networks.table import Extent, cases, measure_into
 from dln_jax.types import require_seed
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ from typing import Annotated, ClassVar
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_bytes, write_json
+from dln_jax.files import write_bytes, write_json
 from dln_jax.studies.case import measure, say_numbers, stored_findings
 from dln_jax.studies.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.studies.hamiltonian.training import RECIPES
 from dln_jax.studies.report import conditions, publish
 from dln_jax.types import InputError
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Folder
-from dln_jax.files import run_folder
 from dln_jax.studies.case import Done, measure
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.stability.interruptions import RUNS, cases
+from dln_jax.zoo.run_folder import run_folder
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
-from dln_jax.files import CONFIG, run_folder, write_figure, write_json
+from dln_jax.files import write_figure, write_json
 from dln_jax.rollout import rollout
 from dln_jax.runs.simulation_results import Motion, draw, results, results_table, warn
 from dln_jax.softbody.driven import Example, drive, driven_step
@@ -41,6 +41,7 @@ from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_ve
 from dln_jax.solvers.info import Info
 from dln_jax.studies.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 MATERIALS = {
     "stable-neo-hookean": stable_neo_hookean,

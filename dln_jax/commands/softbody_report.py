@@ -10,10 +10,11 @@ from typing import Annotated
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.files import write_json
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.soft_bodies import SUBJECTS, cases
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

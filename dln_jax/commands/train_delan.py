@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dln_jax.command_line.options import Drawn, Resumable, SingleCalls
-from dln_jax.files import run_folder
 from dln_jax.runs.dynamics import train_into
 from dln_jax.runs.dynamics_task import Options, prepare
+from dln_jax.zoo.run_folder import run_folder
 
 KINDS = {
     "structured": "structured-delan",

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.command_line.options import Drawn, Resumable
-from dln_jax.files import run_folder
 from dln_jax.runs.function_task import Options, prepare
 from dln_jax.runs.functions import train_into
+from dln_jax.zoo.run_folder import run_folder
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from typing import Literal
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.files import write_json
 from dln_jax.runs.frames import train_into
 from dln_jax.studies.hamiltonian.pixels import STEPS, pixel_data
 from dln_jax.types import require_positive, require_seed
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 from dln_jax.command_line.options import Drawn, Resumable, SingleCalls
 from dln_jax.command_line.running import CHOSEN, stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.files import write_json
 from dln_jax.runs.phase_space import train_into
 from dln_jax.runs.phase_space_task import Options, prepare
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)

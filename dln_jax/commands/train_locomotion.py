@@ -16,9 +16,10 @@ from rich.table import Table
 from dln_jax.command_line.arguments import refuse_given
 from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import CONFIG, run_folder, write_json
+from dln_jax.files import write_json
 from dln_jax.runs.locomotion import Options, announce, learned, prepare, write_run
 from dln_jax.types import InputError
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
 """Options that a method does not use."""

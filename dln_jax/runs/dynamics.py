@@ -13,7 +13,7 @@ from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.data.splits import merged
-from dln_jax.files import CONFIG, write_json
+from dln_jax.files import write_json
 from dln_jax.learning import dynamics
 from dln_jax.learning.basis_degrees import choose_degrees
 from dln_jax.learning.engine.checkpoint import Checkpoint
@@ -30,6 +30,7 @@ from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.kinds import build
 from dln_jax.zoo.load import load_run, save_model
+from dln_jax.zoo.run_folder import CONFIG
 
 
 def train_into(

@@ -16,7 +16,7 @@ from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import ensembles
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
-from dln_jax.files import CONFIG, write_figure, write_json
+from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Progress, Training, one_after_the_other
@@ -28,6 +28,7 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
 from dln_jax.runs.function_task import NAMED, Options, Task, of_named
 from dln_jax.zoo.load_function import load_function, save_function
+from dln_jax.zoo.run_folder import CONFIG
 
 RELU = (
     "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "

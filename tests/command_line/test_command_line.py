@@ -19,7 +19,7 @@ from dln_jax.__main__ import command, command_names, main
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import interrupted, run
-from dln_jax.files import CONFIG, run_folder
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = command_names()

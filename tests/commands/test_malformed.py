@@ -39,7 +39,7 @@ from dln_jax.commands import (
 )
 from dln_jax.data import archive, functions, meshes, schema
 from dln_jax.data.splits import split
-from dln_jax.files import CONFIG, LOCK, write_json
+from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.nn import ensembles
@@ -47,6 +47,7 @@ from dln_jax.types import InputError, Needs
 from dln_jax.zoo.kinds import build
 from dln_jax.zoo.load import save_model
 from dln_jax.zoo.load_function import save_function
+from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 TRAJECTORIES = {
     "t": np.tile(np.arange(4.0), 5),
