@@ -1,7 +1,7 @@
 """Train Hamiltonian models and baselines on the published tasks, and print their errors beside the published ones.
 
-Tasks: spring, pendulum, real-pendulum, two-body, three-body and pixels. Models: hnn (what suits the scene: separable,
-pairwise, with friction where the scene has it), black-box-hnn (one network is H), baseline (a network gives the rates).
+Tasks: spring, pendulum, real-pendulum, two-body, three-body and pixels. Models: what suits the scene (separable-hnn
+or pairwise-hnn, with friction where it has it), black-box-hnn (one network is H), phase-network (one gives the rates).
 Each is trained on the published data (those of seed 0) from several seeds; numbers are medians over these. Prints a
 table, writes report.json and table.md, and draws each task's motions and energies.
 """

@@ -1,10 +1,10 @@
 """Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
 
-Models: structured (a deep Lagrangian network, M = L Lᵀ), black-box (a network is the Lagrangian), trigonometric (linear
-in its parameters, one least-squares problem) and feed-forward (no physics). Without --data it trains on the embedded
-set: the tip of a two-link arm writes 20 letters, of which e, q and v are the test. A run folder gets config.json,
-metrics.json, model.safetensors and model.json (load them with dln_jax.load_run), a checkpoint to --resume from, and
-figures. For Hamiltonian networks see train_hnn.
+Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
+trigonometric (linear in its parameters, one least-squares problem) and feed-forward (no physics). Without --data it
+trains on the embedded set: the tip of a two-link arm writes 20 letters, of which e, q and v are the test. A run folder
+gets config.json, metrics.json, model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume
+from, and figures. For Hamiltonian networks see train_hnn.
 """
 
 from dataclasses import dataclass
@@ -15,25 +15,18 @@ from dln_jax.runs.dynamics import train_into
 from dln_jax.runs.dynamics_task import Options, prepare
 from dln_jax.zoo.run_folder import run_folder
 
-KINDS = {
-    "structured": "structured-delan",
-    "black-box": "black-box-delan",
-    "trigonometric": "trigonometric",
-    "feed-forward": "feed-forward",
-}
-
 
 @dataclass(frozen=True)
 class Arguments(Options, Resumable, Drawn, SingleCalls):
     """What to train on, how, and where the results go."""
 
-    model: Literal["structured", "black-box", "trigonometric", "feed-forward"] = "structured"
+    model: Literal["structured-delan", "black-box-delan", "trigonometric", "feed-forward"] = "structured-delan"
     """What is learned."""
 
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
-    task = prepare(given, KINDS)
+    task = prepare(given)
     wanted = {"figures": given.figures, "low_latency": given.low_latency}
     with run_folder(given.out, "train_delan", resume=given.resume) as folder:
         train_into(folder, task, given, resume=given.resume, **wanted)

@@ -2,7 +2,7 @@
 
 Functions: sin (1-D), cos_sin (cos x1 sin x2), both with the published noise, or an npz file of one's own with x [N, n],
 y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
-with dln_jax.zoo.load_function), and figures. For the published table of activations and losses see diffnet_table.
+with dln_jax.load), and figures. For the published table of activations and losses see diffnet_table.
 """
 
 from dataclasses import dataclass

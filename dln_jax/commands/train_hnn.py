@@ -1,6 +1,6 @@
 """Train a Hamiltonian network on trajectories with torques, and report its errors, its rollouts and its speed.
 
-Models: structured (H = ½ pᵀ M⁻¹(q) p + V(q)) and black-box (a network is H). Data with momenta p are fitted in
+Models: structured-hnn (H = ½ pᵀ M⁻¹(q) p + V(q)) and black-box-hnn (a network is H). Data with momenta p are fitted in
 Hamilton's equations, (q, p, tau) -> (qd, qdd); without them torques are fitted, through the Legendre transform. Errors
 are those of torques and accelerations in coordinates and velocities, as for every model. Without --data it trains on
 the embedded letters; a run folder gets what train_delan writes. Motions without applied forces are for train_hnn_task.
@@ -14,8 +14,6 @@ from dln_jax.runs.dynamics import train_into
 from dln_jax.runs.dynamics_task import Options, prepare
 from dln_jax.zoo.run_folder import run_folder
 
-KINDS = {"structured": "structured-hnn", "black-box": "black-box-hnn"}
-
 
 @dataclass(frozen=True)
 class Arguments(Options, Resumable, Drawn, SingleCalls):
@@ -23,13 +21,13 @@ class Arguments(Options, Resumable, Drawn, SingleCalls):
 
     MOVED: ClassVar = {"--task": "train_hnn_task --task NAME, and train_hnn_pixels for pixels"}
 
-    model: Literal["structured", "black-box"] = "structured"
+    model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"
     """What is learned."""
 
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
-    task = prepare(given, KINDS)
+    task = prepare(given)
     wanted = {"figures": given.figures, "low_latency": given.low_latency}
     with run_folder(given.out, "train_hnn", resume=given.resume) as folder:
         train_into(folder, task, given, resume=given.resume, **wanted)

@@ -1,16 +1,16 @@
-"""Train a Hamiltonian network, or a baseline, on films of a pendulum: an autoencoder with an energy in its plane.
+"""Train a Hamiltonian network, or a plain one, on films of a pendulum: an autoencoder with an energy in its plane.
 
 The films are generated: 28 x 28 pixels of a swinging rod. A run folder gets config.json, metrics.json,
-model.safetensors and model.json (load them with dln_jax.zoo.load_latent), a checkpoint to --resume from, and figures.
+model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume from, and figures.
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.files import write_json
+from dln_jax.models.latent_phase import Field
 from dln_jax.runs.frames import train_into
 from dln_jax.studies.hamiltonian.pixels import STEPS, pixel_data
 from dln_jax.types import require_positive, require_seed
@@ -21,7 +21,7 @@ from dln_jax.zoo.run_folder import CONFIG, run_folder
 class Arguments(Resumable, Drawn):
     """What to train on, how, and where the results go."""
 
-    model: Literal["hnn", "baseline"] = "hnn"
+    model: Field = "black-box-hnn"
     """An energy in the latent plane, or a network that gives the rates there."""
     trajectories: Unstated[int] = None
     """Generated films (default: as published)."""

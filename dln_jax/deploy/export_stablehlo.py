@@ -65,7 +65,7 @@ def export_dynamics(
     """Artefacts inverse_dynamics, forward_dynamics, energy and mass_matrix of a model, as far as it has them.
 
     Args:
-        dynamics: of one state, for instance from `load_run`.
+        dynamics: of one state, for instance `load(folder).dynamics`.
         degrees_of_freedom: d.
         directory: is created where it is missing; all artefacts are written, or none.
         dtype: of the arguments; float64 needs `jax_enable_x64`.

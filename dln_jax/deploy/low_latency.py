@@ -48,7 +48,7 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
     """The function compiled for arguments like the examples, and called once.
 
     Args:
-        function: of arrays, its parameters closed over, for instance `load_run(folder).inverse_dynamics`.
+        function: of arrays, its parameters closed over, for instance `load(folder).dynamics.inverse_dynamics`.
         examples: one argument each, of the shape and type that calls will have.
         numpy: arguments are copied into one buffer, which costs one transfer instead of one for each, and results are
             NumPy arrays. Arguments must have one type; others are converted to it. The buffer makes the callable

@@ -77,7 +77,7 @@ def inject_energy(
     parameters = with_float64(parameters)
     field = flow(model.field.energies(parameters["field"]))
     if not isinstance(field, Flow):
-        raise InputError("the model has no energy to raise; give one whose latent field is an 'hnn'")
+        raise InputError("the model has no energy to raise; give one whose latent field is a black-box-hnn")
     H = field.energy
     still = np.tile(pictures(np.zeros(1))[0], 2)
     q, p = encoded(model, parameters, np.stack([pair, still]))

@@ -14,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import Canonical, System, dynamics, hamiltonian_of
 from dln_jax.types import InputError, Scalar, Vector
-from dln_jax.zoo.kinds import KINDS
+from dln_jax.zoo.catalogue import CATALOGUE
 
 
 class Objective(NamedTuple):
@@ -95,12 +95,10 @@ BOTH_WAYS = Objective(
 """[tau_hat - tau, qdd_hat - qdd], for models whose inverse and forward sides are different networks."""
 
 
-OBJECTIVES = {"torque": TORQUE, "canonical": CANONICAL, "both ways": BOTH_WAYS}
-
-
-def objective_of(kind: str, data: Trajectories) -> Objective:
-    """What a kind of model is fitted to: without momenta in the data, a Hamiltonian is fitted to torques."""
-    objective = OBJECTIVES[KINDS[kind].fitted_to]
+def objective_of(name: str, data: Trajectories) -> Objective:
+    """What a model of the catalogue is fitted to: without momenta in the data, a Hamiltonian is fitted to torques."""
+    properties = CATALOGUE[name].properties
+    objective = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
     complete = all(getattr(data, key) is not None for key in objective.keys)
     return objective if complete else TORQUE
 

@@ -11,13 +11,13 @@ four layers, the hidden ones residual:
 
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
-The rates are those of an energy of one coordinate, or of the baseline's network: any `Model`. Latent time is
+The rates are those of an energy of one coordinate, or a network's: any `Model`. Latent time is
 counted in frames. Pictures enter and leave as differences from their mean, by their typical size.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import haiku as hk
 import jax
@@ -41,7 +41,8 @@ from dln_jax.types import InputError, Needs, require_positive
 NEEDS = Needs(joints=("prismatic",))
 """Of the latent plane: z_q is a number, not an angle, and nothing is applied to it or lost."""
 LAYERS = 4
-FIELDS = ("hnn", "baseline")
+Field = Literal["black-box-hnn", "phase-network"]
+"""What moves in the latent plane: by an energy, or by a network for the rates."""
 
 Latent = Float[Array, "1"]
 
@@ -54,7 +55,7 @@ class LatentPhase(NamedTuple):
     decode: Callable[[Array, Array], Array]
     """(z_q, z_p) -> two frames [n]."""
     field: Flow | PlainFlow
-    """(z_q, z_p) -> rates per frame; with an energy for "hnn"."""
+    """(z_q, z_p) -> rates per frame; with an energy for black-box-hnn."""
 
 
 class LatentModel(NamedTuple):
@@ -69,7 +70,7 @@ class LatentModel(NamedTuple):
 
 
 def latent_field(
-    kind: str,
+    name: str,
     *,
     width: int = 64,
     depth: int = 2,
@@ -77,10 +78,10 @@ def latent_field(
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """A black-box energy ("hnn"), or a network for the rates ("baseline"), of one coordinate.
+    """A black-box energy, or a network for the rates, of one coordinate.
 
     Args:
-        kind: "hnn" or "baseline".
+        name: black-box-hnn or phase-network.
         width: hidden units per layer.
         depth: hidden layers.
         activation: of the hidden layers; it must be smooth.
@@ -88,14 +89,16 @@ def latent_field(
         dtype: of the parameters.
 
     Raises:
-        InputError: another kind, or a size that is not positive.
+        InputError: another name, or a size that is not positive.
     """
-    if kind not in FIELDS:
-        raise InputError(f"field is '{kind}'; expected one of {', '.join(FIELDS)}")
+    if name not in get_args(Field):
+        raise InputError(f"field is '{name}'; expected one of {', '.join(get_args(Field))}")
     size: dict[str, Any] = {"width": width, "depth": depth, "activation": activation, "dtype": dtype}
-    if kind == "hnn":
+    # Written out, so that no change of their defaults changes a stored model.
+    size["momentum_scale"] = 1.0
+    if name == "black-box-hnn":
         return _slowed(make_black_box_hamiltonian(NEEDS, **size), momentum_scale)
-    return _slowed(make_phase_network(NEEDS, **size), momentum_scale)
+    return _slowed(make_phase_network(NEEDS, **size, rate_scale=1.0), momentum_scale)
 
 
 def _slowed(model: Model, rate: float) -> Model:

@@ -28,8 +28,9 @@ from dln_jax.runs.dynamics_results import Task, best_seed, definiteness_of, eval
 from dln_jax.runs.dynamics_task import Options
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_run, save_model
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import load, save
 from dln_jax.zoo.run_folder import CONFIG
 
 
@@ -44,7 +45,7 @@ def train_into(
     console = Console(highlight=False, soft_wrap=True)
     write_json(folder / CONFIG, stored_arguments(given))
     announce(console, task)
-    if task.kind == "trigonometric":
+    if CATALOGUE[task.kind].properties.linear:
         task, training = fit_trigonometric(task, console, grown=given.degree is None)
     elif given.target is not None:
         task, training = grow_to_target(task, given.target, folder, console, resume=resume)
@@ -53,7 +54,7 @@ def train_into(
     if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
         raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
     parameters, best = best_seed(training, given.seeds)
-    save_model(folder, task.description, parameters)
+    save(folder, task.description, parameters)
     metrics = evaluate(folder, task, training, seeds=given.seeds, draw=figures)
     if low_latency:
         metrics |= low_latency_metrics(folder, latency_states(task), console.print)
@@ -75,7 +76,8 @@ def announce(console: Console, task: Task) -> None:
     console.print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
     if task.sets.train.estimated:
         console.print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
-    if task.kind.endswith("hnn") and task.objective is TORQUE:
+    properties = CATALOGUE[task.kind].properties
+    if properties.canonical and task.objective is TORQUE:
         console.print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.optimiser is not None:
         why = f" ({task.optimiser_reason})" if task.optimiser_reason else ""
@@ -134,9 +136,11 @@ def _degrees(degrees: tuple[int, ...]) -> str:
 
 def warn(console: Console, task: Task, training: Training, folder: Path) -> None:
     """Says what a user should know about how training ended, and of what came of it."""
-    found = definiteness_of(load_run(folder), task, merged(task.sets))
+    found = definiteness_of(load(folder).dynamics, task, merged(task.sets))
     if found is not None and found.share_not_definite > 0:
-        remedy = "another --degree, --model structured" if task.kind == "trigonometric" else "a structured model"
+        properties = CATALOGUE[task.kind].properties
+        structured = f"--model {'structured-hnn' if properties.canonical else 'structured-delan'}"
+        remedy = f"another --degree, {structured}" if properties.linear else structured
         console.print(
             f"the mass matrix is not positive definite at {found.share_not_definite:.1%} of the states of the data: "
             f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"

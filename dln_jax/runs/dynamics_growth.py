@@ -16,8 +16,8 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_results import Task, latency_of
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import compiled
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import compiled
 
 WIDTHS = (4, 8, 16, 32)
 DEPTHS = (1, 2)

@@ -24,8 +24,9 @@ from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
 from dln_jax.precision import data_type
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_run, load_system
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import load
 
 
 class Task(NamedTuple):
@@ -38,7 +39,7 @@ class Task(NamedTuple):
     needs: Needs
     needs_origin: str
     description: dict[str, Any]
-    """Of the model, for `dln_jax.zoo.kinds.build`."""
+    """Of the model, for `dln_jax.zoo.build`."""
     objective: Objective
     optimiser: Optimiser | None
     """`None` for the trigonometric model, which is one least-squares problem."""
@@ -60,9 +61,10 @@ class Task(NamedTuple):
 def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
     """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
     dtype = data_type(task.precision)
-    functions = load_run(folder)
+    run = load(folder)
+    functions = run.dynamics
     test = task.sets.test
-    predicted = predictions(load_system(folder), test, dtype)
+    predicted = predictions(run.energies, test, dtype)
     latency = latency_of(functions, task)
     if draw:
         draw_figures(folder, task, training, functions, predicted)
@@ -120,7 +122,8 @@ def latency_states(task: Task) -> tuple[np.ndarray, ...]:
 
 def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
     """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
-    if not task.kind.startswith(("black-box", "trigonometric")):
+    properties = CATALOGUE[task.kind].properties
+    if properties.definite or not properties.energy:
         return None
     return definiteness(functions, data.q, data.qd)
 
@@ -172,7 +175,7 @@ def draw_figures(
     """Writes what there is to draw."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted, model=task.kind))
-    if training.history and task.kind != "trigonometric":
+    if training.history and not CATALOGUE[task.kind].properties.linear:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))

@@ -22,7 +22,8 @@ from dln_jax.scenes.registry import SCENES, scene_named
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs, require_positive, require_seed
-from dln_jax.zoo.kinds import build, describe
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build, describe_for
 
 OF_NETWORKS = ("width", "depth", "activation")
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
@@ -32,7 +33,7 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 class Options(Limited):
     """What to train on, and how."""
 
-    model: str = "structured"
+    model: str = "structured-delan"
     """What is learned."""
     data: Unstated[Path] = None
     """Trajectories in the npz schema (default: the embedded characters, or random states of --scene)."""
@@ -75,11 +76,9 @@ class Options(Limited):
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
 
 
-def prepare(given: Options, kinds: dict[str, str]) -> Task:
+def prepare(given: Options) -> Task:
     """Reads and checks everything that the arguments name, before anything is written."""
-    if given.model not in kinds:
-        raise InputError(f"model is '{given.model}'; expected one of {', '.join(kinds)}")
-    kind = kinds[given.model]
+    kind = given.model
     scene = scene_named(given.scene) if given.scene else None
     labels = tuple(given.test.split(",")) if given.test else None
     if given.data is not None:
@@ -115,7 +114,7 @@ def check_options(given: Options, kind: str) -> None:
     """Refuses options that the model does not read."""
     require_positive(seeds=given.seeds)
     require_seed(given.seed, given.seeds)
-    if kind == "trigonometric":
+    if CATALOGUE[kind].properties.linear:
         if given.seeds > 1:
             raise InputError(f"--seeds is {given.seeds}, but one least-squares problem has no seeds; leave it out")
         names = (*OF_NETWORKS, *OF_ADAM, "steps", "seconds", "target")
@@ -135,7 +134,7 @@ def default_width(kind: str, optimizer: str) -> int:
     """Hidden units per layer: structure needs fewer, and first-order training more."""
     if optimizer == "adam":
         return 64
-    return 8 if kind.startswith("structured") else 16
+    return 8 if CATALOGUE[kind].properties.definite else 16
 
 
 def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
@@ -155,13 +154,13 @@ def model_and_optimiser(
     """Description of the model, its optimiser, and why that one."""
     check_options(given, kind)
     precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
-    if kind == "trigonometric":
+    if CATALOGUE[kind].properties.linear:
         keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
-        description = describe(kind, sets.train, needs, precision=precision, **keywords)
+        description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
         return description, None, ""
     keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
     require_positive(width=keywords["width"], depth=keywords["depth"])
-    description = describe(kind, sets.train, needs, precision=precision, **keywords)
+    description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
     model = build(description)
     optimizer, reason = given.optimizer, ""
     if optimizer == "auto":

@@ -11,13 +11,15 @@ from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.problem import Progress
+from dln_jax.models.latent_phase import Field
 from dln_jax.studies.hamiltonian import pixels as pixel_task
-from dln_jax.zoo.load_latent import save_latent
+from dln_jax.zoo.pictures import with_components
+from dln_jax.zoo.run import save
 
 
 def train_into(
     folder: Path,
-    kind: str,
+    kind: Field,
     data: FrameSplit,
     *,
     seed: int,
@@ -30,7 +32,7 @@ def train_into(
 
     Args:
         folder: of the run.
-        kind: "hnn" or "baseline".
+        kind: of what moves in the latent plane.
         data: `pixel_data(trajectories)`.
         seed: of the initial parameters and the shuffling.
         steps: of Adam.
@@ -51,7 +53,8 @@ def train_into(
             checkpoint=Checkpoint(folder, known, resume),
             report=lambda at: show(at.step, shown(at)),
         )
-    save_latent(folder, kind, seen.components, seen.parameters)
+    description = pixel_task.picture_description(kind, seen.components)
+    save(folder, description, with_components(seen.components, seen.parameters))
     write_json(folder / "metrics.json", {key: value for key, value in numbers.items() if np.isfinite(value)})
     if figures:
         pixel_task.draw_pixels({kind: seen}, data, folder)

@@ -26,8 +26,10 @@ from dln_jax.learning.standardisation import layers_in_own_units, to_units
 from dln_jax.metrics.functions import errors, predictions, typical_spread
 from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
+from dln_jax.nn.differential_mlp import Layers
 from dln_jax.runs.function_task import NAMED, Options, Task, of_named
-from dln_jax.zoo.load_function import load_function, save_function
+from dln_jax.zoo.descriptions import Description, describe
+from dln_jax.zoo.run import load, save
 from dln_jax.zoo.run_folder import CONFIG
 
 RELU = (
@@ -49,7 +51,7 @@ def train_into(folder: Path, task: Task, given: Options, *, resume: bool = False
     if training.stop.reason == "not finite":
         console.print("the loss stopped being finite; the run keeps the best parameters before that")
     layers = layers_in_own_units(training.parameters, task.units)
-    save_function(folder, layers, activation=task.network.activation, precision=task.network.precision)
+    save(folder, description_of(layers, task.network), layers)
     metrics = evaluate(folder, task, training)
     if figures:
         draw_figures(folder, task, training, trials)
@@ -58,6 +60,14 @@ def train_into(folder: Path, task: Task, given: Options, *, resume: bool = False
     if task.network.activation == "relu":
         console.print(RELU)
     console.print(f"run folder: {folder}")
+
+
+def description_of(layers: Layers, network: Network) -> Description:
+    """Of a network, or an ensemble; `layers` have the members on their leading axis."""
+    members, inputs, _ = layers[0][0].shape
+    stated = {"activation": network.activation, "precision": network.precision}
+    sizes = [inputs, *(weight.shape[2] for weight, _ in layers)]
+    return describe("differential-network", sizes=sizes, members=members, **stated)
 
 
 def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Network, Training, list[Trial]]:
@@ -112,11 +122,12 @@ def announce(console: Console, task: Task) -> None:
 
 def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
     """Loads the stored model as a user would, and measures it on the test samples."""
-    loaded = load_function(folder)
+    loaded = load(folder)
     function = activation(task.network.activation)
-    tested = predictions(loaded.layers, task.test.x, activation=function)
+    tested = predictions(loaded.parameters, task.test.x, activation=function)
     metrics = errors(tested.mean, task.test)
-    spread = predictions(loaded.layers, task.shown.x, activation=function).spread if task.bound is not None else None
+    bounded = task.bound is not None
+    spread = predictions(loaded.parameters, task.shown.x, activation=function).spread if bounded else None
     if task.bound is not None and spread is not None:
         inside = np.all(abs(task.shown.x) <= task.bound, axis=1)
         metrics["spread_inside"] = typical_spread(spread, inside)
@@ -126,7 +137,7 @@ def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
         **metrics,
         "validation_loss": float(training.validation),
         "width": task.network.width,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.layers)),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.parameters)),
         "steps": training.stop.step,
         "best_step": training.best_step,
         "compile_seconds": training.compile_seconds,
@@ -138,8 +149,8 @@ def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
 
 def draw_figures(folder: Path, task: Task, training: Training, trials: list[Trial]) -> None:
     """Writes what fits the number of inputs."""
-    inputs, loaded = task.test.inputs, load_function(folder)
-    shown = predictions(loaded.layers, task.shown.x, activation=activation(task.network.activation))
+    inputs, loaded = task.test.inputs, load(folder)
+    shown = predictions(loaded.parameters, task.shown.x, activation=activation(task.network.activation))
     drawn = {"training": training_figure(training, trials)} if training.history else {}
     if inputs == 1:
         drawn["curves"] = drawing.function_curves(task.shown, shown.mean)

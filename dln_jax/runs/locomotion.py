@@ -21,7 +21,8 @@ from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, Task, Walk, creature_named, make_task
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive, require_seed
-from dln_jax.zoo.load import save_model
+from dln_jax.zoo.parameter_files import save_tree
+from dln_jax.zoo.run import MODEL
 
 GOAL = 1.0
 """Body lengths that the methods are compared by."""
@@ -109,14 +110,14 @@ def write_run(
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
     description = {
-        "kind": f"locomotion-{method}",
+        "name": f"locomotion-{method}",
         "creature": creature,
         "width": given.width or WIDTH,
         "precision": "f64",
         "clock_period": task.clock_period,
         "settings": settings_of(method, creature, given.window)._asdict(),
     }
-    save_model(folder, description, best.parameters)
+    save_tree(folder, MODEL, best.parameters, {"model": description})
     seen = shown_walk(task, trained.policy, best.parameters, task.episode)
     numbers = metrics_of(task, trained, seen)
     write_json(folder / "metrics.json", numbers)

@@ -19,10 +19,10 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.runs.phase_space_task import PhaseTask
 from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once, units_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
-from dln_jax.studies.hamiltonian.training import KINDS, MOTIONS, RATES, Trained, stages_of, train
+from dln_jax.studies.hamiltonian.training import MOTIONS, RATES, Trained, stages_of, train
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
-from dln_jax.zoo.load import load_phase_field, save_model
+from dln_jax.zoo.run import load, save
 
 GIF_FRAMES = 80
 LOSSES = {
@@ -47,7 +47,7 @@ def train_into(
         trained = train(problem, description, **training, directory=folder, resume=resume, report=report)
     if not np.isfinite(trained.result.validation):
         raise InputError(f"{trained.stopped}; {folder} holds no model")
-    save_model(folder, description, trained.result.parameters)
+    save(folder, description, trained.result.parameters)
     numbers, seen = measured_once(problem, trained)
     metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.result.validation)}
     if low_latency:
@@ -55,7 +55,7 @@ def train_into(
         metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
     write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
     if figures:
-        draw(folder, problem, description["kind"], seen, trained)
+        draw(folder, problem, description["name"], seen, trained)
     console.print(results_table(metrics, problem))
     console.print(f"run folder: {folder}")
     if trained.diverged:
@@ -88,7 +88,7 @@ def announce(console: Console, problem: Problem, description: dict[str, Any]) ->
     needs = problem.needs
     terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
     console.print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
-    console.print(f"{'-'.join(needs.joints)} with {terms}; {description['kind']}, f64")
+    console.print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
     missing = [key for key in data.estimated if key != "tau"]
     if missing:
         console.print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
@@ -98,15 +98,14 @@ def announce(console: Console, problem: Problem, description: dict[str, Any]) ->
 
 def latency_of(folder: Path, problem: Problem) -> dict[str, float]:
     """Of one call of the rates, of the stored model as a user loads it."""
-    field, truth = load_phase_field(folder), problem.truth[0]
+    field, truth = load(folder).flow, problem.truth[0]
     states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
     found = one_step(field.rates, states, calls=2000)
     return {"one_step_p50_us": found.p50_us, "one_step_p99_us": found.p99_us}
 
 
-def draw(folder: Path, problem: Problem, kind: str, seen: Seen, trained: Trained) -> None:
+def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
     """Writes what there is to draw."""
-    name = "baseline" if kind == KINDS["baseline"] else "hnn"
     write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
     truth = problem.truth[0]
     stride = max(1, len(truth.t) // GIF_FRAMES)

@@ -12,7 +12,6 @@ from dln_jax.command_line.running import needs_from_option
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.studies.hamiltonian.tasks import MEASURED, TASKS, Problem, problem_of
 from dln_jax.studies.hamiltonian.training import (
-    KINDS,
     MOTIONS,
     POLYNOMIAL,
     check,
@@ -20,7 +19,7 @@ from dln_jax.studies.hamiltonian.training import (
     stages_of,
 )
 from dln_jax.types import InputError, require_positive, require_seed
-from dln_jax.zoo.phase_kinds import build_phase
+from dln_jax.zoo.descriptions import build
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,15 @@ class Options(Limited):
 
     task: Annotated[str, choice(TASKS)] = "spring"
     """What moves."""
-    model: Literal["auto", "separable", "structured", "black-box", "pairwise", "polynomial", "baseline"] = "auto"
+    model: Literal[
+        "auto",
+        "separable-hnn",
+        "structured-hnn",
+        "black-box-hnn",
+        "pairwise-hnn",
+        "polynomial-hamiltonian",
+        "phase-network",
+    ] = "auto"
     """What is learned; auto: what suits the task."""
     data: Unstated[Path] = None
     """Trajectories in the npz schema, for measured and real-pendulum."""
@@ -61,7 +68,7 @@ class PhaseTask(NamedTuple):
 
     problem: Problem
     description: dict[str, Any]
-    """Of the model, for `build_phase`."""
+    """Of the model, for `dln_jax.zoo.build`."""
     training: dict[str, Any]
     """Keywords of `studies.hamiltonian.training.train`."""
 
@@ -91,17 +98,17 @@ def check_options(given: Options) -> None:
     if given.optimizer != "adam":
         refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
     if given.model != POLYNOMIAL:
-        refuse_given(given, ["degree"], "for the polynomial model")
+        refuse_given(given, ["degree"], "for polynomial-hamiltonian")
 
 
 def check_suited(given: Options, problem: Problem, description: dict[str, Any]) -> None:
     """Refuses what this task or its model does not take."""
-    build_phase(description)
+    build(description)
     if problem.name != MEASURED:
         refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
     if problem.name not in PROTOCOLS:
         refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
-    if description["kind"] == KINDS[POLYNOMIAL]:
+    if description["name"] == POLYNOMIAL:
         linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
         refuse_given(given, ["width", "depth", "activation"], linear)
         if MOTIONS not in stages_of(problem, description):

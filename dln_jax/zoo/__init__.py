@@ -1,1 +1,19 @@
 """The models by name, and trained ones in folders: what describes a model, saves it and loads it."""
+
+from dln_jax.zoo.catalogue import CATALOGUE, Entry, Properties
+from dln_jax.zoo.descriptions import build, describe, describe_for, typical_sizes
+from dln_jax.zoo.run import Run, compiled, load, save
+
+__all__ = [
+    "CATALOGUE",
+    "Entry",
+    "Properties",
+    "Run",
+    "build",
+    "compiled",
+    "describe",
+    "describe_for",
+    "load",
+    "save",
+    "typical_sizes",
+]

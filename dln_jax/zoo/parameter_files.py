@@ -17,7 +17,9 @@ import safetensors.numpy
 from dln_jax.files import is_file, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+READ = (1, SCHEMA_VERSION)
+"""Versions that this release reads."""
 REMEDY = "restore the file or train again"
 
 
@@ -64,15 +66,12 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")
     manifest = read_json(path, remedy=REMEDY)
     version, file_name = manifest.get("schema_version"), manifest.get("tensor_file")
-    if type(version) is not int or version != SCHEMA_VERSION:
+    if type(version) is not int or version not in READ:
         raise InputError(
-            f"{path}: schema version {reprlib.repr(version)}; this release reads version {SCHEMA_VERSION}; {REMEDY}"
+            f"{path}: schema version {reprlib.repr(version)}; this release reads {READ[0]} and {READ[1]}; {REMEDY}"
         )
     if not isinstance(file_name, str) or Path(file_name).name != file_name:
         raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
-    model = manifest.get("model", {"kind": ""})
-    if not isinstance(model, dict) or not isinstance(model.get("kind"), str):
-        raise InputError(f"{path}: describes no model, but {reprlib.repr(model)}; {REMEDY}")
     return manifest
 
 

@@ -15,6 +15,7 @@ from dln_jax.studies.arm import models as arm_models
 from dln_jax.studies.arm import table
 from dln_jax.studies.arm.data import states
 from dln_jax.studies.published import ARM
+from dln_jax.zoo.catalogue import CATALOGUE
 
 NUMBERS = {
     **{f"{name}_mse": 1e-7 for name in ("torque", "inertial", "coriolis", "gravity", "torque_from_momenta")},
@@ -55,7 +56,7 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
     for case, values in ARM.values.items():
         # Published Hamiltonian torques are computed from recorded momenta, and compared with ours of that kind.
-        by_momenta = case.split("/")[0].endswith("hnn")
+        by_momenta = CATALOGUE[case.split("/")[0]].properties.canonical
         assert ("torque_from_momenta_mse" in values) == by_momenta != ("torque_mse" in values)
         assert (rows[case, "torque_mse"]["reference"] is None) == by_momenta
         for quantity, value in values.items():

@@ -29,8 +29,8 @@ from dln_jax.studies.speed import one_step as benchmark_one_step
 from dln_jax.studies.speed import throughput as benchmark_throughput
 from dln_jax.studies.speed.subjects import SUBJECTS
 from dln_jax.types import Needs
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import save_model
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import save
 
 
 def test_the_full_hessian_way_gives_the_same_torques(d=2):
@@ -108,7 +108,7 @@ def small_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "structured-delan"
     folder.mkdir()
     description = described("structured-delan", published_split(letters(None)).train, width=2, depth=1)
-    save_model(folder, description, build(description).init(jax.random.key(0)))
+    save(folder, description, build(description).init(jax.random.key(0)))
     return folder
 
 

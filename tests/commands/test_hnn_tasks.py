@@ -27,14 +27,14 @@ from dln_jax.studies.hamiltonian.tasks import pieces, problem_of
 from dln_jax.studies.hamiltonian.training import RECIPES, description_of, models_of
 from dln_jax.studies.published import HAMILTONIAN
 from dln_jax.types import InputError
-from dln_jax.zoo.load import load_phase_field
+from dln_jax.zoo.run import load
 
-KINDS = {
-    "spring": ("polynomial",),
-    "pendulum": ("baseline",),
-    "real-pendulum": ("hnn",),
+MEASURED = {
+    "spring": ("polynomial-hamiltonian",),
+    "pendulum": ("phase-network",),
+    "real-pendulum": ("separable-hnn",),
     "two-body": ("black-box-hnn",),
-    "three-body": ("hnn",),
+    "three-body": ("pairwise-hnn",),
 }
 """Each kind of model on one task at least; a program of each takes seconds to compile."""
 
@@ -57,7 +57,7 @@ def quick_training(problem, description, **options):
 def quick_pixels(kind):
     """The pictures have tests of their own; here, what the table does with their numbers."""
     numbers = dict.fromkeys(("energy_mse", "rollout_mse", "compile_seconds", "parameters", "test_loss"), 2.0)
-    return {**numbers, "energy_mse": 1e-5 if kind == "hnn" else 1e-3, "train_seconds": 1.0}
+    return {**numbers, "energy_mse": 1e-5 if kind == "black-box-hnn" else 1e-3, "train_seconds": 1.0}
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_models, "RECIPES", small)
         patch.setattr(hnn_tasks, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
-        patch.setattr(table, "models_of", KINDS.get)
+        patch.setattr(table, "models_of", MEASURED.get)
         patch.setattr(hnn_measures, "predict", quick_prediction)
         patch.setattr(table, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
@@ -101,11 +101,11 @@ def test_every_task_runs_and_reports(workplace, capsys):
     command(hnn_table, *TINY, "--real-pendulum", "swing.npz", "--out", "all")
     report = json.loads((workplace / "all" / "report.json").read_text())
     rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
-    assert rows["pixels/hnn", "energy_mse_over_baseline"]["pass"] is True
-    assert "| pixels/baseline |" in (workplace / "all" / "table.md").read_text()
-    for task in KINDS:
+    assert rows["pixels/black-box-hnn", "energy_mse_over_baseline"]["pass"] is True
+    assert "| pixels/phase-network |" in (workplace / "all" / "table.md").read_text()
+    for task in MEASURED:
         assert (workplace / "all" / f"{task}.png").read_bytes().startswith(b"\x89PNG")
-        for kind in KINDS[task]:
+        for kind in MEASURED[task]:
             quantities = {quantity for case, quantity in rows if case == f"{task}/{kind}"}
             assert {"energy_mse", "rollout_mse", "train_seconds", "compile_seconds", "parameters"} <= quantities
             if task != hnn_tasks.REAL:
@@ -115,9 +115,9 @@ def test_every_task_runs_and_reports(workplace, capsys):
                 if (f"{task}/{kind}", quantity) in rows:
                     assert rows[f"{task}/{kind}", quantity]["reference"] == published
     # The polynomial holds the oscillator.
-    assert rows["spring/polynomial", "clean_field_mse"]["value"] < 0.1
-    assert rows["three-body/hnn", "energy_mse"]["bound"] == 4.2e-3
-    assert "published_energy_mse" in {quantity for case, quantity in rows if case == "pendulum/baseline"}
+    assert rows["spring/polynomial-hamiltonian", "clean_field_mse"]["value"] < 0.1
+    assert rows["three-body/pairwise-hnn", "energy_mse"]["bound"] == 4.2e-3
+    assert "published_energy_mse" in {quantity for case, quantity in rows if case == "pendulum/phase-network"}
 
 
 def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch):
@@ -130,8 +130,8 @@ def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch)
 
 def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypatch):
     numbers = {"energy_mse": 1e-6, "train_seconds": 6.0}
-    monkeypatch.setattr(table, "models_of", lambda task: ("hnn",))
-    monkeypatch.setattr(table, "phase_task", lambda name, **given: Findings(rows_of(f"{name}/hnn", numbers)))
+    monkeypatch.setattr(table, "models_of", lambda task: ("separable-hnn",))
+    monkeypatch.setattr(table, "phase_task", lambda name, **given: Findings(rows_of(f"{name}/separable-hnn", numbers)))
     command(hnn_table, *TINY, "--tasks", "spring,real-pendulum", "--no-figures", "--out", "part")
     out = capsys.readouterr().out
     assert "real-pendulum is left out" in out
@@ -140,13 +140,19 @@ def test_the_real_task_is_left_out_without_its_data(workplace, capsys, monkeypat
 
 
 def test_bounds_decide():
-    line = markdown(rows_of("spring/hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7})).splitlines()[-1]
+    line = markdown(
+        rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "energy_mse_standard_error": 2e-7})
+    ).splitlines()[-1]
     assert "1.0e-06 ± 2e-07 / 3.8e-04" in line
-    bare = rows_of("spring/hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
+    bare = rows_of("spring/separable-hnn", {"energy_mse": 1e-6, "train_seconds": 6.0})
     rows = {row.quantity: row for row in table_rows(bare)}
     assert rows["energy_mse"].passed is True and rows["train_seconds"].passed is False
-    assert all(row.bound is None for row in table_rows(rows_of("spring/baseline", {"energy_mse": 1e-6})))
-    assert {f"{task}/hnn" for task in TASKS} == set(BOUNDS) < set(HAMILTONIAN.values)
+    assert all(row.bound is None for row in table_rows(rows_of("spring/phase-network", {"energy_mse": 1e-6})))
+    assert {*(f"{task}/{RECIPES[task].suits}" for task in TASKS if task != PIXELS), "pixels/black-box-hnn"} == set(
+        BOUNDS
+    )
+    compared = ("black-box-hnn", "phase-network")
+    assert {f"{task}/{name}" for task in TASKS for name in compared} == set(HAMILTONIAN.values)
     assert set(RECIPES) == set(hnn_tasks.TASKS)
 
 
@@ -174,9 +180,10 @@ def test_mistakes_are_one_line(workplace, capsys):
     ]
     for number, (options, message) in enumerate(cases):
         assert message in refused(capsys, hnn_table, *options, "--out", f"no-{number}")
-    with pytest.raises(InputError, match="model 'delan' is unknown; choose from hnn"):
-        description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), "delan")
-    assert set(models_of("spring")) == {"hnn", "black-box-hnn", "baseline", "polynomial"}
+    for name, message in (("delan", "model is 'delan'; this release knows"), ("feed-forward", "is of no phase space")):
+        with pytest.raises(InputError, match=message):
+            description_of(problem_of(hnn_tasks.REAL, data=workplace / "swing.npz"), name)
+    assert models_of("spring") == ("separable-hnn", "black-box-hnn", "phase-network", "polynomial-hamiltonian")
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +220,7 @@ def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     command(train_hnn_task, "--out", str(folder), "--resume", "--no-figures", "--no-low-latency")
     again = load_file(folder / "model.safetensors")
     assert set(again) == set(stored) and all(np.array_equal(again[key], stored[key]) for key in stored)
-    field = load_phase_field(folder)
+    field = load(folder).flow
     assert isinstance(field, Flow)
     qd, pd = field.rates(np.ones(1), np.ones(1))
     assert np.isfinite(qd).all() and np.isfinite(pd).all()
@@ -226,7 +233,7 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         (("--task", "measured"), "needs its data"),
         (("--task", "measured", "--data", "forced.npz"), "applied forces"),
         (("--task", "spring", "--data", "positions.npz"), "generates its data"),
-        ((*OWN, "--model", "pairwise"), "positions of bodies"),
+        ((*OWN, "--model", "pairwise-hnn"), "positions of bodies"),
         ((*OWN, "--precision", "f32"), "Unrecognized options: --precision"),
         ((*OWN, "--seeds", "3"), "Unrecognized options: --seeds"),
         ((*OWN, "--target", "1e-6"), "Unrecognized options: --target"),
@@ -240,8 +247,8 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         ((*OWN, "--weight-decay", "0.1"), "Unrecognized options: --weight-decay"),
         ((*OWN, "--learning-rate", "0.1"), "add --optimizer adam"),
         ((*OWN, "--optimizer", "adam", "--learning-rate", "nan"), "--learning-rate is nan"),
-        ((*OWN, "--degree", "3"), "--degree is for the polynomial model"),
-        ((*OWN, "--model", "polynomial", "--width", "3"), "--width is for networks"),
+        ((*OWN, "--degree", "3"), "--degree is for polynomial-hamiltonian"),
+        ((*OWN, "--model", "polynomial-hamiltonian", "--width", "3"), "--width is for networks"),
         ((*OWN, "--trajectories", "3"), "--trajectories is for generated data"),
         (("--task", "spring", "--needs", '{"joints": ["prismatic"]}'), "--needs is what the task 'spring' decides"),
         (("--task", "measured", "--data", "marked.npz"), "q has numbers of up to 1.0e+308"),
@@ -278,4 +285,4 @@ def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch
     command(train_hnn_task, *options, "hurried", "--seconds", "1e-6")
     assert "out of time after the fit of rates: motions were not fitted" in capsys.readouterr().out
     assert np.isfinite(json.loads((positions.parent / "hurried" / "metrics.json").read_text())["validation_error"])
-    assert isinstance(load_phase_field(positions.parent / "hurried"), Flow)
+    assert isinstance(load(positions.parent / "hurried").flow, Flow)

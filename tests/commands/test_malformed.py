@@ -42,11 +42,9 @@ from dln_jax.data.splits import split
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
-from dln_jax.nn import ensembles
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import save_model
-from dln_jax.zoo.load_function import save_function
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import save
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 TRAJECTORIES = {
@@ -57,14 +55,9 @@ TRAJECTORIES = {
 SAMPLES = {"x": np.linspace(0.0, 1.0, 20)[:, None], "y": np.ones((20, 1))}
 MESH = {"vertices": np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), "elements": np.array([[0, 1, 2]])}
 LONG = "x" * 5000
-DELAN = {
-    "kind": "structured-delan",
-    "needs": {"joints": ["revolute", "prismatic"], "gravity": True, "friction": True, "actuation": None},
-    "width": 3,
-    "depth": 1,
-    "activation": "tanh",
-    "precision": "f64",
-}
+NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)
+DELAN = describe("structured-delan", needs=NEEDS, precision="f64", width=3, depth=1)
+DIFFNET = describe("differential-network", sizes=[1, 3, 1], activation="cos", members=1, precision="f64")
 
 
 @pytest.fixture
@@ -449,9 +442,8 @@ def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     for name in ("delan", "diffnet"):
         (folder / name).mkdir()
-    save_model(folder / "delan", DELAN, build(DELAN).init(jax.random.key(0)))
-    layers = ensembles.init(jax.random.key(0), (1, 3, 1), members=1, dtype=np.float64)
-    save_function(folder / "diffnet", layers, activation="cos", precision="f64")
+    save(folder / "delan", DELAN, build(DELAN).init(jax.random.key(0)))
+    save(folder / "diffnet", DIFFNET, build(DIFFNET).init(jax.random.key(0)))
     return {name: {path.name: path.read_bytes() for path in (folder / name).iterdir()} for name in ("delan", "diffnet")}
 
 
@@ -482,13 +474,16 @@ DAMAGED_MODELS = {
     "description in words": manifest(model="delan"),
     "description that is a list": manifest(model=[]),
     "empty description": manifest(model={}),
-    "kind that is a list": described(kind=["structured-delan"]),
-    "kind that is a number": described(kind=3),
+    "name that is a list": described(name=["structured-delan"]),
+    "name that is a number": described(name=3),
     "precision that is a list": described(precision=["f64"]),
     "precision that is a number": described(precision=64),
     "unknown precision": described(precision="f16"),
     "activation that is a list": described(activation=["tanh"]),
     "activation that is a number": described(activation=1),
+    "a factory that is elsewhere": described(name="os:system"),
+    "a factory that nobody knows": described(name="own"),
+    "an older schema": manifest(schema_version=1),
 }
 OF_DELAN = {
     "needs that are a list": described(needs=[]),

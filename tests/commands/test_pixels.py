@@ -29,7 +29,7 @@ from dln_jax.precision import with_float64
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.types import InputError
-from dln_jax.zoo.load_latent import build_latent, load_latent
+from dln_jax.zoo.run import load
 
 STATES = np.array([[0.0, 0.0], [0.3, -1.2], [-0.55, 0.7], [1.4, 3.0], [-2.9, 4.0], [3.1, -2.0]])
 """q in rad and qd in rad/s, around the whole circle."""
@@ -186,7 +186,7 @@ def test_windows_are_stretches_of_one_trajectory():
 @pytest.fixture(scope="module")
 def untrained(data):
     """A small network for pictures of the data, and its parameters."""
-    field = latent_field("hnn", width=6, depth=1)
+    field = latent_field("black-box-hnn", width=6, depth=1)
     model = make_latent_phase(field, np.tile(data.frames.mean((0, 1)), 2), framewise=True, width=6)
     return model, jax.jit(model.init)(jax.random.key(0))
 
@@ -194,7 +194,8 @@ def untrained(data):
 @pytest.mark.parametrize("framewise", [True, False])
 def test_autoencoders_read_two_frames(data, framewise):
     """Framewise the momentum is the change of the coordinate, for any parameters; else both frames decide both."""
-    model = make_latent_phase(latent_field("baseline", width=3), np.full(2 * PIXELS, 0.1), framewise=framewise, width=5)
+    field = latent_field("phase-network", width=3)
+    model = make_latent_phase(field, np.full(2 * PIXELS, 0.1), framewise=framewise, width=5)
     x, other = data.pairs[0, 0], data.pairs[3, 2]
 
     @jax.jit
@@ -285,15 +286,16 @@ def test_animations_have_every_frame(tmp_path, data):
 
 def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_metrics, "predict", quick_predict)
-    numbers, seen = pixel_task.measure_pixels("baseline", steps=2, trajectories=6, frames=13)
+    numbers, seen = pixel_task.measure_pixels("phase-network", steps=2, trajectories=6, frames=13)
     assert all(np.isfinite(value) for key, value in numbers.items() if "standard_error" not in key)
     assert numbers["energy_mse"] > numbers["energy_floor"] and numbers["parameters"] > 1e5
     assert seen.motions.pairs.shape == (1, 12, 2 * PIXELS)
     data = pixel_task.pixel_data(6, 13)
-    (written,) = pixel_task.draw_pixels({"baseline": seen}, data, tmp_path)
+    (written,) = pixel_task.draw_pixels({"phase-network": seen}, data, tmp_path)
     assert written.name == "pixels.gif" and written.stat().st_size > 1000
     # The other kind has the same autoencoder, and an energy.
-    same, energetic = (build_latent(kind, seen.components).of_coefficients for kind in pixel_task.KINDS[::-1])
+    descriptions = (pixel_task.picture_description(name, seen.components) for name in pixel_task.MODELS[::-1])
+    same, energetic = (pixel_task.picture_models(each, seen.components)[0] for each in descriptions)
     shapes = [jax.tree.map(jnp.shape, jax.eval_shape(model.init, jax.random.key(0))) for model in (same, energetic)]
     assert shapes[0]["decoder"] == shapes[1]["decoder"] and shapes[0]["encoder"] == shapes[1]["encoder"]
 
@@ -308,13 +310,13 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(pixel_task, "energy_floor", lambda *given: 0.0)
     for name in ("late_energy_errors", "energy_errors"):
         monkeypatch.setattr(pixel_task, name, lambda *given: np.ones(2))
-    options = ("--model", "baseline", "--steps", "1", "--no-figures", "--out", str(tmp_path / "run"))
+    options = ("--model", "phase-network", "--steps", "1", "--no-figures", "--out", str(tmp_path / "run"))
     command(train_hnn_pixels, *options)
     stored = (tmp_path / "run" / "model.safetensors").read_bytes()
     (tmp_path / "run" / "model.safetensors").unlink()
     command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == stored
-    system = load_latent(tmp_path / "run")
+    system = load(tmp_path / "run").pictures
     pair = pixel_task.pixel_data().test.pairs[0, 0]
     q, p = system.encode(pair)
     assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PlainFlow)
@@ -328,7 +330,7 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
 
 def test_training_lowers_the_loss(data):
     coefficients = compress(principal_components(data.frames, 8), data.frames)
-    model = make_latent_phase(latent_field("hnn", width=6, depth=1), np.zeros(16), width=8, scale=1.5)
+    model = make_latent_phase(latent_field("black-box-hnn", width=6, depth=1), np.zeros(16), width=8, scale=1.5)
     parameters = jax.jit(model.init)(jax.random.key(0))
     matching = Matching(window=3)
     training = fit(
@@ -346,15 +348,15 @@ def test_training_lowers_the_loss(data):
 def test_mistakes_are_named(data, untrained, tmp_path):
     model, parameters = untrained
     frames, mean = data.frames, np.zeros(4)
-    baseline = make_latent_phase(latent_field("baseline", width=4), mean)
+    baseline = make_latent_phase(latent_field("phase-network", width=4), mean)
     refused = [
         (lambda: swinging_rod(trajectories=0), "trajectories is 0"),
         (lambda: swinging_rod(frames=2), "frames is 2; expected at least 3"),
         (lambda: split(data, test_share=0.9), "leave none for training"),
         (lambda: split(data, validation_share=0.0), "validation_share is 0"),
-        (lambda: latent_field("lnn"), "field is 'lnn'; expected one of hnn, baseline"),
-        (lambda: make_latent_phase(latent_field("hnn"), mean, width=0), "width is 0"),
-        (lambda: make_latent_phase(latent_field("hnn"), np.zeros(3)), "mean has 3 pixels"),
+        (lambda: latent_field("lnn"), "field is 'lnn'; expected one of black-box-hnn, phase-network"),
+        (lambda: make_latent_phase(latent_field("black-box-hnn"), mean, width=0), "width is 0"),
+        (lambda: make_latent_phase(latent_field("black-box-hnn"), np.zeros(3)), "mean has 3 pixels"),
         (lambda: principal_components(frames, 0), "components is 0"),
         (lambda: problem(model, frames, frames, Matching(window=1)), "window is 1"),
         (lambda: problem(model, frames, frames, Matching(window=20)), "expected at least the 21 of a window"),

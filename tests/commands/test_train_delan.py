@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax import load_run
 from dln_jax.commands import make_data, train_delan
 from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]
 TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64", "--no-low-latency")
@@ -144,14 +144,14 @@ def test_a_file_of_ones_own_with_prismatic_joints_and_only_positions(workplace, 
     metrics = json.loads((workplace / "mine" / "metrics.json").read_text())
     assert "torque_mse" in metrics and "inertial_mse" not in metrics
     state = np.zeros((3, 2))
-    assert load_run(workplace / "mine").inverse_dynamics(*state).dtype == jnp.float64
+    assert load(workplace / "mine").dynamics.inverse_dynamics(*state).dtype == jnp.float64
 
 
 def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
     settings = (*TINY, "--scene", "pendulum", "--learning-rate", "1e30", "--no-figures")
     line = refused(capsys, train_delan, *settings, "--out", "exploded")
     assert re.search(r"after step \d+", line) and "lower --learning-rate" in line
-    tau = load_run("exploded").inverse_dynamics(*np.ones((3, 1)))
+    tau = load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))
     assert np.isfinite(tau).all()
 
 

@@ -17,8 +17,9 @@ from dln_jax.runs import function_task
 from dln_jax.runs import functions as function_runs
 from dln_jax.studies.differential_networks import one_pass, table
 from dln_jax.studies.published import DIFFERENTIAL_NETWORKS
-from dln_jax.types import InputError
-from dln_jax.zoo.load_function import load_function
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import load, save
 
 SMALL = ("--samples", "200", "--width", "4")
 TINY = (*SMALL, "--steps", "4")
@@ -72,7 +73,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     config = json.loads((folder / "config.json").read_text())
     assert (config["function"], config["optimizer"]) == ("sin", "gauss-newton")
     assert (config["chosen"]["width"], config["chosen"]["precision"]) == (4, "f64")
-    loaded = load_function(folder)
+    loaded = load(folder)
     grid = functions.sine_grid()
     answers = jax.vmap(loaded.derivatives)(grid.x)
     np.testing.assert_allclose(np.mean((answers.hessian - grid.d2y) ** 2), metrics["hessian_mse"], rtol=1e-6)
@@ -90,8 +91,8 @@ def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(w
     metrics = metrics_of(folder)
     assert metrics["parameters"] == 3 * (8 + 4 + 16 + 4 + 4 + 1)
     assert metrics["spread_inside"] > 0 and metrics["spread_outside"] > 0
-    loaded = load_function(folder)
-    assert loaded.layers[0][0].shape == (3, 2, 4) and loaded.derivatives(np.zeros(2)).value.dtype == jnp.float32
+    loaded = load(folder)
+    assert loaded.parameters[0][0].shape == (3, 2, 4) and loaded.derivatives(np.zeros(2)).value.dtype == jnp.float32
     assert "3 networks 2 x 4 x 4 x 1" in capsys.readouterr().out
 
 
@@ -103,7 +104,7 @@ def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(wo
     assert names_in(folder) == FILES | {"parity.png", "training.png"}
     metrics = metrics_of(folder)
     assert metrics["value_mse"] < 1e-2 * data["y"].var(axis=0).sum()
-    answers = jax.vmap(load_function(folder).derivatives)(data["x"])
+    answers = jax.vmap(load(folder).derivatives)(data["x"])
     assert answers.hessian.shape == (60, 2, 3, 3)
     units = data["x"].std(axis=0) / data["y"].std(axis=0)[:, None]
     assert np.sqrt(np.mean(((answers.jacobian - data["dy"]) * units) ** 2)) < 0.1
@@ -195,9 +196,10 @@ def test_an_unknown_function_is_refused_with_the_names(workplace, capsys):
 
 
 def test_a_folder_with_another_model_is_refused(workplace):
-    (workplace / "model.json").write_text(json.dumps({"schema_version": 1, "tensor_file": "m", "model": {"kind": "x"}}))
-    with pytest.raises(InputError, match="describes no differential-mlp"):
-        load_function(workplace)
+    description = describe("phase-network", needs=Needs(joints=("revolute",)), precision="f32")
+    save(workplace, description, build(description).init(jax.random.key(0)))
+    with pytest.raises(InputError, match=r"a phase-network has no derivatives; ask for \.flow"):
+        _ = load(workplace).derivatives
 
 
 def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypatch, capsys):

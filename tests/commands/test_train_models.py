@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax import load_run
 from dln_jax.commands import train_delan, train_hnn
 from dln_jax.data import schema
 from dln_jax.data.splits import split
@@ -21,13 +20,12 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
-from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.runs import dynamics_growth
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.studies.speed import low_latency_calls
-from dln_jax.zoo.kinds import build, describe
-from dln_jax.zoo.load import load_system
+from dln_jax.zoo.descriptions import build, describe_for
+from dln_jax.zoo.run import load
 
 QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
 
@@ -70,7 +68,7 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
     assert "least squares: 6 parameters, rank" in out and "condition" in out and "chosen 1" in out
     assert "not positive definite" not in out
     assert metrics["share_not_definite"] == 0
-    system = load_run(workplace / "linear")
+    system = load(workplace / "linear").dynamics
     tau = system.inverse_dynamics(*np.array([[0.5], [1.0], [2.0]]))
     # m l² qdd + m g l sin q + b qd
     np.testing.assert_allclose(tau, [2.0 + 9.81 * np.sin(0.5) + 0.2], rtol=1e-9)
@@ -105,18 +103,17 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
 
 
 def test_black_box_models_report_their_mass_matrix(workplace, capsys):
-    command(train_delan, *QUICK, "--model", "black-box", "--out", "black-box")
+    command(train_delan, *QUICK, "--model", "black-box-delan", "--out", "black-box")
     metrics = metrics_of(workplace / "black-box")
     assert 0 <= metrics["share_not_definite"] <= 1 and "smallest_mass_eigenvalue" in metrics
     command(train_delan, *QUICK, "--model", "feed-forward", "--out", "feed-forward")
-    assert isinstance(load_run(workplace / "feed-forward"), PlainDynamics)
+    assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
 
 
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     command(train_hnn, *QUICK, "--out", "hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
-    H = hamiltonian_of(load_system(workplace / "hamiltonian"))
-    assert np.isfinite(H(jnp.ones(1), jnp.ones(1)))
+    assert np.isfinite(load(workplace / "hamiltonian").flow.energy([1.0], [1.0]))
     command(train_hnn, "--data", "bare.npz", *QUICK[2:], "--out", "bare")
     assert "no momenta p in the data" in capsys.readouterr().out
 
@@ -134,14 +131,14 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     candidates = json.loads((workplace / "hard" / "candidates.json").read_text())["candidates"]
     best = min(candidates, key=lambda each: each["validation_error"])
     assert metrics_of(workplace / "hard")["parameters"] == best["parameters"]
-    line = refused(capsys, train_delan, "--target", "1e-8", "--model", "black-box", "--out", "no")
+    line = refused(capsys, train_delan, "--target", "1e-8", "--model", "black-box-delan", "--out", "no")
     assert "--target grows one structured network" in line
 
 
 @pytest.mark.parametrize("optimiser", [Adam(12, batch=32), GaussNewton(12)])
 def test_seeds_in_one_program_equal_single_runs(workplace, optimiser):
     sets = split(schema.load("swing.npz"))
-    description = describe(
+    description = describe_for(
         "structured-delan", sets.train, sets.train.needs, precision="f64", width=3, depth=1, activation="tanh"
     )
     model = build(description)

@@ -21,10 +21,9 @@ from dln_jax.deploy.exports import described, read_export, write_exports
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics, hamiltonian_of
 from dln_jax.nn import activations, differential_mlp
-from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import save_model
-from dln_jax.zoo.load_function import save_function
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import save
 
 STATES = 1000
 KEY = jax.random.key(0)
@@ -57,14 +56,14 @@ def random_model(case):
     """Description and parameters that no initialisation would give: biases are not zero."""
     kind, joints, gravity, friction, keywords = CASES[case]
     needs = {"joints": joints, "gravity": gravity, "friction": friction, "actuation": None}
-    description = {"kind": kind, "needs": needs, "precision": "f64", **keywords}
+    description = describe(kind, needs=needs, precision="f64", **keywords)
     random, init = np.random.default_rng(len(case)), build(description).init
     if kind == "trigonometric":  # starts from M = 1, which small changes leave definite
         return description, jax.tree.map(lambda leaf: leaf + 0.02 * random.normal(size=leaf.shape), init(KEY))
 
     def drawn(path, leaf):
         # Convex in its inputs, so that mass matrices are definite and each velocity has a momentum.
-        convex = kind.startswith("black-box") and "linear_0" not in str(path) and len(leaf.shape) == 2
+        convex = kind in ("black-box-delan", "black-box-hnn") and "linear_0" not in str(path) and len(leaf.shape) == 2
         values = 0.5 * random.normal(size=leaf.shape)
         return jnp.asarray(np.abs(values) + 0.1 if convex else values)
 
@@ -134,7 +133,8 @@ def random_function(case):
         tuple(jnp.asarray(0.7 * random.normal(size=(members, *shape))) for shape in ((n, m), (m,)))
         for n, m in differential_mlp.layer_shapes(sizes)
     )
-    return {"kind": "differential-mlp", "activation": activation, "precision": "f64"}, layers
+    stated = {"sizes": sizes, "members": members, "activation": activation}
+    return describe("differential-network", precision="f64", **stated), layers
 
 
 @needs_compiler
@@ -168,7 +168,7 @@ def test_a_differential_network_equals_its_c(case, tmp_path):
 def test_each_activation_has_its_first_two_derivatives(name, tmp_path):
     """L = w·g(W [cos q, sin q, qd] + b), whose M and energy take g, g' and g''; closed forms, from -30 to 30."""
     needs = {"joints": SWING, "gravity": True, "friction": False, "actuation": None}
-    description = {"kind": "black-box-delan", "needs": needs, "precision": "f64", "activation": name}
+    description = describe("black-box-delan", needs=needs, precision="f64", width=6, depth=1, activation=name)
     random = np.random.default_rng(4)
     weight, bias, output = random.normal(size=(3, 6)), random.normal(size=6), random.normal(size=(6, 1))
     layers = [{"w": weight, "b": bias}, {"w": output, "b": np.zeros(1)}]
@@ -242,7 +242,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     once, again = (source_files(*model, name="arm", precision="f32") for _ in range(2))
     assert once == again
     header, source = once["arm.h"].decode(), once["arm.c"].decode()
-    for words in ("kind structured-delan", "C format 2", "prismatic (m), revolute (rad)", "N m", "without friction"):
+    for words in ("from a structured-delan", "C format 2", "prismatic (m), revolute (rad)", "N m", "without friction"):
         assert words in header
     assert "void arm_inverse_dynamics(const float q[2], const float qd[2], const float qdd[2], float tau[2]);" in header
     assert re.findall(r"#include (\S+)", source) == ["<math.h>", '"arm.h"']
@@ -254,7 +254,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
 def folder(tmp_path):
     """The run folder of a model of dynamics."""
     (tmp_path / "run").mkdir()
-    save_model(tmp_path / "run", *random_model("delan-1"))
+    save(tmp_path / "run", *random_model("delan-1"))
     return tmp_path / "run"
 
 
@@ -287,8 +287,7 @@ def test_the_command_exports_runs_of_both_sorts(folder, monkeypatch, capsys):
     assert (out / "swing.c").read_bytes() == before
 
     (folder.parent / "function").mkdir()
-    _, layers = random_function("2-1-ensemble")
-    save_function(folder.parent / "function", layers, activation="gelu", precision="f64")
+    save(folder.parent / "function", *random_function("2-1-ensemble"))
     command(monkeypatch, "--run", folder.parent / "function", "--out", folder.parent / "f")
     assert load_c(folder.parent / "f").value([0.1, 0.2]).shape == (1,)
 
@@ -300,11 +299,17 @@ def test_mistakes_are_one_line_and_leave_nothing_behind(folder, monkeypatch, cap
     for name in ("2x;y", "double", "", "Main", "ä", "x" * 41):
         assert "expected a C name" in refused(monkeypatch, capsys, *there, f"--name={name}")
     manifest = json.loads((folder / "model.json").read_text())
-    manifest["model"]["kind"] = "pairwise"
-    (folder / "model.json").write_text(json.dumps(manifest))
-    assert "a model of kind 'pairwise' has no C export; exportable are structured-delan" in refused(
-        monkeypatch, capsys, *there
+    (folder.parent / "other").mkdir()
+    polynomial = describe("polynomial-hamiltonian", needs=Needs(joints=("revolute",)), precision="f64")
+    save(folder.parent / "other", polynomial, build(polynomial).init(KEY))
+    assert "a polynomial-hamiltonian has no C export; exportable are structured-delan" in refused(
+        monkeypatch, capsys, "--run", folder.parent / "other", "--out", out
     )
+    bent = describe(
+        "structured-hnn", needs=Needs(joints=("revolute",), friction=True), precision="f64", friction_width=2
+    )
+    with pytest.raises(InputError, match="a friction that depends on q has no C export"):
+        export_c(bent, {}, out)
     (folder / "model.json").write_text(json.dumps({**manifest, "model": None}))
     assert "describes no model" in refused(monkeypatch, capsys, *there)
     assert not out.exists()

@@ -25,27 +25,25 @@ from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_phase_field, load_run, save_model
-from dln_jax.zoo.load_function import load_function, save_function
-from dln_jax.zoo.phase_kinds import build_phase
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import load, save
 
 SCENE = cart_pole(friction=0.1)
-NETWORK = {"precision": "f64", "activation": "tanh", "width": 3, "depth": 1, "needs": SCENE.needs._asdict()}
 
 
 def description(kind):
-    keys = ("precision", "needs") if kind in ("trigonometric", "polynomial-hamiltonian") else NETWORK
-    given = {"kind": kind, **{key: NETWORK[key] for key in keys}}
-    return given | {"needs": SCENE.needs._replace(friction=False)._asdict()} if kind.startswith("poly") else given
+    if kind == "polynomial-hamiltonian":
+        return describe(kind, needs=SCENE.needs._replace(friction=False), precision="f64")
+    size = {} if kind == "trigonometric" else {"width": 3, "depth": 1}
+    return describe(kind, needs=SCENE.needs, precision="f64", **size)
 
 
 @functools.cache
-def parameters_of(make, kind):
+def parameters_of(kind):
     # Drawn here and not by `init`, which is slow to compile.
     draw = np.random.default_rng(0).normal
     return jax.tree.map(
-        lambda leaf: jnp.asarray(draw(size=leaf.shape)), jax.eval_shape(make(description(kind)).init, KEY)
+        lambda leaf: jnp.asarray(draw(size=leaf.shape)), jax.eval_shape(build(description(kind)).init, KEY)
     )
 
 
@@ -61,16 +59,16 @@ def network(kind):
     return lambda folder: dynamics(energies(kind), degrees_of_freedom=2)
 
 
-def energies(kind, build=build):
-    return build(description(kind)).energies(parameters_of(build, kind))
+def energies(kind):
+    return build(description(kind)).energies(parameters_of(kind))
 
 
 def loaded(kind):
-    def load(folder):
-        save_model(folder, description(kind), parameters_of(build, kind))
-        return load_run(folder)
+    def load_again(folder):
+        save(folder, description(kind), parameters_of(kind))
+        return load(folder).dynamics
 
-    return load
+    return load_again
 
 
 ORIGINS = {
@@ -191,16 +189,16 @@ FIELDS = {
     "energy": lambda folder: flow(HamiltonianSystem(H, lambda q, qd: jnp.sum(qd**2))),
     "structured": lambda folder: flow(energies("structured-hnn")),
     **{
-        kind: lambda folder, kind=kind: flow(energies(kind, build_phase))
-        for kind in ("separable-hamiltonian", "polynomial-hamiltonian", "phase-network")
+        kind: lambda folder, kind=kind: flow(energies(kind))
+        for kind in ("separable-hnn", "polynomial-hamiltonian", "phase-network")
     },
 }
 
 
 def loaded_field(folder):
-    kind = "separable-hamiltonian"
-    save_model(folder, description(kind), parameters_of(build_phase, kind))
-    return load_phase_field(folder)
+    kind = "separable-hnn"
+    save(folder, description(kind), parameters_of(kind))
+    return load(folder).flow
 
 
 @pytest.mark.parametrize("origin", [*FIELDS, "loaded"])
@@ -223,7 +221,7 @@ def test_a_phase_field_refuses_and_converts_likewise(origin, tmp_path):
 @pytest.mark.parametrize("kind", ["structured-delan", "black-box-delan", "feed-forward"])
 def test_exported_c_takes_and_refuses_what_the_model_does(kind, tmp_path):
     model = network(kind)(tmp_path)
-    export_c(description(kind), parameters_of(build, kind), tmp_path)
+    export_c(description(kind), parameters_of(kind), tmp_path)
     system = load_c(tmp_path, flags=("-O0",))
     q, qd, x = [0.3, -0.2], [1, 0], np.array([0.5, 1.0], np.float32)
     expected = jax.jit(model.inverse_dynamics)(q, qd, x)
@@ -248,11 +246,15 @@ def test_exported_c_takes_and_refuses_what_the_model_does(kind, tmp_path):
                     getattr(system, name)(*state)
 
 
+def of_function(sizes):
+    return describe("differential-network", sizes=sizes, activation="tanh", members=1, precision="f64")
+
+
 def test_a_network_of_x_refuses_and_converts_likewise(tmp_path):
     draw = np.random.default_rng(0).normal
     layers = tuple((jnp.asarray(draw(size=(1, *size))), jnp.zeros((1, size[1]))) for size in ((2, 3), (3, 1)))
-    save_function(tmp_path, layers, activation="tanh", precision="f64")
-    derivatives = load_function(tmp_path).derivatives
+    save(tmp_path, of_function([2, 3, 1]), layers)
+    derivatives = load(tmp_path).derivatives
     jax.tree.map(np.testing.assert_array_equal, derivatives([1, 0]), derivatives(np.array([1.0, 0.0])))
     for value, message in (MALFORMED[fault] for fault in MALFORMED if fault != "text"):
         with pytest.raises(InputError, match=f"^x {message}"):
@@ -263,28 +265,27 @@ DOUBLE = """
 import sys
 import jax
 from pathlib import Path
-from dln_jax import InputError, load_phase_field, load_run
+from dln_jax import InputError, load
 from dln_jax.deploy.c.source import export_run
 from dln_jax.deploy.export_stablehlo import load_stablehlo
-from dln_jax.zoo.load_function import load_function
 folder = Path(sys.argv[1])
 loads = {
-    "run": lambda: load_run(folder / "run"),
-    "field": lambda: load_phase_field(folder / "field"),
-    "function": lambda: load_function(folder / "function"),
+    "run": lambda: load(folder / "run").dynamics,
+    "field": lambda: load(folder / "field").flow,
+    "function": lambda: load(folder / "function"),
     "c": lambda: export_run(folder / "run", folder / "c"),
     "export": lambda: load_stablehlo(folder / "sine.stablehlo"),
 }
 messages = {}
-for name, load in loads.items():
+for name, make in loads.items():
     try:
-        load()
+        make()
     except InputError as error:
         messages[name] = str(error)
 (line,) = {message.split("`")[1] for message in messages.values()}
 print(len(messages), *messages.values(), sep=chr(10))
 exec(line)
-results = {name: load() for name, load in loads.items()}
+results = {name: make() for name, make in loads.items()}
 print(results["run"].inverse_dynamics([0, 1], [1, 0], [0, 0]).dtype, results["export"]([1, 2]).dtype)
 """
 
@@ -296,9 +297,7 @@ def test_double_precision_is_asked_for_in_one_line_that_works(tmp_path):
         (tmp_path / folder).mkdir()
     loaded("structured-delan")(tmp_path / "run")
     loaded_field(tmp_path / "field")
-    save_function(
-        tmp_path / "function", ((jnp.ones((1, 2, 1)), jnp.zeros((1, 1))),), activation="tanh", precision="f64"
-    )
+    save(tmp_path / "function", of_function([2, 1]), ((jnp.ones((1, 2, 1)), jnp.zeros((1, 1))),))
     export_stablehlo(jnp.sin, np.zeros(2), path=tmp_path / "sine.stablehlo")
     result = subprocess.run([sys.executable, "-c", DOUBLE, tmp_path], capture_output=True, text=True, timeout=200)
     assert result.returncode == 0, result.stderr

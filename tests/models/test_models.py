@@ -17,7 +17,7 @@ from dln_jax.models.feed_forward import make_feed_forward
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
 from dln_jax.nn.activations import tanh
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.load import compiled
+from dln_jax.zoo.run import compiled
 
 MAKERS = [make_structured_hamiltonian, make_black_box_hamiltonian, make_black_box_lagrangian, make_feed_forward]
 MIXED = Needs(("prismatic", "revolute"), friction=True)

@@ -61,7 +61,7 @@ def test_a_case_that_there_is_not_is_refused():
 
 def test_published_numbers_are_found_by_case_and_quantity():
     assert published(ARM, "structured-hnn/characters", "torque_from_momenta_mse") == 5.4e-6
-    assert published(HAMILTONIAN, "two-body/hnn", "energy_mse") == 3.9e-5
+    assert published(HAMILTONIAN, "two-body/black-box-hnn", "energy_mse") == 3.9e-5
     assert published(DIFFERENTIAL_NETWORKS, "sin/type2/cos", "value_mse") == 1.7e-8
     assert published(ARM, "structured-hnn/characters", "torque_mse") is None
     assert published(ARM, "trigonometric/characters", "torque_mse") is None

@@ -12,6 +12,7 @@ from dln_jax.deploy.c import networks as c_networks
 from dln_jax.deploy.c.text import table
 from dln_jax.models.black_box import per_coordinate
 from dln_jax.types import Needs
+from dln_jax.zoo.catalogue import CATALOGUE
 
 _STATE = """
 /* What the network sees of the state: features of q, then ${second} / ${scale}. */
@@ -151,15 +152,15 @@ void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    lagrangian = description["kind"] == "black-box-delan"
+    lagrangian = not CATALOGUE[description["name"]].properties.canonical
     scale, second = ("rate_scale", "qd") if lagrangian else ("momentum_scale", "p")
     network = c_networks.from_haiku("energy", parameters, "lagrangian" if lagrangian else "hamiltonian")
     friction = parameters.get("~", {}).get("viscous_friction")
     d, features = needs.degrees_of_freedom, c_joints.count(needs)
     enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]
     if not lagrangian:
-        enumerators.append(f"NEWTON_STEPS = {description.get('iterations', 8)}")
-    size = description.get(scale, 1.0)
+        enumerators.append(f"NEWTON_STEPS = {description['iterations']}")
+    size = description[scale]
     sizes = per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size)
     head = f"enum {{ {', '.join(enumerators)} }};\n\n/* Typical size of {second}, by which it is divided */\n"
     head += table(scale, np.array(sizes), precision)

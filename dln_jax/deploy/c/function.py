@@ -83,7 +83,7 @@ def feed_forward_source(description: dict[str, Any], parameters: Any, needs: Nee
     d, features = needs.degrees_of_freedom, c_joints.count(needs)
     text = [f"enum {{ D = {d}, FEATURES = {features} }};\n\n/* Typical sizes of qd, qdd and tau */\n"]
     for scale in ("rate_scale", "acceleration_scale", "tau_scale"):
-        size = description.get(scale, 1.0)
+        size = description[scale]
         sizes = per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size)
         text.append(table(scale, np.array(sizes), precision))
     text.append(c_joints.functions(needs, ("features",)))

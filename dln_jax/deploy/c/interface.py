@@ -6,8 +6,8 @@ from typing import Any
 from dln_jax.deploy.c.text import PRECISIONS
 from dln_jax.deploy.exports import AGAIN, read_export
 from dln_jax.types import InputError
-from dln_jax.zoo.load_function import KIND as FUNCTION
 
+FUNCTION = "differential-network"
 FORMAT = 2
 """Version of the names and signatures in exported sources, and of their description."""
 LARGEST = 10_000

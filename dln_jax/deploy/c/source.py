@@ -8,8 +8,6 @@ import importlib.metadata
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from dln_jax.data.schema import needs_from_json
 from dln_jax.deploy.c import black_box as c_black_box
 from dln_jax.deploy.c import function as c_function
@@ -17,18 +15,16 @@ from dln_jax.deploy.c import structured as c_structured
 from dln_jax.deploy.c import trigonometric as c_trigonometric
 from dln_jax.deploy.c.activations import EXPORTABLE
 from dln_jax.deploy.c.demo import cmake, demo
-from dln_jax.deploy.c.interface import FORMAT, interface, signatures
+from dln_jax.deploy.c.interface import FORMAT, FUNCTION, interface, signatures
 from dln_jax.deploy.c.library import helpers
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, fill
 from dln_jax.deploy.exports import described, write_exports
 from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import MODEL
-from dln_jax.zoo.load_function import KIND as FUNCTION
-from dln_jax.zoo.load_function import load_function
-from dln_jax.zoo.parameter_files import load_manifest, load_tree
+from dln_jax.zoo.catalogue import entry_of
+from dln_jax.zoo.descriptions import Description, require_complete
+from dln_jax.zoo.run import load
 
-KINDS = {
+SOURCES = {
     "structured-delan": c_structured.source,
     "structured-hnn": c_structured.source,
     "black-box-delan": c_black_box.source,
@@ -47,7 +43,7 @@ _MEANINGS = {
 
 
 def export_c(
-    description: dict[str, Any],
+    description: Description,
     parameters: Any,
     directory: str | Path,
     *,
@@ -58,8 +54,7 @@ def export_c(
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
 
     Args:
-        description: of the model, as `zoo.kinds.describe` gives and `model.json` holds it; or that of a differential
-            network, with `kind` "differential-mlp" and `activation`.
+        description: of the model, as `zoo.describe` gives and `model.json` holds it.
         parameters: of the model; layers with the members of an ensemble first, for a differential network.
         directory: is created where it is missing.
         name: a C name; every file and public function starts with it.
@@ -77,43 +72,35 @@ def export_c(
 
 def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[Path]:
     """`export_c` of the model in a run's folder, of `train_delan`, `train_hnn` or `train_diffnet`."""
-    directory = Path(directory)
-    description = load_manifest(directory, MODEL).get("model")
-    if not isinstance(description, dict):
-        raise InputError(f"{directory / MODEL}.json: describes no model; train again or restore the file")
-    if description.get("kind") == FUNCTION:
-        return export_c(description, load_function(directory).layers, out, **keywords)
-    _check_kind(description)
-    like = jax.eval_shape(build(description).init, jax.random.key(0))
-    return export_c(description, load_tree(directory, MODEL, like), out, **keywords)
+    run = load(directory)
+    return export_c(run.description, run.parameters, out, **keywords)
 
 
-def source_files(description: dict[str, Any], parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
+def source_files(description: Description, parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
     """Content of each file, by its name."""
-    _check_kind(description)
-    kind = description["kind"]
-    precision = precision or str(description.get("precision", "f64"))
+    name_of_model = _exportable(description)
+    precision = precision or str(description["precision"])
     if precision not in PRECISIONS:
         raise InputError(f"precision is '{precision}'; expected f32 or f64")
     activation = str(description.get("activation", "tanh"))
     if activation not in EXPORTABLE:
         raise InputError(f"activation is '{activation}'; C export knows {', '.join(EXPORTABLE)}")
-    if kind == FUNCTION:
+    if name_of_model == FUNCTION:
         sizes = {"n": parameters[0][0].shape[1], "m": parameters[-1][0].shape[2]}
         body = c_function.source(parameters, precision)
         about = f"{sizes['n']} inputs x, {sizes['m']} outputs y"
     else:
         needs = needs_from_json(description["needs"])
         sizes = {"d": needs.degrees_of_freedom}
-        body = KINDS[kind](description, parameters, needs, precision)
+        body = SOURCES[name_of_model](description, parameters, needs, precision)
         units = ", ".join(f"{joint} ({'rad' if joint == 'revolute' else 'm'})" for joint in needs.joints)
         about = f"joints: {units}; {'with' if needs.friction else 'without'} friction"
     version = importlib.metadata.version("dln-jax")
     written_by = (
-        f"Written by dln-jax {version}, C format {FORMAT}, from a model of kind {kind}.\n{about[0].upper()}{about[1:]}."
+        f"Written by dln-jax {version}, C format {FORMAT}, from a {name_of_model}.\n{about[0].upper()}{about[1:]}."
     )
-    stated = interface(name, kind, precision, sizes, version)
-    declared = signatures(kind, precision, sizes)
+    stated = interface(name, name_of_model, precision, sizes, version)
+    declared = signatures(name_of_model, precision, sizes)
     filled = fill(body, precision, name=name)
     texts = {
         f"{name}.h": _header(name, written_by, declared, sizes),
@@ -125,10 +112,15 @@ def source_files(description: dict[str, Any], parameters: Any, *, name: str, pre
     return {**files, f"{name}.json": described(stated, files)}
 
 
-def _check_kind(description: dict[str, Any]) -> None:
-    kind = description.get("kind")
-    if kind not in KINDS and kind != FUNCTION:
-        raise InputError(f"a model of kind {kind!r} has no C export; exportable are {', '.join((*KINDS, FUNCTION))}")
+def _exportable(description: Description) -> str:
+    """The model's name, if it has a C export."""
+    name = str(description.get("name"))
+    if name not in SOURCES and name != FUNCTION:
+        raise InputError(f"a {name} has no C export; exportable are {', '.join((*SOURCES, FUNCTION))}")
+    require_complete(description, entry_of(name).factory)
+    if description.get("friction_width") and description["needs"]["friction"]:
+        raise InputError("a friction that depends on q has no C export; train with one coefficient per coordinate")
+    return name
 
 
 def _header(name: str, written_by: str, declared: dict[str, tuple[str, str]], sizes: dict[str, int]) -> str:

@@ -14,15 +14,16 @@ from dln_jax.deploy.c.natural import DELAN, FACTOR, HAMILTONIAN
 from dln_jax.deploy.c.networks import Network
 from dln_jax.deploy.c.text import number, table
 from dln_jax.types import Needs
+from dln_jax.zoo.catalogue import CATALOGUE
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    delan = description["kind"] == "structured-delan"
+    delan = not CATALOGUE[description["name"]].properties.canonical
     shared = "energies/~/linear_0" in parameters
     factor = c_networks.from_haiku("factor", parameters, "energies" if shared else "cholesky")
     potential = None if shared or not needs.gravity else c_networks.from_haiku("potential", parameters, "potential")
-    shift, floor = (float(description.get(key, default)) for key, default in _defaults(delan))
+    shift, floor = float(description["diagonal_shift"]), float(description["diagonal_floor"])
     friction = parameters.get("~", {}).get("viscous_friction")
     entries = needs.degrees_of_freedom * (needs.degrees_of_freedom + 1) // 2
     head = [
@@ -46,11 +47,6 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     for key, text in texts.items():
         body = body.replace(f"${{{key}}}", text)
     return "".join(head) + networks + functions + FACTOR + body
-
-
-def _defaults(delan: bool) -> tuple[tuple[str, float], ...]:
-    """Keywords of the factories and their defaults."""
-    return ("diagonal_shift", 2.0 if delan else 0.0), ("diagonal_floor", 0.1)
 
 
 def _texts(factor: Network, potential: Network | None, *, shared: bool, friction: bool) -> dict[str, str]:

@@ -79,7 +79,7 @@ void ${name}_mass_matrix(const real q[D], real M[D * D])
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
     d = needs.degrees_of_freedom
-    degree = description.get("degree", 1)
+    degree = description["degree"]
     degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
     potential_degrees = tuple(
         max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)

@@ -28,8 +28,9 @@ from dln_jax.models.model import Model
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import Hamiltonian
-from dln_jax.zoo.kinds import build, describe
-from dln_jax.zoo.load import compiled
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build, describe_for
+from dln_jax.zoo.run import compiled
 
 TRIGONOMETRIC = "trigonometric"
 TORQUE_NOISE = 0.05
@@ -74,9 +75,9 @@ def whole_circle(*, samples: int = 1_000) -> Trajectories:
 
 
 def described(kind: str, data: Trajectories, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
-    """The description of a model of the arm; the trigonometric one is of degree 1, networks get their size."""
-    size = {"degree": 1} if kind == TRIGONOMETRIC else {"activation": "tanh", **keywords}
-    return describe(kind, data, two_link_arm().needs, precision=precision, **size)
+    """The description of a model of the arm; networks get their size, others have none."""
+    size: dict[str, Any] = {} if CATALOGUE[kind].properties.linear else {"activation": "tanh", **keywords}
+    return describe_for(kind, data, two_link_arm().needs, precision=precision, **size)
 
 
 def free_motion_inside_seconds(scene: Scene, sets: Split, *, duration: float = 5.0, dt: float = 0.02) -> float:
@@ -237,7 +238,8 @@ def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float],
 
 def definite(kind: str, system: Dynamics | PlainDynamics, sets: Split) -> dict[str, float]:
     """The share of test states whose learned mass matrix is not definite, for models without structure."""
-    if not kind.startswith("black-box"):
+    properties = CATALOGUE[kind].properties
+    if properties.definite or not properties.energy:
         return {}
     return {"share_not_definite": definiteness(system, sets.test.q, sets.test.qd).share_not_definite}
 

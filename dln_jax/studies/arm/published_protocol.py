@@ -25,8 +25,8 @@ from dln_jax.studies.arm.table import ARM_UNITS
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.published import ARM, PUBLISHED_CODE, published
 from dln_jax.studies.report import Row, unit_of
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import compiled
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import compiled
 
 KIND = "structured-delan"
 BOUNDS = {

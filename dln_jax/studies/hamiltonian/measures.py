@@ -12,7 +12,7 @@ from dln_jax.figures.style import TRUTH
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.studies.hamiltonian.training import Trained
-from dln_jax.zoo.phase_kinds import build_phase
+from dln_jax.zoo.descriptions import build
 
 
 class Seen(NamedTuple):
@@ -25,7 +25,7 @@ class Seen(NamedTuple):
 
 def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen]:
     """Errors and times of one run, and what it predicts."""
-    model, parameters = build_phase(trained.description), trained.result.parameters
+    model, parameters = build(trained.description), trained.result.parameters
     predicted = [predict(model, parameters, true.q[:, 0], true.p[:, 0], true.t) for true in problem.truth]
     numbers = motion_errors(predicted, problem.truth, problem.energy, published_energy=problem.published_energy)
     if problem.train is not None and problem.test is not None:

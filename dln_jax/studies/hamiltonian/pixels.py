@@ -1,7 +1,7 @@
 """The pixel pendulum: data, models, training, errors, and what its pictures need, for the scripts that report them.
 
-Models: hnn (an energy in the latent plane) and baseline (a network gives the rates there), with the same autoencoder,
-loss and budget. The data are those of seed 0; a seed is that of the parameters and the order of the samples.
+Models: black-box-hnn (an energy in the latent plane) and phase-network (a network gives the rates there), with the same
+autoencoder, loss and budget. The data are those of seed 0; a seed is that of the parameters and of the samples' order.
 """
 
 import functools
@@ -25,12 +25,13 @@ from dln_jax.learning.engine.problem import Progress, Report, Training, silent
 from dln_jax.learning.frames import Matching, Weights, loss, windows
 from dln_jax.metrics.frames import FrameMotions, energy_errors, energy_floor, frame_errors, late_energy_errors, recoded
 from dln_jax.metrics.phase_space import summary
-from dln_jax.models.latent_phase import LatentModel
+from dln_jax.models.latent_phase import Field, LatentModel, through_components
 from dln_jax.models.model import Parameters
 from dln_jax.models.principal_components import Components, compress, principal_components
-from dln_jax.zoo.load_latent import build_latent
+from dln_jax.zoo.descriptions import Description, build, describe
 
-KINDS = ("hnn", "baseline")
+MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
+"""In the latent plane."""
 MATCHING = Matching(weights=Weights(field=10.0))
 """The same for both models. Weight, components and length of training were chosen with seed 0 by validation films; one
 step at a time, the published form, in place of windows of ten steps, with which both models were alike (1e-6 J² over a
@@ -51,6 +52,18 @@ class SeenFrames(NamedTuple):
     """From the test starts."""
     components: Components
     history: list[Progress]
+
+
+def picture_description(field: Field, components: Components) -> Description:
+    """Of a model of pictures by their components."""
+    count, pixels = components.basis.shape
+    return describe("latent-phase", field=field, pixels=pixels, components=count, precision="f32")
+
+
+def picture_models(description: Description, components: Components) -> tuple[LatentModel, LatentModel]:
+    """One model with one set of parameters, from two sides: of the components' coefficients, and of pictures."""
+    inner = build(description).of_coefficients(components.scale)
+    return inner, through_components(inner, components)
 
 
 @functools.cache
@@ -82,7 +95,7 @@ def optimiser_of(steps: int | None = None) -> Adam:
 
 
 def measure_pixels(
-    kind: str,
+    kind: Field,
     *,
     seed: int = 0,
     steps: int | None = None,
@@ -94,7 +107,7 @@ def measure_pixels(
     """A model's errors on the test trajectories and its times, and what pictures need of it."""
     data = pixel_data(trajectories, frames)
     components = principal_components(data.train.frames, COMPONENTS)
-    inner, model = build_latent(kind, components)
+    inner, model = picture_models(picture_description(kind, components), components)
     training = train_pixels(inner, components, data, seed=seed, steps=steps, checkpoint=checkpoint, report=report)
     parameters = training.parameters
     numbers, motions = frame_errors(model, parameters, data.test)
@@ -110,14 +123,13 @@ def measure_pixels(
 
 
 def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
-    """Writes `pixels.gif`, the truth and each model's frames, and `pixels-injection.png`, of "hnn"; returns paths."""
+    """Writes `pixels.gif`, the truth and each model's frames, and of an energy `pixels-injection.png`; gives paths."""
     times = data.test.frames.shape[1] - 1
     frames = {TRUTH: data.test.frames[shown, :times]}
     frames |= {name: each.motions.frames[shown] for name, each in seen.items()}
     written = [folder / "pixels.gif"]
     write_frame_gif(written[0], frames, FRAME_TIME * np.arange(times))
-    if "hnn" in seen:
-        hnn = seen["hnn"]
+    if hnn := seen.get("black-box-hnn"):
         # From the start with the least energy, so that three times as much is still what the decoder has seen.
         ranges = np.abs(data.test.q).max(axis=1)
         quiet = int(np.argsort(ranges)[len(ranges) // 4])

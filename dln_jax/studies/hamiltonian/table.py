@@ -20,12 +20,12 @@ from dln_jax.types import require_positive
 TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
 """The published ones."""
 BOUNDS = {
-    "spring/hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
-    "pendulum/hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
-    "real-pendulum/hnn": {"energy_mse": 8e-4, "train_seconds": 60.0},
-    "two-body/hnn": {"energy_mse": 3.9e-6, "train_seconds": 30.0},
-    "three-body/hnn": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
-    "pixels/hnn": {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0},
+    "spring/separable-hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
+    "pendulum/separable-hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
+    "real-pendulum/separable-hnn": {"energy_mse": 8e-4, "train_seconds": 60.0},
+    "two-body/pairwise-hnn": {"energy_mse": 3.9e-6, "train_seconds": 30.0},
+    "three-body/pairwise-hnn": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
+    "pixels/black-box-hnn": {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0},
 }
 """Figures to reach, of the model that suits the scene."""
 SHOWN = (
@@ -69,7 +69,7 @@ def cases(
     found = []
     for name in names:
         if name == PIXELS:
-            kinds, task = pixels.KINDS, pixel_task
+            kinds, task = pixels.MODELS, pixel_task
         else:
             kinds, task = models_of(name), partial(phase_task, name, data=real_pendulum if name == REAL else None)
         measure = partial(task, seeds=seeds, folder=folder, **given)
@@ -101,10 +101,11 @@ def phase_task(
 def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folder: Path | None) -> Findings:
     """The models of pictures, and their animation and pictures."""
     numbers, seen = {}, {}
-    for kind in pixels.KINDS:
+    for kind in pixels.MODELS:
         runs = [pixels.measure_pixels(kind, seed=seed, steps=steps, trajectories=trajectories) for seed in range(seeds)]
         numbers[kind], seen[kind] = medians(runs), runs[0][1]
-    numbers["hnn"]["energy_mse_over_baseline"] = numbers["hnn"]["energy_mse"] / numbers["baseline"]["energy_mse"]
+    energetic, baseline = (numbers[kind] for kind in pixels.MODELS)
+    energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
     if folder is not None:
         pixels.draw_pixels(seen, pixels.pixel_data(trajectories), folder)
     return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
@@ -122,20 +123,25 @@ def table_rows(rows: Sequence[Row]) -> list[Row]:
     """Numbers with the published ones and the figures to reach; every Hamiltonian network beside the published one."""
     found = []
     for row in rows:
-        task, kind = row.case.split("/")
-        beside = f"{task}/{'baseline' if kind == 'baseline' else 'hnn'}"
-        reference, bound = published(HAMILTONIAN, beside, row.quantity), BOUNDS.get(row.case, {}).get(row.quantity)
+        reference, bound = beside(row.case, row.quantity), BOUNDS.get(row.case, {}).get(row.quantity)
         found.append(row._replace(unit=unit_of(row.quantity), reference=reference, bound=bound))
     return found
 
 
+def beside(case: str, quantity: str) -> float | None:
+    """The published number that a model stands beside: the baseline's, or the Hamiltonian network's."""
+    task, kind = case.split("/")
+    name = kind if kind == "phase-network" else "black-box-hnn"
+    return published(HAMILTONIAN, f"{task}/{name}", quantity)
+
+
 def markdown(rows: Sequence[Row]) -> str:
-    """Ours / published, a line per case."""
-    lines = []
+    """Ours / published, a line per case: of the model that suits the scene, and of the baseline."""
+    lines, compared = [], {*BOUNDS, *(f"{task}/phase-network" for task in TASKS)}
     for case, numbers in by_case(rows).items():
         cells = [case]
         for quantity in TITLES:
-            value, theirs = numbers.get(quantity), published(HAMILTONIAN, case, quantity)
+            value, theirs = numbers.get(quantity), beside(case, quantity) if case in compared else None
             text = "" if value is None else f"{value:.1f}" if quantity == "train_seconds" else f"{value:.1e}"
             if f"{quantity}_standard_error" in numbers:
                 text += f" ± {numbers[f'{quantity}_standard_error']:.0e}"

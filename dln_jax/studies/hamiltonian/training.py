@@ -32,21 +32,13 @@ from dln_jax.learning.motions import Weights, cut_windows
 from dln_jax.learning.rates import match_linear
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, WINDOW, Problem
 from dln_jax.types import InputError
-from dln_jax.zoo.phase_kinds import build_phase, describe_phase
+from dln_jax.zoo.catalogue import CATALOGUE, entry_of
+from dln_jax.zoo.descriptions import build, describe_for
 
-MODELS = ("hnn", "black-box-hnn", "baseline")
-"""Of every task in the table; hnn is what suits the scene."""
-POLYNOMIAL = "polynomial"
+MODELS = ("black-box-hnn", "phase-network")
+"""Of every task in the table, beside the one that suits the scene."""
+POLYNOMIAL = "polynomial-hamiltonian"
 """Of tasks with one coordinate and without friction, beside."""
-KINDS = {
-    "separable": "separable-hamiltonian",
-    "structured": "structured-hamiltonian",
-    "black-box": "black-box-hamiltonian",
-    "black-box-hnn": "black-box-hamiltonian",
-    "pairwise": "pairwise-hamiltonian",
-    POLYNOMIAL: "polynomial-hamiltonian",
-    "baseline": "phase-network",
-}
 DEGREES = range(2, 7)
 RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
@@ -83,19 +75,19 @@ class Recipe(NamedTuple):
 
 # The noise of spring and pendulum has sd 0.1; their rates have none, and are trusted to 0.01.
 _NOISY = Weights(state=0.1, rate=0.01)
-_SPRING = Recipe("separable", 8, 1, 16, 1, 40, 10_000, 60.0, 40, 30, _NOISY, 1)
+_SPRING = Recipe("separable-hnn", 8, 1, 16, 1, 40, 10_000, 60.0, 40, 30, _NOISY, 1)
 _PENDULUM = _SPRING._replace(trajectory_steps=50, window=15)
 RECIPES = {
     "spring": _SPRING,
     "pendulum": _PENDULUM,
     "damped-spring": _SPRING,
     "damped-pendulum": _PENDULUM,
-    "henon-heiles": Recipe("separable", 12, 2, 24, 2, 100, 4_000, 60.0),
-    "double-pendulum": Recipe("structured", 8, 2, 24, 2, 100, 4_000, 60.0),
-    "two-body": Recipe("pairwise", 8, 1, 24, 2, 60, 3_000, 25.0),
-    "three-body": Recipe("pairwise", 8, 1, 24, 2, 60, 4_000, 45.0),
-    REAL: Recipe("separable", 4, 1, 8, 1, 40, 10_000, 30.0, 40, WINDOW[REAL], Weights(state=0.03), 1),
-    MEASURED: Recipe("structured", 8, 1, 16, 1, 60, 10_000, 60.0, 60, WINDOW[MEASURED], None, 2),
+    "henon-heiles": Recipe("separable-hnn", 12, 2, 24, 2, 100, 4_000, 60.0),
+    "double-pendulum": Recipe("structured-hnn", 8, 2, 24, 2, 100, 4_000, 60.0),
+    "two-body": Recipe("pairwise-hnn", 8, 1, 24, 2, 60, 3_000, 25.0),
+    "three-body": Recipe("pairwise-hnn", 8, 1, 24, 2, 60, 4_000, 45.0),
+    REAL: Recipe("separable-hnn", 4, 1, 8, 1, 40, 10_000, 30.0, 40, WINDOW[REAL], Weights(state=0.03), 1),
+    MEASURED: Recipe("structured-hnn", 8, 1, 16, 1, 60, 10_000, 60.0, 60, WINDOW[MEASURED], None, 2),
 }
 ANCHOR = 30.0
 """How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
@@ -108,7 +100,7 @@ class Trained(NamedTuple):
     """A model and how it came about."""
 
     description: dict[str, Any]
-    """For `dln_jax.zoo.phase_kinds.build_phase`."""
+    """For `dln_jax.zoo.build`."""
     fits: dict[str, Training]
     """By stage, one after the other; the last one's parameters are the result."""
     stopped: str = ""
@@ -128,26 +120,32 @@ class Trained(NamedTuple):
 
 
 def models_of(task: str) -> tuple[str, ...]:
-    """The kinds of model that the table gives a task to."""
-    return (*MODELS, POLYNOMIAL) if task in ("spring", "pendulum") else MODELS
+    """The models that the table gives a task to; the first is what suits the scene."""
+    every = (RECIPES[task].suits, *MODELS)
+    return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
 
 
 def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
-    """The description of a model for a task; `keywords` (width, depth, activation, degree) replace the recipe's."""
+    """The description of a model for a task, "auto" for what suits the scene.
+
+    `keywords` (width, depth, activation, degree) replace the recipe's.
+    """
     recipe = RECIPES[problem.name]
-    suits = model in ("hnn", "auto", recipe.suits)
-    kind = KINDS.get(recipe.suits if suits else model)
-    if kind is None:
-        raise InputError(f"model '{model}' is unknown; choose from hnn, {', '.join(KINDS)}")
-    if kind == KINDS[POLYNOMIAL]:
+    suits = model in ("auto", recipe.suits)
+    name = recipe.suits if suits else model
+    if not entry_of(name).properties.canonical:
+        known = ", ".join(name for name, entry in CATALOGUE.items() if entry.properties.canonical)
+        raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
+    stated: dict[str, Any] = {"precision": precision, "pooled": True}
+    if name == POLYNOMIAL:
         degree = keywords.get("degree") or polynomial_degree(problem)
-        return describe_phase(kind, problem.fitted, problem.needs, precision=precision, degree=degree)
+        return describe_for(name, problem.fitted, problem.needs, **stated, degree=degree)
     few = (recipe.width, recipe.depth) if suits else (recipe.network, recipe.network_depth)
-    size = {"width": few[0], "depth": few[1], "activation": "tanh"}
+    size: dict[str, Any] = {"width": few[0], "depth": few[1], "activation": "tanh"}
     size |= {key: value for key, value in keywords.items() if value is not None and key in size}
-    if problem.needs.friction and kind in (KINDS["separable"], KINDS["structured"]):
+    if problem.needs.friction and name in ("separable-hnn", "structured-hnn"):
         size["friction_width"] = FRICTION_WIDTH
-    return describe_phase(kind, problem.fitted, problem.needs, precision=precision, **size)
+    return describe_for(name, problem.fitted, problem.needs, **stated, **size)
 
 
 def polynomial_degree(problem: Problem) -> int:
@@ -155,8 +153,8 @@ def polynomial_degree(problem: Problem) -> int:
     fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
 
     def fit(degree: int):
-        description = describe_phase(KINDS[POLYNOMIAL], fitted, problem.needs, degree=degree)
-        return match_linear(build_phase(description), fitted, validation=validation)
+        description = describe_for(POLYNOMIAL, fitted, problem.needs, precision="f64", degree=degree)
+        return match_linear(build(description), fitted, validation=validation)
 
     return grow(DEGREES, fit)[0].candidate
 
@@ -164,7 +162,7 @@ def polynomial_degree(problem: Problem) -> int:
 def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
     """The stages of a training that take steps, and how many each."""
     recipe = RECIPES[problem.name]
-    rates = {} if description["kind"] == KINDS[POLYNOMIAL] else {RATES: steps or recipe.steps}
+    rates = {} if description["name"] == POLYNOMIAL else {RATES: steps or recipe.steps}
     return {**rates, **({MOTIONS: steps or recipe.trajectory_steps} if recipe.trajectory_steps else {})}
 
 
@@ -172,7 +170,7 @@ def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
     """Raises `InputError` for all that `train` would refuse in the data."""
     recipe = RECIPES[problem.name]
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
-    fitted = rates.problem(build_phase(description), *parts, seed=seed, most_samples=recipe.samples)
+    fitted = rates.problem(build(description), *parts, seed=seed, most_samples=recipe.samples)
     require_finite_start(fitted, rates.samples(problem.fitted))
     if recipe.trajectory_steps:
         windows, validation = (cut_windows(part, recipe.window) for part in parts)
@@ -197,7 +195,7 @@ def train(
     finite from its start, the fit of rates is the result.
     """
     began = time.perf_counter()
-    recipe, model = RECIPES[problem.name], build_phase(description)
+    recipe, model = RECIPES[problem.name], build(description)
     numbers = [getattr(problem.fitted, key) for key in PER_SAMPLE]
 
     def checkpoint(name: str, optimiser: Optimiser) -> Checkpoint | None:
@@ -207,7 +205,7 @@ def train(
         return Checkpoint(directory, known, resume, f"checkpoint_{name}")
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
-    if description["kind"] == KINDS[POLYNOMIAL]:
+    if description["name"] == POLYNOMIAL:
         first = match_linear(model, parts[0], validation=parts[1])[0]
     else:
         own = _with_steps(optimiser, steps or recipe.steps)

@@ -24,7 +24,7 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.metrics.latency import one_step
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.types import InputError
-from dln_jax.zoo.load import load_run
+from dln_jax.zoo.run import load
 
 NAME = "model"
 NAMES = ("inverse", "forward")
@@ -59,7 +59,7 @@ def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arg
     """Of one run, by call path and function."""
     precision = json.loads((folder / "model.json").read_text())["model"]["precision"]
     dtype = {"f32": np.float32, "f64": np.float64}[precision]
-    system = load_run(folder)
+    system = load(folder).dynamics
     host = {name: list(zip(*(array.astype(dtype) for array in states[name]), strict=True)) for name in NAMES}
     device = {name: [tuple(map(jnp.asarray, state)) for state in host[name]] for name in NAMES}
     if given.dispatch == "default":

@@ -19,7 +19,7 @@ from dln_jax.studies.hamiltonian.tasks import Problem, problem_of
 from dln_jax.studies.hamiltonian.training import description_of, train
 from dln_jax.studies.report import Row
 from dln_jax.types import Hamiltonian
-from dln_jax.zoo.phase_kinds import build_phase
+from dln_jax.zoo.descriptions import build
 
 SCENES = {"pendulum": 0.2, "double-pendulum": 0.04, "henon-heiles": 0.4, "two-body": 0.4}
 """Largest time step of each, in s; it is halved."""
@@ -71,8 +71,8 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
     If quick, by a few steps of Adam, whose program compiles sooner.
     """
     options = {"optimiser": Adam(), "steps": 50} if quick else {}
-    trained = train(problem, description_of(problem, "hnn"), seed=0, **options)
-    return hamiltonian_of(build_phase(trained.description).energies(trained.result.parameters))
+    trained = train(problem, description_of(problem, "auto"), seed=0, **options)
+    return hamiltonian_of(build(trained.description).energies(trained.result.parameters))
 
 
 def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:

@@ -19,7 +19,7 @@ import numpy as np
 from dln_jax.command_line.running import run
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.metrics.latency import one_step
-from dln_jax.zoo.load import load_phase_field, load_run
+from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[3]
 """Where the package is, which the process is to import."""
@@ -44,7 +44,7 @@ def main(given: Arguments) -> None:
     """Times, and prints JSON."""
     enable_low_latency()
     states = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
-    system = load_phase_field(given.run) if given.function == "rates" else load_run(given.run)
+    system = load(given.run).flow if given.function == "rates" else load(given.run).dynamics
     function = low_latency(getattr(system, given.function), *states[0])
     found = one_step(function, [tuple(map(jnp.asarray, state)) for state in states], calls=given.calls)
     print(json.dumps({key: getattr(found, key) for key in ("p50_us", "p99_us")}))

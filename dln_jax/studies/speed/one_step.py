@@ -23,8 +23,8 @@ from dln_jax.studies.arm.models import SIZES, TRIGONOMETRIC, described
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, unit_of
 from dln_jax.types import InputError
-from dln_jax.zoo.kinds import build
-from dln_jax.zoo.load import load_system, save_model
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import load, save
 
 WIDE = "structured-delan-64x64"
 SMALL = "structured-delan"
@@ -92,13 +92,13 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     else:
         optimiser = (Adam if wide else GaussNewton)(steps=max(5, steps // 100) if quick else steps)
         parameters = fit(problem(model, sets, objective_of(kind, sets.train)), optimiser).parameters
-    save_model(folder, description, parameters)
+    save(folder, description, parameters)
     return folder
 
 
 def torque_mse(folder: Path, sets: Split) -> float:
     """On the test, as the stored model gives it."""
-    return errors(predictions(load_system(folder), sets.test, jnp.float64), sets.test)["torque_mse"]
+    return errors(predictions(load(folder).energies, sets.test, jnp.float64), sets.test)["torque_mse"]
 
 
 def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:

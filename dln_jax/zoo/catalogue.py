@@ -1,0 +1,152 @@
+"""The models by name: what makes each, what its typical sizes are taken from, and what it is by construction.
+
+A name is the same on command lines, in files, in tables and beside published numbers. Behaviour hangs on `Properties`,
+never on how a name is spelled.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+from dln_jax.models.black_box import make_black_box_lagrangian
+from dln_jax.models.delan import make_delan
+from dln_jax.models.dissipative import make_dissipative
+from dln_jax.models.feed_forward import make_feed_forward
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
+from dln_jax.models.model import Model
+from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.phase_network import make_phase_network
+from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.separable import make_separable_hamiltonian
+from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.nn.activations import Activation, tanh
+from dln_jax.types import InputError, Needs, require_network, require_positive
+from dln_jax.zoo.differential_network import make_differential_network
+from dln_jax.zoo.pictures import make_picture_model
+
+
+class Properties(NamedTuple):
+    """What a model is for any parameters."""
+
+    energy: bool = True
+    """Its functions come from an energy, so that it has a mass matrix."""
+    definite: bool = False
+    """Its mass matrix is positive definite."""
+    canonical: bool = False
+    """It is a function of (q, p), which Hamilton's equations fit to data with momenta."""
+    linear: bool = False
+    """Its parameters enter linearly, so that one least-squares problem fits them."""
+
+
+class Entry(NamedTuple):
+    """A model of the catalogue."""
+
+    factory: Callable[..., Any]
+    """Keywords, of which `needs` and `dtype` where it takes them -> model."""
+    properties: Properties
+    sizes: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation each is."""
+
+
+def extending(make: Callable[..., Model], *replaced: str) -> Callable[[Callable[..., Model]], Callable[..., Model]]:
+    """A factory that hands its `**keywords` on to `make` states those of both, but for the replaced ones.
+
+    A description has every keyword that the signature of its factory names.
+    """
+
+    def decorate(factory: Callable[..., Model]) -> Callable[..., Model]:
+        ours, theirs = (inspect.signature(each).parameters.values() for each in (factory, make))
+        own = [each for each in ours if each.kind is not each.VAR_KEYWORD]
+        names = {*replaced, *(each.name for each in own)}
+        every = [*own, *(each for each in theirs if each.name not in names)]
+        setattr(factory, "__signature__", inspect.Signature(every))  # noqa: B010
+        return factory
+
+    return decorate
+
+
+def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
+    """The factory of a Hamiltonian whose friction may depend on q: `friction_width` hidden units give it.
+
+    With `friction_width` 0 each coordinate has one coefficient, as `make` has it; without friction in the needs the
+    friction's keywords say nothing.
+    """
+
+    @extending(make)
+    def factory(
+        needs: Needs,
+        *,
+        friction_width: int = 0,
+        friction_depth: int = 1,
+        friction_activation: Activation = tanh,
+        initial_friction: float = 0.05,
+        dtype: DTypeLike = jnp.float32,
+        **keywords: Any,
+    ) -> Model:
+        if not (needs.friction and friction_width):
+            return make(needs, dtype=dtype, **keywords)
+        require_network(width=friction_width, depth=friction_depth)
+        conservative = make(needs._replace(friction=False), dtype=dtype, **keywords)
+        return make_dissipative(
+            conservative,
+            needs,
+            width=friction_width,
+            depth=friction_depth,
+            activation=friction_activation,
+            initial_friction=initial_friction,
+            dtype=dtype,
+        )
+
+    return factory
+
+
+@extending(make_pairwise_hamiltonian, "bodies")
+def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model:
+    """`make_pairwise_hamiltonian` of the bodies that the needs have coordinates for."""
+    require_positive(dimension=dimension)
+    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or needs.friction:
+        raise InputError(
+            f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
+        )
+    return make_pairwise_hamiltonian(needs.degrees_of_freedom // dimension, dimension, **keywords)
+
+
+MOMENTUM = {"momentum_scale": ("p",)}
+CATALOGUE = {
+    "structured-delan": Entry(make_delan, Properties(definite=True)),
+    "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}),
+    "trigonometric": Entry(make_trigonometric, Properties(linear=True)),
+    "feed-forward": Entry(
+        make_feed_forward,
+        Properties(energy=False),
+        {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)},
+    ),
+    "structured-hnn": Entry(
+        with_friction_network(make_structured_hamiltonian), Properties(definite=True, canonical=True)
+    ),
+    "black-box-hnn": Entry(with_friction_network(make_black_box_hamiltonian), Properties(canonical=True), MOMENTUM),
+    "separable-hnn": Entry(with_friction_network(make_separable_hamiltonian), Properties(canonical=True), MOMENTUM),
+    "pairwise-hnn": Entry(make_pairwise, Properties(definite=True, canonical=True)),
+    "polynomial-hamiltonian": Entry(make_polynomial_hamiltonian, Properties(canonical=True, linear=True)),
+    "phase-network": Entry(
+        make_phase_network, Properties(energy=False, canonical=True), {**MOMENTUM, "rate_scale": ("qd", "pd")}
+    ),
+    "differential-network": Entry(make_differential_network, Properties(energy=False)),
+    "latent-phase": Entry(make_picture_model, Properties(energy=False)),
+}
+"""Every model that a command trains and a file names."""
+
+
+def entry_of(name: str) -> Entry:
+    """The model of a name.
+
+    Raises:
+        InputError: an unknown one.
+    """
+    if name not in CATALOGUE:
+        raise InputError(f"model is {name!r:.60}; this release knows {', '.join(CATALOGUE)}")
+    return CATALOGUE[name]

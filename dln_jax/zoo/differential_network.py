@@ -1,0 +1,65 @@
+"""Differential networks, and ensembles of them, as a model of the catalogue: value, Jacobian and Hessian of one x."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
+
+from dln_jax.mechanics.arguments import vectors
+from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn.activations import Activation
+from dln_jax.nn.differential_mlp import Layers
+from dln_jax.types import MOST_LAYERS, InputError, VectorLike, require_positive
+
+
+class Derivatives(NamedTuple):
+    """What the function returns at one x [n]; of an ensemble, the means over its members."""
+
+    value: Float[Array, "m"]
+    jacobian: Float[Array, "m n"]
+    hessian: Float[Array, "m n n"]
+
+
+class FunctionModel(NamedTuple):
+    """A function of x with parameters."""
+
+    init: Callable[[Array], Layers]
+    """Random key -> layers, with the members of the ensemble on the leading axis, also when there is one."""
+    derivatives: Callable[[Layers], Callable[[VectorLike], Derivatives]]
+    """Layers -> function of x [n], which refuses what is no such x."""
+
+
+def make_differential_network(
+    *, sizes: tuple[int, ...], activation: Activation, members: int, dtype: DTypeLike = jnp.float32
+) -> FunctionModel:
+    """The model of `nn.differential_mlp`.
+
+    Args:
+        sizes: (inputs n, hidden widths ..., outputs m).
+        activation: of the hidden layers.
+        members: networks in the ensemble.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: sizes that make no network, or too many layers, or no members.
+    """
+    require_positive(members=members)
+    differential_mlp.layer_shapes(sizes)
+    if len(sizes) > MOST_LAYERS + 2:
+        raise InputError(f"sizes are those of {len(sizes) - 2} hidden layers; expected at most {MOST_LAYERS}")
+
+    def derivatives(layers: Layers) -> Callable[[VectorLike], Derivatives]:
+        def function(x):
+            (inputs,) = vectors(sizes[0], x=x)
+            every = jax.vmap(
+                lambda ours: differential_mlp.value_jacobian_and_hessian(ours, inputs, activation=activation)
+            )(layers)
+            return Derivatives(*(array.mean(axis=0) for array in every))
+
+        return function
+
+    return FunctionModel(lambda key: ensembles.init(key, sizes, members=members, dtype=dtype), derivatives)

@@ -1,0 +1,119 @@
+"""A latent model of pictures: an autoencoder of their principal components, and what moves in the latent plane."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics.arguments import vectors
+from dln_jax.models.latent_phase import (
+    Field,
+    LatentModel,
+    LatentPhase,
+    latent_field,
+    make_latent_phase,
+    through_components,
+)
+from dln_jax.models.principal_components import Components
+from dln_jax.nn.activations import Activation, silu, tanh
+from dln_jax.types import InputError, require_positive
+
+MOST_NUMBERS = 10**8
+"""Of the components of a picture."""
+
+
+class PictureModel(NamedTuple):
+    """Pictures and their latent plane with parameters."""
+
+    init: Callable[[Array], Any]
+    """Random key -> {"parameters": of the networks, "components": mean, basis and scale of the components}."""
+    pictures: Callable[[Any], LatentPhase]
+    """These -> functions of two pictures after each other [2 n]."""
+    of_coefficients: Callable[[float], LatentModel]
+    """Typical coefficient -> the model of the components' coefficients, which is what is trained."""
+
+
+def make_picture_model(
+    *,
+    field: Field,
+    pixels: int,
+    components: int,
+    field_width: int = 64,
+    field_depth: int = 2,
+    field_activation: Activation = tanh,
+    width: int = 200,
+    activation: Activation = silu,
+    momentum_scale: float = 0.2,
+    dtype: DTypeLike = jnp.float32,
+) -> PictureModel:
+    """The model of pictures by their principal components, framewise.
+
+    Args:
+        field: what moves in the latent plane.
+        pixels: n, of one picture.
+        components: of a picture.
+        field_width: hidden units per layer of what moves there.
+        field_depth: its hidden layers.
+        field_activation: of these.
+        width: hidden units per layer of encoder and decoder.
+        activation: of these.
+        momentum_scale: typical size of the momentum in the latent plane, where the coordinate has one of 1.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` in the components.
+    """
+    require_positive(pixels=pixels, components=components)
+    if pixels * components > MOST_NUMBERS:
+        raise InputError(f"{components} components of {pixels} pixels are more than {MOST_NUMBERS:,} numbers")
+    moving = latent_field(
+        field,
+        width=field_width,
+        depth=field_depth,
+        activation=field_activation,
+        momentum_scale=momentum_scale,
+        dtype=dtype,
+    )
+
+    def of_coefficients(scale: float) -> LatentModel:
+        mean = np.zeros(2 * components)
+        size: dict[str, Any] = {"width": width, "activation": activation, "momentum_scale": momentum_scale}
+        return make_latent_phase(moving, mean, framewise=True, scale=scale, **size, dtype=dtype)
+
+    unit = of_coefficients(1.0)
+
+    def init(key: Array) -> Any:
+        shapes = {"mean": (pixels,), "basis": (components, pixels), "scale": ()}
+        arrays = {name: jnp.ones(shape, dtype) for name, shape in shapes.items()}
+        return {"parameters": unit.init(key), "components": arrays}
+
+    def pictures(parameters: Any) -> LatentPhase:
+        stored = parameters["components"]
+        scale = stored["scale"]
+
+        def scaled(parameters: Any) -> LatentPhase:
+            inner = unit.apply(parameters)
+            return LatentPhase(
+                lambda c: inner.encode(c / scale.astype(c.dtype)),
+                lambda q, p: inner.decode(q, p) * scale.astype(q.dtype),
+                inner.field,
+            )
+
+        basis = Components(stored["mean"], stored["basis"], 1.0, 0.0)
+        system = through_components(LatentModel(unit.init, scaled, moving), basis).apply(parameters["parameters"])
+        return LatentPhase(
+            lambda frames: system.encode(*vectors(2 * pixels, frames=frames)),
+            lambda q, p: system.decode(*vectors(1, q=q, p=p)),
+            system.field,
+        )
+
+    return PictureModel(init, pictures, of_coefficients)
+
+
+def with_components(components: Components, parameters: Any, dtype: DTypeLike = jnp.float32) -> Any:
+    """The parameters of a `PictureModel`, from those of its coefficients' model."""
+    arrays = {"mean": components.mean, "basis": components.basis, "scale": components.scale}
+    return {"parameters": parameters, "components": {name: jnp.asarray(each, dtype) for name, each in arrays.items()}}

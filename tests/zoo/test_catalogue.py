@@ -1,0 +1,297 @@
+"""Every name gives the same model again from its folder, whatever becomes of defaults; one's own models too."""
+
+import functools
+import inspect
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dln_jax
+from dln_jax.data.schema import from_arrays
+from dln_jax.mechanics.equations import Canonical, Energies, dynamics, flow
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.models.model import Model
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build, describe, describe_for, typical_sizes
+from dln_jax.zoo.run import load, save
+
+SWING = Needs(joints=("revolute",), friction=True)
+FREE = Needs(joints=("revolute",))
+BODIES = Needs(joints=("prismatic",) * 4)
+SMALL = {"width": 3, "depth": 1}
+MODELS = {
+    "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
+    "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
+    "trigonometric": {"needs": SWING, "degree": [2]},
+    "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
+    "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
+    "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},
+    "separable-hnn": {"needs": SWING, **SMALL, "friction_width": 2, "initial_friction": 0.1},
+    "pairwise-hnn": {"needs": BODIES, **SMALL, "features": ["inverse"]},
+    "polynomial-hamiltonian": {"needs": FREE, "degree": 3},
+    "phase-network": {"needs": FREE, **SMALL, "rate_scale": 2.0},
+    "differential-network": {"sizes": [2, 3, 1], "activation": "cos", "members": 2},
+    "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
+}
+
+
+def random_parameters(model):
+    # Drawn here and not by `init`, which is slow to compile.
+    draw = np.random.default_rng(0).normal
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(0.3 * draw(size=leaf.shape), leaf.dtype), jax.eval_shape(model.init, jax.random.key(0))
+    )
+
+
+def stored(folder, name, precision="f64", **changes):
+    description = describe(name, precision=precision, **{**MODELS[name], **changes})
+    save(folder, description, random_parameters(build(description)))
+    return description
+
+
+def altered(folder, change):
+    path = folder / "model.json"
+    manifest = json.loads(path.read_text())
+    change(manifest["model"])
+    path.write_text(json.dumps(manifest))
+
+
+def answer(name, run):
+    """One number of a run, by what it gives."""
+    q = [0.3, 0.1, -0.4, 0.9] if name == "pairwise-hnn" else [0.3]
+    if name == "differential-network":
+        return run.derivatives([0.1, 0.2]).hessian.sum()
+    if name == "latent-phase":
+        return sum(run.pictures.encode(np.linspace(0, 1, 12)))[0]
+    if CATALOGUE[name].properties.canonical and name != "pairwise-hnn":
+        return run.flow.rates(q, q)[1].sum()
+    return run.dynamics.inverse_dynamics(q, q, q).sum()
+
+
+def test_every_name_is_tried():
+    assert set(MODELS) == set(CATALOGUE)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_stored_model_is_the_same_after_every_default_has_changed(name, tmp_path, monkeypatch):
+    """Every keyword of the factory is in the file: what is built from it asks no default."""
+    description = stored(tmp_path, name)
+    run = load(tmp_path)
+    assert run.description == description == json.loads(json.dumps(description))
+    before = answer(name, run)
+    assert np.isfinite(before) and before != 0
+    factory = CATALOGUE[name].factory
+    keywords = [each for each in inspect.signature(factory).parameters.values() if each.name != "dtype"]
+    assert {"name", "precision", *(each.name for each in keywords)} == set(description)
+    given = {}
+
+    def remembers(**keywords):
+        given.update(keywords)
+        return factory(**keywords)
+
+    remembers.__signature__ = inspect.signature(factory)
+    monkeypatch.setitem(CATALOGUE, name, CATALOGUE[name]._replace(factory=remembers))
+    again = load(tmp_path)
+    assert set(given) == {"dtype", *(each.name for each in keywords)}
+    assert answer(name, again) == before
+    for leaf, other in zip(jax.tree.leaves(run.parameters), jax.tree.leaves(again.parameters), strict=True):
+        np.testing.assert_array_equal(leaf, other)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_missing_keyword_is_refused_and_never_filled_in(name, tmp_path):
+    description = stored(tmp_path, name)
+    for key in description:
+        if key in ("name", "precision"):
+            continue
+        altered(tmp_path, lambda model, key=key: model.pop(key))
+        with pytest.raises(InputError, match=f"model.json: model description: lacks {key}; restore") as caught:
+            load(tmp_path)
+        assert "\n" not in str(caught.value)
+        altered(tmp_path, lambda model, key=key: model.update({key: description[key]}))
+    if "needs" in description:
+        altered(tmp_path, lambda model: model["needs"].pop("friction"))
+        with pytest.raises(InputError, match="needs lack friction"):
+            load(tmp_path)
+
+
+def test_a_default_that_changes_leaves_stored_results(tmp_path, monkeypatch):
+    """The diagonal floor, 0.1 by default, once decided a torque that had been stored without it."""
+    stored(tmp_path, "structured-delan", shared_trunk=False)
+    before = load(tmp_path).dynamics.inverse_dynamics([0.3], [0.1], [2.0])
+    entry = CATALOGUE["structured-delan"]
+    other = entry._replace(factory=functools.partial(entry.factory, diagonal_floor=0.5))
+    monkeypatch.setitem(CATALOGUE, "structured-delan", other)
+    assert describe("structured-delan", needs=FREE, precision="f64")["diagonal_floor"] == 0.5
+    assert load(tmp_path).dynamics.inverse_dynamics([0.3], [0.1], [2.0]) == before
+
+
+def test_what_a_model_cannot_give_is_refused_with_what_it_can(tmp_path):
+    refused = [
+        ("phase-network", "dynamics", "a phase-network has no dynamics; ask for .flow"),
+        ("feed-forward", "flow", "a feed-forward has no flow; ask for .dynamics"),
+        ("structured-delan", "pictures", "a structured-delan has no pictures; ask for .dynamics or .flow"),
+        ("differential-network", "energies", "a differential-network has no energies; ask for .derivatives"),
+        ("latent-phase", "derivatives", "a latent-phase has no derivatives; ask for .pictures"),
+    ]
+    for name, asked, message in refused:
+        stored(tmp_path, name)
+        with pytest.raises(InputError) as caught:
+            getattr(load(tmp_path), asked)
+        assert str(caught.value) == message
+
+
+def test_functions_are_made_once_and_compute_in_the_precision_of_the_training(tmp_path):
+    stored(tmp_path, "structured-hnn", precision="f32", friction_width=0)
+    run = load(tmp_path)
+    assert run.dynamics is run.dynamics and run.flow is run.flow
+    tau = run.dynamics.inverse_dynamics([1], np.ones(1), np.ones(1))
+    assert tau.dtype == run.flow.energy([1], [0.5]).dtype == jnp.float32
+
+
+def test_a_loaded_run_is_trained_on(tmp_path):
+    """Its parameters are public: a gradient by them lowers a loss, and the result is saved and loaded again."""
+    stored(tmp_path, "structured-delan")
+    run = dln_jax.load(tmp_path)
+    state = (jnp.array([0.3]), jnp.array([0.2]), jnp.array([1.0]))
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(parameters):
+        return jnp.sum((dynamics(run.model.energies(parameters)).inverse_dynamics(*state) - 5.0) ** 2)
+
+    before, slope = loss(run.parameters)
+    tuned = jax.tree.map(lambda leaf, change: leaf - 1e-4 * change, run.parameters, slope)
+    assert loss(tuned)[0] < before
+    dln_jax.save(tmp_path, run.description, tuned)
+    again = dln_jax.load(tmp_path)
+    np.testing.assert_allclose(jnp.sum((again.dynamics.inverse_dynamics(*state) - 5.0) ** 2), loss(tuned)[0])
+
+
+# one's own models
+
+
+def make_rod(needs: Needs, *, length: float = 2.0, dtype=jnp.float32) -> Model:
+    """A rod with a learned mass."""
+
+    def energies(mass):
+        return NaturalSystem(
+            cholesky=lambda q: jnp.sqrt(mass[:, None]) * length, potential=lambda q: -mass[0] * jnp.cos(q[0])
+        )
+
+    return Model(lambda key: jnp.ones(needs.degrees_of_freedom, dtype), energies)
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A file of one's own that can be imported, and whether it was."""
+    (tmp_path / "rods.py").write_text(
+        inspect.getsource(make_rod).join(
+            (
+                "import jax.numpy as jnp\nfrom dln_jax import Model, NaturalSystem, Needs\n",
+                "\nnumber = 3\n",
+            )
+        )
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    yield lambda: "rods" in sys.modules
+    sys.modules.pop("rods", None)
+
+
+def test_a_model_of_ones_own_is_loaded_with_its_factory(tmp_path):
+    description = describe(make_rod, needs=FREE, precision="f64")
+    assert description["name"] == "own" and description["length"] == 2.0 and "rod" not in json.dumps(description)
+    save(tmp_path, description, jnp.array([3.0]))
+    with pytest.raises(InputError, match="give it as factory="):
+        load(tmp_path, trust=True)
+    run = load(tmp_path, factory=make_rod)
+    np.testing.assert_allclose(run.dynamics.mass_matrix([0.1]), [[12.0]])
+    assert run.flow.energy([0.1], [0.0]) == -3 * jnp.cos(0.1)
+    altered(tmp_path, lambda model: model.pop("length"))
+    with pytest.raises(InputError, match="lacks length"):
+        load(tmp_path, factory=make_rod)
+
+
+def test_a_factory_is_imported_by_name_only_when_it_is_trusted(tmp_path, module):
+    description = describe("rods:make_rod", needs=FREE, precision="f64", length=1.0)
+    save(tmp_path, description, jnp.array([3.0]))
+    sys.modules.pop("rods")
+    with pytest.raises(InputError, match="made by rods:make_rod, which is no code of this package; give"):
+        load(tmp_path)
+    assert not module()
+    np.testing.assert_allclose(load(tmp_path, factory=make_rod).dynamics.mass_matrix([0.1]), [[3.0]])
+    assert not module()
+    np.testing.assert_allclose(load(tmp_path, trust=True).dynamics.mass_matrix([0.1]), [[3.0]])
+    assert module()
+    for name in ("rods:number", "rods:nothing", "no.such.module:make", ":", "rods:", "..rods:make_rod"):
+        altered(tmp_path, lambda model, name=name: model.update(name=name))
+        with pytest.raises(InputError) as caught:
+            load(tmp_path, trust=True)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_named_model_takes_no_other_factory(tmp_path):
+    stored(tmp_path, "feed-forward")
+    with pytest.raises(InputError, match="leave factory= out"):
+        load(tmp_path, factory=make_rod)
+
+
+def test_mistakes_in_a_description_are_named():
+    cases = [
+        (
+            lambda: describe("delan", needs=FREE, precision="f64"),
+            "model is 'delan'; this release knows structured-delan",
+        ),
+        (lambda: describe("structured-delan", needs=FREE, precision="f64", colour=1), "unknown are 'colour'"),
+        (lambda: describe("structured-delan", precision="f64"), "lacks needs"),
+        (
+            lambda: describe("black-box-hnn", needs=FREE, precision="f64", initial_guess=jnp.sin),
+            "which no file can hold",
+        ),
+        (lambda: describe("feed-forward", needs=FREE, precision="f64", tau_scale=np.inf), "tau_scale is inf"),
+        (lambda: build(describe("feed-forward", needs=FREE, precision="f16")), "precision is 'f16'"),
+        (lambda: build({"name": "feed-forward"}), "lacks acceleration_scale, activation, depth"),
+    ]
+    for call, message in cases:
+        with pytest.raises(InputError, match=message):
+            call()
+
+
+def test_typical_sizes_are_those_of_the_data():
+    rng = np.random.default_rng(0)
+    arrays = {key: rng.normal(size=(50, 2)) * [1.0, 4.0] for key in ("q", "qd", "qdd", "tau", "p", "pd")}
+    data = from_arrays({"t": np.arange(50.0), "trajectory": np.zeros(50, int), **arrays})
+    sizes = typical_sizes("feed-forward", data)
+    np.testing.assert_allclose(sizes["tau_scale"], arrays["tau"].std(axis=0), rtol=5e-3)
+    pooled = typical_sizes("phase-network", data, pooled=True)
+    rates = np.concatenate([arrays["qd"], arrays["pd"]])
+    np.testing.assert_allclose(pooled["rate_scale"], rates.std(), rtol=5e-3)
+    np.testing.assert_allclose(pooled["momentum_scale"], arrays["p"].std(), rtol=5e-3)
+    without = data._replace(p=None, pd=None)
+    assert typical_sizes("black-box-hnn", without) == {}
+    with pytest.raises(InputError, match="no momenta p"):
+        typical_sizes("black-box-hnn", without, pooled=True)
+    needs = Needs(joints=("prismatic",) * 2)
+    assert describe_for("black-box-hnn", without, needs, precision="f64")["momentum_scale"] == 1.0
+
+
+def test_properties_are_those_of_the_energies():
+    """What the catalogue says of a model is what its energies are."""
+    for name, entry in CATALOGUE.items():
+        if "needs" not in MODELS[name]:
+            continue
+        model = build(describe(name, precision="f64", **MODELS[name]))
+        energies = model.energies(random_parameters(model))
+        assert isinstance(energies, Energies) == entry.properties.energy
+        assert isinstance(energies, Canonical | PhaseRates) == entry.properties.canonical
+        if entry.properties.definite:
+            q = np.linspace(0.1, 0.7, len(MODELS[name]["needs"].joints)) ** 2
+            assert np.linalg.eigvalsh(dynamics(energies).mass_matrix(q)).min() > 0
+        if entry.properties.canonical:
+            assert flow(energies).rates is not None
