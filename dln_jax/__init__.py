@@ -1,4 +1,10 @@
-"""Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers."""
+"""Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers.
+
+The public names, gathered from all rooms; every room has its own `__all__`. Functions take one state (`q, qd, qdd, tau`
+of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for each concept.
+"""
+
+import importlib.metadata
 
 import dln_jax.interrupts  # noqa: F401  first, as the others take a second to import
 from dln_jax.data.schema import Trajectories
@@ -7,34 +13,59 @@ from dln_jax.data.schema import save as save_trajectories
 from dln_jax.deploy.c.load import load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
-from dln_jax.mechanics import lagrangian, natural
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.engine.problem import Problem, Training
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.flow import Flow, PlainFlow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.models.delan import make_delan
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.plain import InverseForward, PhaseRates
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.descriptions import describe
+from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import Run, load, save
 
+__version__ = importlib.metadata.version("dln-jax")
+
 __all__ = [
+    "Adam",
+    "ClosedForm",
     "Decomposition",
     "Dynamics",
+    "Flow",
+    "GaussNewton",
+    "HamiltonianSystem",
     "InputError",
+    "InverseForward",
+    "LagrangianSystem",
     "Model",
+    "NaturalHamiltonian",
     "NaturalSystem",
     "Needs",
+    "PhaseRates",
+    "PlainDynamics",
+    "PlainFlow",
+    "Problem",
     "Run",
+    "Training",
     "Trajectories",
+    "__version__",
+    "build",
     "describe",
+    "dynamics",
     "enable_low_latency",
     "export_c",
-    "lagrangian",
+    "fit",
+    "flow",
     "load",
     "load_c",
     "load_trajectories",
     "low_latency",
-    "make_delan",
-    "natural",
     "save",
     "save_trajectories",
 ]
