@@ -1,0 +1,97 @@
+"""
+A measured pendulum with friction
+=================================
+
+What a camera gives: times and noisy angles of a swinging pendulum, no rates, no torques. The command `train_hnn_task`
+matches motions through an integrator, so that no noise is differentiated, and finds energy and friction apart.
+"""
+
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import dln_jax
+from dln_jax.commands import train_hnn_task
+from dln_jax.mechanics.integrators import rk4, rollout
+
+jax.config.update("jax_enable_x64", True)
+
+NOISE = 0.01  # rad
+FRICTION = 0.15  # 1/s
+STIFFNESS = 9.0  # g / l, 1/s²
+ITERATIONS = 15
+
+# %%
+# The measurement
+# ---------------
+# Six recordings of 6 s at 20 Hz. The file says only what was measured: `t`, `q` and which recording it was.
+
+times = np.arange(0, 6, 0.05)
+starts = np.random.default_rng(0).uniform(0.3, 2.0, 6)
+
+
+def swing(t, state):
+    q, qd = state
+    return qd, -STIFFNESS * jnp.sin(q) - FRICTION * qd
+
+
+motion = jax.jit(jax.vmap(lambda start: rollout(rk4(swing), (start, 0.0 * start), times, substeps=4)))
+angles, rates = motion(starts)
+measured = np.asarray(angles) + NOISE * np.random.default_rng(1).normal(size=angles.shape)
+folder = Path(tempfile.mkdtemp())
+np.savez(
+    folder / "pendulum.npz",
+    t=np.tile(times, len(starts)),
+    q=measured.reshape(-1, 1),
+    trajectory=np.repeat(np.arange(len(starts)), len(times)),
+)
+
+# %%
+# Training
+# --------
+# In a terminal this is
+#
+# `dln-jax train_hnn_task --task measured --data pendulum.npz --needs '{"joints": ["revolute"], "friction": true}'`
+#
+# A revolute joint enters as cosine and sine; friction is asked for, so that there is a dissipation to learn.
+
+train_hnn_task.main(
+    train_hnn_task.Arguments(
+        task="measured",
+        data=folder / "pendulum.npz",
+        needs='{"joints": ["revolute"], "friction": true}',
+        steps=ITERATIONS,
+        out=folder / "run",
+        figures=False,
+        low_latency=False,
+    )
+)
+flow = dln_jax.load(folder / "run").flow
+
+# %%
+# Energy falls as friction takes it
+# ---------------------------------
+# dH/dt = -2 D, where D is the Rayleigh function: what the model loses along its own motion is what it says it loses.
+
+start = jnp.array([1.5]), jnp.array([0.0])
+q, p = jax.jit(lambda start: rollout(rk4(lambda t, state: flow.rates(*state)), start, times, substeps=4))(start)
+energy = jax.vmap(flow.energy)(q, p)
+assert energy[-1] < energy[0]
+
+true_q, _ = motion(np.array([1.5]))
+error = float(np.sqrt(np.mean((q[:, 0] - true_q[0]) ** 2)))
+print(f"a new swing of 6 s: root mean square error {error:.4f} rad; the noise of the data was {NOISE} rad")
+assert error < 5 * NOISE
+
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)
+above.plot(times, true_q[0], "k", linewidth=3, label="truth")
+above.plot(times, q[:, 0], "--", color="tab:red", label="learned")
+above.set(ylabel="angle, rad")
+above.legend(frameon=False, ncols=2)
+below.plot(times, energy - energy.min(), color="tab:red")
+below.set(ylabel="learned energy", xlabel="time, s")
+figure.tight_layout()

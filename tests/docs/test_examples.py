@@ -1,0 +1,51 @@
+"""The examples of the documentation, at reduced size: each ends with its own assertions of physics."""
+
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "docs" / "examples").glob("*.py"))
+REDUCED = {
+    "01_spherical_pendulum": {"SECONDS": 2},
+    "02_train_the_arm": {"ITERATIONS": 25},
+    "03_measured_pendulum": {"ITERATIONS": 10},
+    "04_two_bodies": {"TRAJECTORIES": 20, "SECONDS": 5},
+    "05_differential_network": {"SAMPLES": 500},
+    "06_soft_body": {"STEPS": 30, "RINGS": 2},
+    "07_gait": {"GOAL": 0.3},
+    "08_c_in_a_loop": {},
+    "09_fine_tune": {"ITERATIONS": 10},
+}
+"""Constants of the examples, and what they are here."""
+
+
+def reduced(path: Path) -> str:
+    source = path.read_text()
+    for name, value in REDUCED[path.stem].items():
+        line = re.search(rf"^(.*\b{name}\b.*) = (.*)$", source, re.MULTILINE)
+        assert line is not None, f"{path.stem} sets no {name}"
+        names, values = ([part.strip() for part in re.split(",| #", side)] for side in line.groups())
+        values = values[: len(names)]
+        values[names.index(name)] = str(value)
+        source = source.replace(line.group(0), f"{', '.join(names)} = {', '.join(values)}")
+    return source
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs_and_its_assertions_hold(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = path.read_text()
+    assert re.search(r"^assert ", source, re.MULTILINE), "an example checks its physics"
+    try:
+        exec(compile(reduced(path), str(path), "exec"), {"__name__": "__main__"})
+        assert plt.get_fignums(), "an example ends with a picture"
+    finally:
+        plt.close("all")
+    assert re.search(r"\d", capsys.readouterr().out)
+
+
+def test_every_example_has_its_size():
+    assert set(REDUCED) == {path.stem for path in EXAMPLES}
