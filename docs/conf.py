@@ -1,0 +1,142 @@
+"""The documentation: Markdown pages, examples that run as it is built, and the API from the docstrings."""
+
+import importlib
+import itertools
+import os
+import pkgutil
+import re
+import warnings
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+from sphinx.ext.napoleon import Config, GoogleDocstring
+
+import dln_jax
+
+HERE = Path(__file__).parent
+project = "dln_jax"
+author = "The dln_jax developers"
+copyright = f"2026, {author}"
+version = release = dln_jax.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "examples", "gallery/*.ipynb", "gallery/*.py"]
+myst_heading_anchors = 3
+default_role = "code"  # docstrings write `name` as Markdown does
+add_module_names = False
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+
+html_theme = "furo"
+html_title = f"dln_jax {version}"
+html_static_path = ["_static"]
+html_css_files = ["style.css"]
+html_show_sphinx = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": "FileNameSortKey",
+    "remove_config_comments": True,
+    "download_all_examples": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "first_notebook_cell": "# pip install dln-jax",
+}
+suppress_warnings = ["config.cache"]
+warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
+
+ROOMS = {
+    "types": "Symbols, units and shapes",
+    "mechanics": "Mechanics: equations of motion from energies",
+    "scenes": "Textbook systems",
+    "models": "Models: energies made of networks and bases",
+    "data": "Data: a user's file",
+    "datasets": "Data sets that are generated",
+    "zoo": "Models by name, run folders",
+    "learning": "Learning",
+    "metrics": "Numbers about a model",
+    "figures": "Pictures",
+    "deploy": "Real time, C and StableHLO",
+    "softbody": "Soft bodies",
+    "locomotion": "Locomotion",
+    "nn": "Networks",
+    "solvers": "Solvers",
+    "precision": "Precision",
+}
+"""Folders and modules of dln_jax that the API pages show, in the order of the contents."""
+
+
+def modules(room):
+    """A room's modules, itself first, without those that need an extra which is not installed."""
+    package = importlib.import_module(f"dln_jax.{room}")
+    yield package
+    for found in pkgutil.walk_packages(getattr(package, "__path__", []), package.__name__ + "."):
+        try:
+            yield importlib.import_module(found.name)
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith("dln_jax"):
+                raise
+
+
+def write_api_pages():
+    """One page a room, so that a new module is in the documentation without a list to extend."""
+    folder = HERE / "api"
+    for room, title in ROOMS.items():
+        parts = [title, "=" * len(title), ""]
+        for module in modules(room):
+            members = [] if hasattr(module, "__path__") else ["   :members:"]
+            short = module.__name__.removeprefix("dln_jax.")
+            heading = [] if short == room else [short, "-" * len(short), ""]
+            parts += [*heading, f".. automodule:: {module.__name__}", *members, "   :ignore-module-all:", ""]
+        text = "\n".join(parts)
+        path = folder / f"{room}.rst"
+        if not path.exists() or path.read_text() != text:
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+
+
+RULE = re.compile(r"\|[-| ]+\|")
+
+
+def to_rst(app, what, name, obj, options, lines):
+    """Turns a docstring into reStructuredText: Markdown's tables and `code`, Google's sections, no other markup."""
+    converted, in_table = [], False
+    for line, following in itertools.zip_longest(lines, lines[1:], fillvalue=""):
+        if line.startswith("|") and RULE.fullmatch(following):
+            in_table = True
+            converted += [".. list-table::", "   :header-rows: 1", ""]
+        in_table &= line.startswith("|")
+        if not in_table:
+            converted.append(escaped(line))
+        elif not RULE.fullmatch(line):
+            cells = [cell.strip() for cell in line.strip()[1:-1].split("|")]
+            converted += [f"   {'  -' if column else '* -'} {escaped(cell)}" for column, cell in enumerate(cells)]
+    if what != "attribute":  # Napoleon takes what is before a colon there for a type
+        converted = str(GoogleDocstring(converted, Config(), app, "function", name, obj, options)).splitlines()
+    lines[:] = converted
+
+
+def escaped(line):
+    """A line with what reStructuredText would read as markup escaped, outside of `code`."""
+    parts = re.split(r"(`[^`]*`)", line)
+    return "".join(part if index % 2 else re.sub(r"([|*]|_(?!\w))", r"\\\1", part) for index, part in enumerate(parts))
+
+
+def skip(app, what, name, obj, skipped, options):
+    """Fields of records that have no line of their own are read in the signature."""
+    return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") and skipped else skipped
+
+
+def setup(app):
+    """Sphinx calls it."""
+    write_api_pages()
+    app.connect("autodoc-process-docstring", to_rst, priority=100)
+    app.connect("autodoc-skip-member", skip)
