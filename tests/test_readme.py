@@ -1,4 +1,7 @@
-"""README.md as its reader meets it: every block runs as printed, after the README's own first command."""
+"""README.md and the pages of the documentation as their reader meets them.
+
+Every block runs as printed in a fresh interpreter, in a folder where the README's own first command has run.
+"""
 
 import importlib
 import os
@@ -7,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,22 +21,31 @@ from conftest import CACHE
 from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.pendulum import pendulum
 
 ROOT = Path(__file__).parent.parent
-TEXT = (ROOT / "README.md").read_text()
-BLOCKS = {
-    language: re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
-    for language in ("python", "bash")
+PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
+PROSE = {name: re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE) for name, text in PAGES.items()}
+MOST_WORDS = 900
+"""Of the README."""
+SMALL = {
+    "train_delan": "--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 --no-figures",
+    "train_hnn_task": "--steps 2 --no-figures --no-low-latency",
+    "export_c": "",
 }
-INLINE = re.findall(r"`(python -m scripts\.[^`]*)`", re.sub(r"^```.*?^```", "", TEXT, flags=re.DOTALL | re.MULTILINE))
-BUDGET = {
-    "train_delan": shlex.split(
-        "--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 --no-figures"
-    )
-}
-"""Put behind what the README gives, so that a script runs for a second: what is printed there stays as it is."""
-NOT_RUN = (("pip", "install"), ("python", "-m", "pytest"), ("ruff",), ("pyright",))
+"""Put behind what a page gives, so that a command runs for a second: what is printed there stays as it is."""
+NOT_RUN = (("pip", "install"), ("python", "-m", "pytest"))
 """What installs, and what checks this very repository."""
+
+
+class Block(NamedTuple):
+    page: str
+    text: str
+
+
+def blocks(language):
+    pattern = re.compile(rf"^```{language}\n(.*?)^```", re.DOTALL | re.MULTILINE)
+    return [Block(name, text) for name, page in PAGES.items() for text in pattern.findall(page)]
 
 
 def commands(text):
@@ -46,7 +59,12 @@ def script_and_arguments(words):
     return importlib.import_module(f"dln_jax.commands.{words[2].removeprefix('scripts.')}"), words[3:]
 
 
-SCRIPTS = [words for block in BLOCKS["bash"] for words in commands(block) if words[2:3] and words[2].startswith("scr")]
+EVERY = [words for block in blocks("bash") for words in commands(block.text)]
+FIRST = ["python", "-m", "scripts.train_delan"]
+SCRIPTS = [list(words) for words in dict.fromkeys(map(tuple, EVERY)) if words[2:3] and words[2].startswith("scripts.")]
+INLINE = {
+    text.replace("\n", " ") for page in PROSE.values() for text in re.findall(r"`(python -m scripts\.[^`]*)`", page)
+}
 
 
 @pytest.fixture(scope="module")
@@ -58,47 +76,68 @@ def workplace(tmp_path_factory):
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         data = generators.uniform(cart_pole(friction=0.1), samples=60)
         schema.save(folder / "mine.npz", data._replace(label=np.array([f"run{index}" for index in range(60)])))
-        run(SCRIPTS[0])
+        swings = generators.free_swing(pendulum(), trajectories=4, steps=60)
+        np.savez(folder / "swings.npz", t=swings.t, q=swings.q, trajectory=swings.trajectory)
+        run(FIRST)
         yield folder
 
 
 def run(words):
     script, arguments = script_and_arguments(words)
-    command(script, *arguments, *BUDGET[words[2].removeprefix("scripts.")])
+    command(script, *arguments, *shlex.split(SMALL[words[2].removeprefix("scripts.")]))
+
+
+def test_the_readme_is_short():
+    assert len(PAGES["README.md"].split()) <= MOST_WORDS
 
 
 def test_every_command_of_a_block_is_known():
     """Each is one of a script, which runs below, or is named as one that does not run here."""
-    every = [words for block in BLOCKS["bash"] for words in commands(block)]
-    others = [words for words in every if words not in SCRIPTS]
-    assert len(SCRIPTS) >= 2 and SCRIPTS[0] == ["python", "-m", "scripts.train_delan"]
+    assert len(SCRIPTS) >= 3 and SCRIPTS[0] == FIRST
+    others = [words for words in EVERY if words not in SCRIPTS]
     assert all(any(tuple(words[: len(known)]) == known for known in NOT_RUN) for words in others)
 
 
 @pytest.mark.parametrize("words", SCRIPTS[1:], ids=shlex.join)
 def test_a_command_of_a_block_runs(words, workplace):
-    before = len(list((workplace / "runs").iterdir()))
+    before = len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir()))
     run(words)
-    assert len(list((workplace / "runs").iterdir())) == before + 1
+    assert len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir())) == before + 1
 
 
-@pytest.mark.parametrize("text", INLINE)
+@pytest.mark.parametrize("text", sorted(INLINE))
 def test_a_command_in_the_text_parses(text):
     script, arguments = script_and_arguments(shlex.split(text))
     tyro.cli(script.Arguments, args=arguments)
 
 
-@pytest.mark.parametrize("block", BLOCKS["python"], ids=lambda block: block.strip().splitlines()[-1][:40])
+@pytest.mark.parametrize("block", blocks("python"), ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}")
 def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(block, workplace):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": os.environ[CACHE]}
     result = subprocess.run(
-        [sys.executable, "-c", block], env=environment, cwd=workplace, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", block.text], env=environment, cwd=workplace, capture_output=True, text=True, timeout=300
     )
     assert result.returncode == 0, result.stderr
     assert re.search(r"\d\.\d", result.stdout) and not re.search("nan|inf", result.stdout), result.stdout
 
 
 def test_there_are_blocks_to_run():
-    """A README that no pattern matches would pass everything above."""
-    assert len(BLOCKS["python"]) >= 4 and len(INLINE) >= 10
-    assert sum(len(blocks) for blocks in BLOCKS.values()) * 2 == len(re.findall(r"^```", TEXT, re.MULTILINE))
+    """Pages that no pattern matches would pass everything above."""
+    assert len(blocks("python")) >= 8 and len(INLINE) >= 10
+    fences = sum(len(re.findall(r"^```(?!\{)\w+$", page, re.MULTILINE)) for page in PAGES.values())
+    assert sum(len(blocks(language)) for language in ("python", "bash")) == fences
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_link_to_a_file_or_a_heading_of_a_page_leads_somewhere(page):
+    """The documentation's builder checks those of its pages again; nobody else checks the README's."""
+    folder = ROOT if page == "README.md" else ROOT / "docs"
+    for target in re.findall(r"\]\(([^)\s]+)\)", PROSE[page]):
+        if target.startswith(("https://", "gallery/", "api/")):
+            continue
+        path, _, heading = target.partition("#")
+        assert (folder / path).exists(), target
+        if heading:
+            headings = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.MULTILINE)
+            slugs = [re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-") for text in headings]
+            assert heading in slugs, target
