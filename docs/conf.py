@@ -10,6 +10,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+from docutils import nodes
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import dln_jax
@@ -108,6 +109,8 @@ RULE = re.compile(r"\|[-| ]+\|")
 
 def to_rst(app, what, name, obj, options, lines):
     """Turns a docstring into reStructuredText: Markdown's tables and `code`, Google's sections, no other markup."""
+    if lines and lines[0].startswith("Alias for field number"):  # of a record's field that has no line of its own
+        lines.clear()
     converted, in_table = [], False
     for line, following in itertools.zip_longest(lines, lines[1:], fillvalue=""):
         if line.startswith("|") and RULE.fullmatch(following):
@@ -130,13 +133,33 @@ def escaped(line):
     return "".join(part if index % 2 else re.sub(r"([|*]|_(?!\w))", r"\\\1", part) for index, part in enumerate(parts))
 
 
-def skip(app, what, name, obj, skipped, options):
-    """Fields of records that have no line of their own are read in the signature."""
-    return True if str(getattr(obj, "__doc__", "")).startswith("Alias for field number") and skipped else skipped
+NUMBER = re.compile(r"(\d[\d.]*e-\d+)")
+
+
+def tidy(app, doctree, page):
+    """Keeps small numbers of tables on one line, and names JAX's arrays as their users do."""
+    for text in list(doctree.findall(nodes.Text)):
+        if "jaxlib._jax." in text:
+            text.parent.replace(text, nodes.Text(text.replace("jaxlib._jax.", "")))
+        elif NUMBER.search(text) and any(isinstance(above, nodes.entry) for above in ancestors(text)):
+            parts = NUMBER.split(text)
+            text.parent.replace(
+                text,
+                [
+                    nodes.inline("", part, classes=["number"]) if index % 2 else nodes.Text(part)
+                    for index, part in enumerate(parts)
+                ],
+            )
+
+
+def ancestors(node):
+    """The nodes above a node."""
+    while (node := node.parent) is not None:
+        yield node
 
 
 def setup(app):
     """Sphinx calls it."""
     write_api_pages()
     app.connect("autodoc-process-docstring", to_rst, priority=100)
-    app.connect("autodoc-skip-member", skip)
+    app.connect("doctree-resolved", tidy)
