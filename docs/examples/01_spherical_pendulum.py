@@ -9,8 +9,8 @@ A mass hangs on a rod and swings in all directions; q = (polar angle from the do
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-from dln_jax.mechanics.equations import LagrangianSystem, dynamics
 
+from dln_jax.mechanics.equations import LagrangianSystem, dynamics
 from dln_jax.mechanics.integrators import rk4, rollout
 
 jax.config.update("jax_enable_x64", True)

@@ -10,16 +10,15 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from dln_jax.learning.dynamics import problem
-from dln_jax.mechanics.equations import dynamics
 
 from dln_jax import make_delan
 from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import default_data
+from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.nn.activations import tanh
-from dln_jax.scenes import scene as scenes
 from dln_jax.scenes.two_link_arm import two_link_arm
 
 jax.config.update("jax_enable_x64", True)
@@ -63,7 +62,7 @@ assert error < 1e-5
 # The mass matrix of the arm, and the parts of the torque. Both follow from the energy that was learned. (Torques alone
 # fix M completely: they are linear in the accelerations.)
 
-truth = scenes.dynamics(scene)
+truth = dynamics(scene.energies)
 learned = jax.jit(jax.vmap(arm.mass_matrix))(test.q)
 exact = jax.jit(jax.vmap(truth.mass_matrix))(test.q)
 print(f"mass matrix: largest error {np.abs(learned - exact).max():.1e} of {np.abs(exact).max():.2f} kg m²")

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from dln_jax.learning.linear import fit_linear
 
 from dln_jax import describe, export_c, load_c
 from dln_jax.datasets.generators import uniform
+from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.trigonometric import make_trigonometric
-from dln_jax.scenes.scene import dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 
 jax.config.update("jax_enable_x64", True)
@@ -49,7 +49,7 @@ print("files:", ", ".join(path.name for path in files))
 arm = load_c(folder)
 
 state = np.array([0.3, 1.2]), np.array([0.5, -1.0]), np.array([2.0, 0.1])
-exact = dynamics(scene).inverse_dynamics(*state)
+exact = dynamics(scene.energies).inverse_dynamics(*state)
 assert np.abs(arm.inverse_dynamics(*state) - exact).max() < 1e-9
 
 # %%
@@ -58,7 +58,7 @@ assert np.abs(arm.inverse_dynamics(*state) - exact).max() < 1e-9
 # Computed torque: the inverse model of the wanted acceleration, corrected by what position and rate are off. The plant
 # is the textbook arm, in one JAX function; the controller is the C.
 
-plant = jax.jit(dynamics(scene).forward_dynamics)
+plant = jax.jit(dynamics(scene.energies).forward_dynamics)
 STEP = 1e-3  # s
 
 
