@@ -53,6 +53,7 @@ def no_program_has_options_of_its_own(pytestconfig):
 
 LONGEST = (
     "test_compilation",
+    "test_examples",
     *("test_softbody_report", "test_train_delan", "test_stability", "test_locomotion", "test_hnn_tasks", "test_pixels"),
     *(
         "test_soft_body_identification",
