@@ -25,6 +25,7 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.models.delan import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
@@ -66,6 +67,7 @@ __all__ = [
     "load_c",
     "load_trajectories",
     "low_latency",
+    "make_delan",
     "save",
     "save_trajectories",
 ]

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
@@ -152,7 +153,7 @@ def advance(step: Step, t, state: State, duration, *, substeps: int = 1) -> Stat
     return jax.lax.scan(body, state, jnp.arange(substeps))[0]
 
 
-def rollout(step: Step, state: State, t: Float[Array, " T"], *, substeps: int = 1) -> State:
+def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, substeps: int = 1) -> State:
     """States at the times t [T], the first of which is the given one; each leaf gets a leading axis T.
 
     Args:
@@ -163,7 +164,7 @@ def rollout(step: Step, state: State, t: Float[Array, " T"], *, substeps: int = 
     """
     require_positive(substeps=substeps)
     # A step must not change the type of the state that it is given.
-    times = t.astype(jnp.result_type(*jax.tree.leaves(state)))
+    times = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(state)))
 
     def interval(state, start_and_duration):
         start, duration = start_and_duration
@@ -174,7 +175,7 @@ def rollout(step: Step, state: State, t: Float[Array, " T"], *, substeps: int = 
 
 
 def adaptive_rollout(
-    field: Field, state: State, t: Float[Array, " T"], *, tolerance: float, max_steps: int = 100_000
+    field: Field, state: State, t: Float[Array | np.ndarray, " T"], *, tolerance: float, max_steps: int = 100_000
 ) -> tuple[State, Bool[Array, ""]]:
     """States at the times t [T] by Dormand-Prince 8 with step-size control, and whether the integration finished.
 
