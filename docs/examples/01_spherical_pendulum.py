@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
-from dln_jax.mechanics.equations import LagrangianSystem, dynamics
+from dln_jax import LagrangianSystem, dynamics
 from dln_jax.mechanics.integrators import rk4, rollout
 
 jax.config.update("jax_enable_x64", True)

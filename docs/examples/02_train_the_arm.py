@@ -11,13 +11,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dln_jax import make_delan
+from dln_jax import GaussNewton, dynamics, fit, make_delan
 from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import default_data
 from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.nn.activations import tanh
 from dln_jax.scenes.two_link_arm import two_link_arm
 

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+from dln_jax import GaussNewton, fit
 from dln_jax.data.splits import hold_out
 from dln_jax.datasets.hamiltonian_tasks import two_body
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.rates import problem
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.integrators import gauss_legendre4, rollout

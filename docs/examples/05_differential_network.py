@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+from dln_jax import GaussNewton
 from dln_jax.data.functions import from_arrays, split
-from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.functions import Network, train
 from dln_jax.nn.activations import activation
 from dln_jax.nn.differential_mlp import value_jacobian_and_hessian

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dln_jax import describe, export_c, load_c
+from dln_jax import describe, dynamics, export_c, load_c
 from dln_jax.datasets.generators import uniform
 from dln_jax.learning.linear import fit_linear
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.two_link_arm import two_link_arm
 
