@@ -48,9 +48,9 @@ def source(layers: Layers, precision: str) -> str:
         for k in range(layers[0][0].shape[0])
     ]
     first = members[0]
-    sizes = [first.inputs, *(len(bias) for _, bias in first.layers)]
+    sizes = [first.sizes[0], *(len(bias) for _, bias in first.layers)]
     backward = cheaper_jacobian(sizes) == "backward"
-    head = f"enum {{ INPUTS = {first.inputs}, OUTPUTS = {first.outputs}, MEMBERS = {len(members)} }};\n"
+    head = f"enum {{ INPUTS = {sizes[0]}, OUTPUTS = {sizes[-1]}, MEMBERS = {len(members)} }};\n"
     functions, values, jacobians = [], [], []
     for member in members:
         functions.append(c_networks.tables(member, precision) + c_networks.value(member))
