@@ -10,14 +10,14 @@ passes through more Python; it is therefore what is used here.
 """
 
 from collections.abc import Callable
-from itertools import accumulate
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.deploy.host_arrays import as_shaped
+from dln_jax.mechanics.arguments import require_shape
 from dln_jax.types import InputError
 
 _SETTING = "jax_cpu_enable_async_dispatch"
@@ -74,35 +74,51 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
     return _packed(function, arrays)
 
 
+def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
+    """The argument where it is an array of this shape, else such an array of the numbers that it holds.
+
+    To be copied into the host's memory, where an assignment would broadcast silently.
+
+    Raises:
+        InputError: another shape, or nothing that is an array of numbers.
+    """
+    try:
+        if argument.shape == shape and argument.dtype.kind in "fiu":
+            return argument
+    except AttributeError:
+        pass
+    try:
+        array = np.asarray(argument)
+    except (ValueError, TypeError):
+        raise InputError(f"{name} makes no array; expected real numbers of shape {shape}") from None
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} has type {array.dtype}; expected real numbers of shape {shape}")
+    require_shape(name, array.shape, shape)
+    return array
+
+
 def _packed(function: Callable[..., Any], arrays: list[np.ndarray]) -> Callable[..., Any]:
     buffer = np.concatenate([array.ravel() for array in arrays])
-    ends = list(accumulate(array.size for array in arrays))
-    pieces = [(end - array.size, end, array.shape) for end, array in zip(ends, arrays, strict=True)]
+    ends, shapes = np.cumsum([array.size for array in arrays])[:-1], [array.shape for array in arrays]
     views = [
-        (f"argument {number}", shape, buffer[start:end].reshape(shape))
-        for number, (start, end, shape) in enumerate(pieces, 1)
+        (f"argument {number}", shape, piece.reshape(shape))
+        for number, (shape, piece) in enumerate(zip(shapes, np.split(buffer, ends), strict=True), 1)
     ]
 
     @jax.jit
     def compiled(packed):
-        return function(*(packed[start:end].reshape(shape) for start, end, shape in pieces))
+        return function(*map(jnp.reshape, jnp.split(packed, ends), shapes))
 
-    def fill(arguments):
+    single = isinstance(jax.eval_shape(compiled, jnp.asarray(buffer)), jax.ShapeDtypeStruct)
+    # A copy, also where JAX would hand back memory of its own or the buffer's.
+    copied = np.array if single else partial(jax.tree.map, np.array)
+
+    def evaluate(*arguments):
         if len(arguments) != len(views):
             raise InputError(f"{len(arguments)} arguments were given; expected {len(views)}, as in the examples")
         for (name, shape, view), argument in zip(views, arguments, strict=True):
             view[...] = as_shaped(name, argument, shape)
+        return copied(compiled(buffer))
 
-    def evaluate(*arguments):
-        fill(arguments)
-        # A copy, also where JAX would hand back memory of its own or the buffer's.
-        return np.array(compiled(buffer))
-
-    def evaluate_tree(*arguments):
-        fill(arguments)
-        return jax.tree.map(np.array, compiled(buffer))
-
-    single = isinstance(jax.eval_shape(compiled, jnp.asarray(buffer)), jax.ShapeDtypeStruct)
-    chosen = evaluate if single else evaluate_tree
-    chosen(*[array.copy() for array in arrays])
-    return chosen
+    evaluate(*arrays)
+    return evaluate

@@ -3,13 +3,14 @@
 All second derivatives are rates of the gradient along a direction, one pass forward and one back each.
 """
 
+from string import Template
 from typing import Any
 
 import numpy as np
 
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
-from dln_jax.deploy.c.text import table
+from dln_jax.deploy.c.text import friction_table, table
 from dln_jax.models.black_box import per_coordinate
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -155,7 +156,7 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     lagrangian = not CATALOGUE[description["name"]].properties.canonical
     scale, second = ("rate_scale", "qd") if lagrangian else ("momentum_scale", "p")
     network = c_networks.from_haiku("energy", parameters, "lagrangian" if lagrangian else "hamiltonian")
-    friction = parameters.get("~", {}).get("viscous_friction")
+    friction = c_networks.friction_from_haiku(parameters)
     d, features = needs.degrees_of_freedom, c_joints.count(needs)
     enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]
     if not lagrangian:
@@ -164,16 +165,12 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     sizes = per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size)
     head = f"enum {{ {', '.join(enumerators)} }};\n\n/* Typical size of {second}, by which it is divided */\n"
     head += table(scale, np.array(sizes), precision)
-    if friction is not None:
-        head += "\n/* Viscous friction, N m s or N s/m */\n"
-        head += table("friction", np.logaddexp(0, np.asarray(friction, np.float64)), precision)
-    functions = c_joints.functions(needs, ("features", "feature_rates", "pull_back_features"))
+    head += friction_table(friction, precision)
+    functions = c_joints.functions(needs)
     functions += c_networks.trace(network, bends=True)
     functions += "" if lagrangian else c_networks.value(network)
     functions += c_networks.gradient(network) + c_networks.gradient_rate(network)
-    body = _STATE + (_LAGRANGIAN if lagrangian else _HAMILTONIAN)
-    texts = {"second": second, "scale": scale, "degrees": str(d)}
-    texts["friction"] = " + friction[i] * qd[i]" if friction is not None else ""
-    for key, text in texts.items():
-        body = body.replace(f"${{{key}}}", text)
+    body = Template(_STATE + (_LAGRANGIAN if lagrangian else _HAMILTONIAN)).safe_substitute(
+        second=second, scale=scale, degrees=d, friction="" if friction is None else " + friction[i] * qd[i]"
+    )
     return head + c_networks.tables(network, precision) + functions + body

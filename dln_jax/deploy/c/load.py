@@ -14,7 +14,7 @@ import numpy as np
 
 from dln_jax.deploy.c.interface import read_interface
 from dln_jax.deploy.c.text import PRECISIONS, check_name
-from dln_jax.deploy.host_arrays import as_shaped
+from dln_jax.deploy.low_latency import as_shaped
 from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
@@ -40,12 +40,10 @@ class CDynamics(NamedTuple):
 
 
 class CPlainDynamics(NamedTuple):
-    """As `CDynamics`, of a model that comes from no energy."""
+    """The same of a model that comes from no energy."""
 
     inverse_dynamics: Callable[[Any, Any, Any], np.ndarray]
-    """(q, qd, qdd) -> tau [d]."""
     forward_dynamics: Callable[[Any, Any, Any], np.ndarray]
-    """(q, qd, tau) -> qdd [d]."""
 
 
 class CFunction(NamedTuple):
@@ -107,24 +105,35 @@ def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
 
 
 def _dynamics(functions: dict[str, Any], d: int, numpy_type, with_velocity: bool) -> CDynamics | CPlainDynamics:
-    plain = CPlainDynamics(
-        inverse_dynamics=_of_three(functions["inverse_dynamics"], ("q", "qd", "qdd"), d, numpy_type),
-        forward_dynamics=_of_three(functions["forward_dynamics"], ("q", "qd", "tau"), d, numpy_type),
-    )
+    inverse = _of_three(functions["inverse_dynamics"], ("q", "qd", "qdd"), d, numpy_type)
+    forward = _of_three(functions["forward_dynamics"], ("q", "qd", "tau"), d, numpy_type)
     if "energy" not in functions:
-        return plain
-    return CDynamics(
-        *plain,
-        energy=_scalar(functions["energy"], d, numpy_type),
-        mass_matrix=_matrix(functions["mass_matrix"], d, numpy_type, with_velocity),
-    )
+        return CPlainDynamics(inverse, forward)
+    # Buffers of their own, so that each function may have a thread of its own.
+    (q_of_energy, qd_of_energy), (q_of_matrix, qd_of_matrix) = np.zeros((2, 2, d), numpy_type)
+    matrix, shape = np.zeros((d, d), numpy_type), (d,)
+    state = (q_of_matrix, qd_of_matrix)[: 1 + with_velocity]
+    call_matrix = _bound(functions["mass_matrix"], *state, matrix)
+    result = np.ctypeslib.as_ctypes_type(numpy_type)
+    call_energy = _bound(functions["energy"], q_of_energy, qd_of_energy, result=result)
+
+    def energy(q, qd):
+        q_of_energy[:], qd_of_energy[:] = as_shaped("q", q, shape), as_shaped("qd", qd, shape)
+        return call_energy()
+
+    def mass_matrix(q, qd=None):
+        q_of_matrix[:] = as_shaped("q", q, shape)
+        qd_of_matrix[:] = 0 if qd is None else as_shaped("qd", qd, shape)
+        call_matrix()
+        return matrix.copy()
+
+    return CDynamics(inverse, forward, energy, mass_matrix)
 
 
 def _of_three(function, names: tuple[str, str, str], d: int, numpy_type) -> Callable[[Any, Any, Any], np.ndarray]:
     """The buffers' addresses are converted once, and a call copies 3 d numbers in and d out."""
-    first, second, third, result = (np.zeros(d, numpy_type) for _ in range(4))
-    call, copy = _bound(function, first, second, third, result), result.copy
-    shape = (d,)
+    first, second, third, result = np.zeros((4, d), numpy_type)
+    call, copy, shape = _bound(function, first, second, third, result), result.copy, (d,)
 
     def evaluate(q, qd, x):
         # Arrays of the right shape pass in a fraction of a microsecond; others go the long way.
@@ -141,55 +150,24 @@ def _of_three(function, names: tuple[str, str, str], d: int, numpy_type) -> Call
     return evaluate
 
 
-def _scalar(function, d: int, numpy_type) -> Callable[[Any, Any], float]:
-    first, second = (np.zeros(d, numpy_type) for _ in range(2))
-    result = ctypes.c_float if numpy_type is np.float32 else ctypes.c_double
-    call = _bound(function, first, second, result=result)
-    shape = (d,)
-
-    def evaluate(q, qd):
-        first[:], second[:] = as_shaped("q", q, shape), as_shaped("qd", qd, shape)
-        return call()
-
-    return evaluate
-
-
-def _matrix(function, d: int, numpy_type, with_velocity: bool) -> Callable[..., np.ndarray]:
-    first, second, result = np.zeros(d, numpy_type), np.zeros(d, numpy_type), np.zeros((d, d), numpy_type)
-    call = _bound(function, first, second, result) if with_velocity else _bound(function, first, result)
-    shape = (d,)
-
-    rest = np.zeros(d, numpy_type)
-
-    def evaluate(q, qd=None):
-        first[:] = as_shaped("q", q, shape)
-        second[:] = rest if qd is None else as_shaped("qd", qd, shape)
-        call()
-        return result.copy()
-
-    return evaluate
-
-
 def _function(functions: dict[str, Any], n: int, m: int, numpy_type) -> CFunction:
     point, y, jacobian = np.zeros(n, numpy_type), np.zeros(m, numpy_type), np.zeros((m, n), numpy_type)
-    value, both = _bound(functions["value"], point, y), _bound(functions["value_and_jacobian"], point, y, jacobian)
-    shape = (n,)
+    call, call_both = _bound(functions["value"], point, y), _bound(functions["value_and_jacobian"], point, y, jacobian)
 
-    def evaluate(x):
-        point[:] = as_shaped("x", x, shape)
-        value()
+    def value(x):
+        point[:] = as_shaped("x", x, point.shape)
+        call()
         return y.copy()
 
-    def evaluate_both(x):
-        point[:] = as_shaped("x", x, shape)
-        both()
+    def value_and_jacobian(x):
+        point[:] = as_shaped("x", x, point.shape)
+        call_both()
         return y.copy(), jacobian.copy()
 
-    return CFunction(evaluate, evaluate_both)
+    return CFunction(value, value_and_jacobian)
 
 
 def _bound(function, *buffers: np.ndarray, result=None) -> Callable[[], Any]:
     """The C function with its arguments fixed; it must be called while the buffers live."""
-    pointers = [ctypes.c_void_p(buffer.ctypes.data) for buffer in buffers]
     function.restype = result
-    return functools.partial(function, *pointers)
+    return functools.partial(function, *(ctypes.c_void_p(buffer.ctypes.data) for buffer in buffers))

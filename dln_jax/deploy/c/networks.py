@@ -61,6 +61,12 @@ def from_haiku(name: str, parameters, module: str) -> Network:
     return Network(name, tuple(layers))
 
 
+def friction_from_haiku(parameters) -> np.ndarray | None:
+    """Coefficients of viscous friction [d] beside a network, if there are any: softplus of its parameters."""
+    friction = parameters.get("~", {}).get("viscous_friction")
+    return None if friction is None else np.logaddexp(0, np.asarray(friction, np.float64))
+
+
 def tables(network: Network, precision: str) -> str:
     """Weights and biases. The last weight is stored [out][in], the others [in][out]."""
     hidden = ", ".join(str(len(bias)) for _, bias in network.layers[:-1]) or "none"

@@ -1,20 +1,198 @@
 """Structured DeLaN and structured Hamiltonian as C: `mechanics.natural` and `mechanics.natural_hamiltonian`.
 
 One derivative of the triangular factor along the motion and one pull-back, whose covector also takes in the gradient of
-the potential, so that one pass back through the features serves both.
+the potential, so that one pass back through the features serves both: it gives -dT/dq + dV/dq (or +dT/dq where M⁻¹ is
+given) as `force`.
 """
 
+from string import Template
 from typing import Any
-
-import numpy as np
 
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
-from dln_jax.deploy.c.natural import DELAN, FACTOR, HAMILTONIAN
-from dln_jax.deploy.c.networks import Network
-from dln_jax.deploy.c.text import number, table
+from dln_jax.deploy.c.text import friction_table, number
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
+
+_FACTOR = """
+/* Triangular factor L (row-major) from the outputs of the network: the diagonal, then what is below it by rows. */
+static void unpack_factor(const real *restrict entries, real *restrict L)
+{
+    int n = D;
+    for (int i = 0; i < D; ++i) {
+        L[i * D + i] = softplus(entries[i] + DIAGONAL_SHIFT) + DIAGONAL_FLOOR;
+        for (int j = 0; j < i; ++j) L[i * D + j] = entries[n++];
+        for (int j = i + 1; j < D; ++j) L[i * D + j] = 0;
+    }
+}
+
+/* L, its rate from the rate of the outputs, and the slope of its diagonal with respect to them. */
+static void unpack_factor_rate(const real *restrict entries, const real *restrict entries_rate,
+                               real *restrict L, real *restrict L_rate, real *restrict diagonal_slope)
+{
+    int n = D;
+    unpack_factor(entries, L);
+    for (int i = 0; i < D; ++i) {
+        diagonal_slope[i] = logistic(entries[i] + DIAGONAL_SHIFT);
+        L_rate[i * D + i] = diagonal_slope[i] * entries_rate[i];
+        for (int j = 0; j < i; ++j) L_rate[i * D + j] = entries_rate[n++];
+        for (int j = i + 1; j < D; ++j) L_rate[i * D + j] = 0;
+    }
+}
+
+/* Covector of the outputs: minus u_i v_j for each element of L. */
+static void pack_covector(const real *restrict diagonal_slope, const real *restrict u, const real *restrict v,
+                          real *restrict adjoint)
+{
+    int n = D;
+    for (int i = 0; i < D; ++i) {
+        adjoint[i] = -diagonal_slope[i] * u[i] * v[i];
+        for (int j = 0; j < i; ++j) adjoint[n++] = -u[i] * v[j];
+    }
+}
+
+/* y = L x and y = L^T x, L lower triangular and row-major */
+static void times(const real *restrict L, const real *restrict x, real *restrict y)
+{
+    for (int i = 0; i < D; ++i) {
+        y[i] = 0;
+        for (int j = 0; j <= i; ++j) y[i] += L[i * D + j] * x[j];
+    }
+}
+
+static void times_transposed(const real *restrict L, const real *restrict x, real *restrict y)
+{
+    for (int j = 0; j < D; ++j) {
+        y[j] = 0;
+        for (int i = j; i < D; ++i) y[j] += L[i * D + j] * x[i];
+    }
+}
+"""
+_DELAN = """
+/* L, and the force that a motion without acceleration takes: dM/dt qd - dT/dq + dV/dq and friction.
+ * With u = L^T qd: dM/dt qd = L (dL/dt^T qd) + dL/dt u, and dT/dq is the pull-back of qd u^T through dL/dq. */
+static void motion(const real *restrict q, const real *restrict qd, real *restrict L, real *restrict bias)
+{
+    real L_rate[D * D], diagonal_slope[D], u[D], v[D], force[D];
+${features}    times_transposed(L, qd, u);
+    pack_covector(diagonal_slope, qd, u, adjoint);
+${pull_back}    times_transposed(L_rate, qd, v);
+    times(L, v, bias);
+    for (int i = 0; i < D; ++i) {
+        for (int j = 0; j <= i; ++j) bias[i] += L_rate[i * D + j] * u[j];
+        bias[i] += force[i]${friction};
+    }
+}
+
+void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
+{
+    real L[D * D], bias[D], v[D];
+    motion(q, qd, L, bias);
+    times_transposed(L, qdd, v);
+    times(L, v, tau);
+    for (int i = 0; i < D; ++i) tau[i] += bias[i];
+}
+
+void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
+{
+    real L[D * D], bias[D], v[D];
+    motion(q, qd, L, bias);
+    for (int i = 0; i < D; ++i) bias[i] = tau[i] - bias[i];
+    solve_lower(L, bias, v);
+    solve_lower_transposed(L, v, qdd);
+}
+
+${energy}void ${name}_mass_matrix(const real q[D], real M[D * D])
+{
+    real L[D * D];
+${factor_values}    for (int i = 0; i < D; ++i) times(L, &L[i * D], &M[i * D]);
+}
+"""
+_HAMILTONIAN = """
+/* L with M^-1 = L L^T, and for u = L^-1 qd, p = L^-T u:
+ * drift = dL/dt u, momentum_drift = dL/dt^T p, load = dT/dq + dV/dq and friction. */
+static void motion(const real *restrict q, const real *restrict qd, real *restrict L, real *restrict drift,
+                   real *restrict momentum_drift, real *restrict load)
+{
+    real L_rate[D * D], diagonal_slope[D], u[D], p[D], force[D];
+${features}    solve_lower(L, qd, u);
+    solve_lower_transposed(L, u, p);
+    times(L_rate, u, drift);
+    times_transposed(L_rate, p, momentum_drift);
+    for (int i = 0; i < D; ++i) u[i] = -u[i];
+    pack_covector(diagonal_slope, p, u, adjoint);
+${pull_back}    for (int i = 0; i < D; ++i) load[i] = force[i]${friction};
+}
+
+void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
+{
+    real L[D * D], drift[D], momentum_drift[D], load[D], v[D];
+    motion(q, qd, L, drift, momentum_drift, load);
+    for (int i = 0; i < D; ++i) drift[i] = qdd[i] - drift[i];
+    solve_lower(L, drift, v);
+    for (int i = 0; i < D; ++i) v[i] -= momentum_drift[i];
+    solve_lower_transposed(L, v, tau);
+    for (int i = 0; i < D; ++i) tau[i] += load[i];
+}
+
+void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
+{
+    real L[D * D], drift[D], momentum_drift[D], load[D], v[D];
+    motion(q, qd, L, drift, momentum_drift, load);
+    for (int i = 0; i < D; ++i) load[i] = tau[i] - load[i];
+    times_transposed(L, load, v);
+    for (int i = 0; i < D; ++i) v[i] += momentum_drift[i];
+    times(L, v, qdd);
+    for (int i = 0; i < D; ++i) qdd[i] += drift[i];
+}
+
+${energy}void ${name}_mass_matrix(const real q[D], real M[D * D])
+{
+    real L[D * D], unit[D], v[D];
+${factor_values}    for (int i = 0; i < D; ++i) {
+        for (int j = 0; j < D; ++j) unit[j] = i == j;
+        solve_lower(L, unit, v);
+        solve_lower_transposed(L, v, &M[i * D]);
+    }
+}
+"""
+_ENERGY = """\
+real ${name}_energy(const real q[D], const real qd[D])
+{
+    real L[D * D], u[D], energy = 0;
+${values}    ${velocity}(L, qd, u);
+    for (int i = 0; i < D; ++i) energy += u[i] * u[i];
+    return energy / 2${potential};
+}
+
+"""
+# The network along the motion: its features, its outputs and their rates.
+_FEATURES = """\
+    real x[FEATURES], x_rate[FEATURES], x_adjoint[FEATURES], entries[${outputs}], rate[${outputs}],
+        adjoint[${outputs}];
+${potential_trace}    factor_trace trace;
+    features(q, x);
+    feature_rates(x, qd, x_rate);
+    factor_rates(x, x_rate, &trace, entries, rate);
+    unpack_factor_rate(entries, rate, L, L_rate, diagonal_slope);
+"""
+_VALUES = """\
+    real x[FEATURES], entries[${outputs}];
+${potential_result}    features(q, x);
+    factor_value(x, entries);
+    unpack_factor(entries, L);
+"""
+# The potential of a network of its own: where it lives, its pull-back and its value.
+_POTENTIAL_TRACE = """\
+    const real one = 1;
+    potential_trace potential;
+    real potential_adjoint[FEATURES];
+"""
+_PULL_BACK_POTENTIAL = """\
+    potential_slopes(x, &potential);
+    potential_pull_back(&potential, &one, potential_adjoint);
+    for (int k = 0; k < FEATURES; ++k) x_adjoint[k] += potential_adjoint[k];
+"""
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
@@ -22,71 +200,36 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     delan = not CATALOGUE[description["name"]].properties.canonical
     shared = "energies/~/linear_0" in parameters
     factor = c_networks.from_haiku("factor", parameters, "energies" if shared else "cholesky")
-    potential = None if shared or not needs.gravity else c_networks.from_haiku("potential", parameters, "potential")
-    shift, floor = float(description["diagonal_shift"]), float(description["diagonal_floor"])
-    friction = parameters.get("~", {}).get("viscous_friction")
+    friction = c_networks.friction_from_haiku(parameters)
     entries = needs.degrees_of_freedom * (needs.degrees_of_freedom + 1) // 2
-    head = [
-        f"enum {{ D = {needs.degrees_of_freedom}, FEATURES = {c_joints.count(needs)}, ENTRIES = {entries} }};\n",
-        f"#define DIAGONAL_SHIFT {number(shift, precision)}\n#define DIAGONAL_FLOOR {number(floor, precision)}\n",
-    ]
-    if friction is not None:
-        head.append("\n/* Viscous friction, N m s or N s/m */\n")
-        head.append(table("friction", np.logaddexp(0, np.asarray(friction, np.float64)), precision))
+    head = f"enum {{ D = {needs.degrees_of_freedom}, FEATURES = {c_joints.count(needs)}, ENTRIES = {entries} }};\n"
+    for constant in ("diagonal_shift", "diagonal_floor"):
+        head += f"#define {constant.upper()} {number(float(description[constant]), precision)}\n"
     networks = c_networks.tables(factor, precision)
-    functions = c_joints.functions(needs, ("features", "feature_rates", "pull_back_features"))
-    functions += c_networks.trace(factor) + "".join(
-        make(factor) for make in (c_networks.value, c_networks.rates, c_networks.pull_back)
-    )
-    if potential:
+    functions = c_joints.functions(needs) + c_networks.trace(factor)
+    functions += c_networks.value(factor) + c_networks.rates(factor) + c_networks.pull_back(factor)
+    trace, result, value = "", "", ""
+    pull_back = "    adjoint[ENTRIES] = 1; /* the potential */\n" * shared
+    pull_back += "    factor_pull_back(&trace, adjoint, x_adjoint);\n"
+    energy = " + entries[ENTRIES]" * shared
+    if needs.gravity and not shared:
+        potential = c_networks.from_haiku("potential", parameters, "potential")
         networks += c_networks.tables(potential, precision)
         functions += c_networks.trace(potential) + c_networks.value(potential)
         functions += c_networks.slopes(potential, with_value=False) + c_networks.pull_back(potential)
-    texts = _texts(factor, potential, shared=shared, friction=friction is not None)
-    body = DELAN if delan else HAMILTONIAN
-    for key, text in texts.items():
-        body = body.replace(f"${{{key}}}", text)
-    return "".join(head) + networks + functions + FACTOR + body
-
-
-def _texts(factor: Network, potential: Network | None, *, shared: bool, friction: bool) -> dict[str, str]:
-    outputs = "ENTRIES + 1" if shared else "ENTRIES"
-    features = [
-        f"real x[FEATURES], x_rate[FEATURES], x_adjoint[FEATURES], entries[{outputs}], rate[{outputs}],",
-        f"    adjoint[{outputs}];",
-        "factor_trace trace;",
-        "features(q, x);",
-        "feature_rates(x, qd, x_rate);",
-        "factor_rates(x, x_rate, &trace, entries, rate);",
-        "unpack_factor_rate(entries, rate, L, L_rate, diagonal_slope);",
-    ]
-    pull_back = ["adjoint[ENTRIES] = 1; /* the potential */"] * shared
-    pull_back.append("factor_pull_back(&trace, adjoint, x_adjoint);")
-    factor_values = [f"real x[FEATURES], entries[{outputs}];", "features(q, x);", "factor_value(x, entries);"]
-    factor_values.append("unpack_factor(entries, L);")
-    values, energy = list(factor_values), ""
-    if potential:
-        features[2:2] = ["const real one = 1;", "potential_trace potential;", "real potential_adjoint[FEATURES];"]
-        pull_back += [
-            "potential_slopes(x, &potential);",
-            "potential_pull_back(&potential, &one, potential_adjoint);",
-            "for (int k = 0; k < FEATURES; ++k) x_adjoint[k] += potential_adjoint[k];",
-        ]
-        values[1:1] = ["real potential;"]
-        values.append("potential_value(x, &potential);")
+        trace, result, value = _POTENTIAL_TRACE, "    real potential;\n", "    potential_value(x, &potential);\n"
+        pull_back += _PULL_BACK_POTENTIAL
         energy = " + potential"
-    elif shared:
-        energy = " + entries[ENTRIES]"
-    pull_back.append("pull_back_features(x, x_adjoint, force);")
-    return {
-        "features": _lines(features),
-        "pull_back": _lines(pull_back),
-        "friction": " + friction[i] * qd[i]" if friction else "",
-        "values": _lines(values),
-        "factor_values": _lines(factor_values),
-        "potential": energy,
-    }
-
-
-def _lines(lines: list[str]) -> str:
-    return "\n".join(f"    {line}" for line in lines)
+    outputs = "ENTRIES + 1" if shared else "ENTRIES"
+    body = Template(_DELAN if delan else _HAMILTONIAN).safe_substitute(
+        features=Template(_FEATURES).substitute(outputs=outputs, potential_trace=trace),
+        pull_back=pull_back + "    pull_back_features(x, x_adjoint, force);\n",
+        friction="" if friction is None else " + friction[i] * qd[i]",
+        energy=Template(_ENERGY).safe_substitute(
+            values=Template(_VALUES).substitute(outputs=outputs, potential_result=result) + value,
+            velocity="times_transposed" if delan else "solve_lower",
+            potential=energy,
+        ),
+        factor_values=Template(_VALUES).substitute(outputs=outputs, potential_result=""),
+    )
+    return head + friction_table(friction, precision) + networks + functions + _FACTOR + body

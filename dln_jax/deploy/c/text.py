@@ -60,6 +60,13 @@ def table(name: str, values, precision: str) -> str:
     return f"static const real {name}[{size}] = {{\n" + "\n".join(lines) + "\n};\n"
 
 
+def friction_table(coefficients, precision: str) -> str:
+    """The table of viscous friction, nothing for None."""
+    if coefficients is None:
+        return ""
+    return "\n/* Viscous friction, N m s or N s/m */\n" + table("friction", coefficients, precision)
+
+
 def wrapped(words: list[str]) -> list[str]:
     """Lines of words, a comma behind each."""
     lines = ["   "]

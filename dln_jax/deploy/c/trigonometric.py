@@ -1,10 +1,11 @@
 """Trigonometric Lagrangian as C: the closed forms of `models.trigonometric`."""
 
+from string import Template
 from typing import Any
 
 import numpy as np
 
-from dln_jax.deploy.c.text import table
+from dln_jax.deploy.c.text import friction_table, table
 from dln_jax.models.trigonometric import SPRING_DEGREE
 from dln_jax.types import Needs
 
@@ -97,8 +98,7 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
             "\n/* Coefficients of V, J */\n",
             table("potential", np.concatenate([[0.0], np.asarray(potential)]), precision),
         ]
-    if parameters.friction is not None:
-        head += ["\n/* Viscous friction, N m s or N s/m */\n", table("friction", parameters.friction, precision)]
+    head.append(friction_table(parameters.friction, precision))
     functions = [_basis("mass_basis", needs, degrees)]
     gravity, energy = [], []
     if potential is not None:
@@ -124,10 +124,7 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
         gravity.append("    for (int i = 0; i < D; ++i) bias[i] += friction[i] * qd[i];\n")
     texts = {"d": d, "entries": entries, "basis": size, "half": "0.5${f}"}
     texts |= {"gravity": "".join(gravity), "potential": "".join(energy)}
-    body = _BODY
-    for key, text in texts.items():
-        body = body.replace(f"${{{key}}}", str(text))
-    return "".join([*head, *functions, body])
+    return "".join([*head, *functions, Template(_BODY).safe_substitute(texts)])
 
 
 def _basis(name: str, needs: Needs, degrees: tuple[int, ...]) -> str:
