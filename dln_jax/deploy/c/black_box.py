@@ -6,12 +6,9 @@ All second derivatives are rates of the gradient along a direction, one pass for
 from string import Template
 from typing import Any
 
-import numpy as np
-
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
-from dln_jax.deploy.c.text import friction_table, table
-from dln_jax.models.black_box import per_coordinate
+from dln_jax.deploy.c.text import friction_table
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 
@@ -34,31 +31,29 @@ static void hessian(const energy_trace *restrict trace, real *restrict H)
     }
 }
 """
+# The gradient of the energy at (q, qd), and its rate where q changes at qd and the other half of the state as given.
+_STATE_GRADIENT = """\
+    energy_trace trace;
+    ${place}(q, qd, x);
+    energy_gradient(x, &trace, slope);
+"""
+_RATE = """\
+${gradient}    feature_rates(x, qd, x_rate);
+    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = ${other};
+    energy_gradient_rate(&trace, x_rate, rate);
+    pull_back_features(x, slope, force);
+"""
 _LAGRANGIAN = """
 void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
 {
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
-    energy_trace trace;
-    inputs(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    feature_rates(x, qd, x_rate);
-    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = qdd[i] / rate_scale[i];
-    energy_gradient_rate(&trace, x_rate, rate);
-    pull_back_features(x, slope, force);
-    for (int i = 0; i < D; ++i) tau[i] = rate[FEATURES + i] / rate_scale[i] - force[i]${friction};
+${at_qdd}    for (int i = 0; i < D; ++i) tau[i] = rate[FEATURES + i] / rate_scale[i] - force[i]${friction};
 }
 
 void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
 {
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], M[D * D];
-    energy_trace trace;
-    inputs(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    feature_rates(x, qd, x_rate);
-    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = 0;
-    energy_gradient_rate(&trace, x_rate, rate);
-    pull_back_features(x, slope, force);
-    for (int i = 0; i < D; ++i) qdd[i] = tau[i] - (rate[FEATURES + i] / rate_scale[i] - force[i]${friction});
+${at_rest}    for (int i = 0; i < D; ++i) qdd[i] = tau[i] - (rate[FEATURES + i] / rate_scale[i] - force[i]${friction});
     hessian(&trace, M);
     eliminate_1(M, qdd);
 }
@@ -76,10 +71,7 @@ real ${name}_energy(const real q[D], const real qd[D])
 void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
 {
     real x[INPUTS], slope[INPUTS];
-    energy_trace trace;
-    inputs(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    hessian(&trace, M);
+${state}    hessian(&trace, M);
 }
 """
 _HAMILTONIAN = """
@@ -103,14 +95,7 @@ static void momentum(const real *restrict q, const real *restrict qd, real *rest
 void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
 {
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], momentum_rate[D], H[D * D];
-    energy_trace trace;
-    momentum(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    feature_rates(x, qd, x_rate);
-    for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = 0;
-    energy_gradient_rate(&trace, x_rate, rate);
-    pull_back_features(x, slope, force);
-    for (int i = 0; i < D; ++i) momentum_rate[i] = qdd[i] - rate[FEATURES + i] / momentum_scale[i];
+${at_rest}    for (int i = 0; i < D; ++i) momentum_rate[i] = qdd[i] - rate[FEATURES + i] / momentum_scale[i];
     hessian(&trace, H);
     eliminate_1(H, momentum_rate);
     for (int i = 0; i < D; ++i) tau[i] = momentum_rate[i] + force[i]${friction};
@@ -119,10 +104,7 @@ void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[
 void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
 {
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
-    energy_trace trace;
-    momentum(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    pull_back_features(x, slope, force);
+${state}    pull_back_features(x, slope, force);
     feature_rates(x, qd, x_rate);
     for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = (tau[i] - (force[i]${friction})) / momentum_scale[i];
     energy_gradient_rate(&trace, x_rate, rate);
@@ -140,10 +122,7 @@ real ${name}_energy(const real q[D], const real qd[D])
 void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
 {
     real x[INPUTS], slope[INPUTS], H[D * D];
-    energy_trace trace;
-    momentum(q, qd, x);
-    energy_gradient(x, &trace, slope);
-    hessian(&trace, H);
+${state}    hessian(&trace, H);
     for (int i = 0; i < D; ++i)
         for (int j = 0; j < D; ++j) M[i * D + j] = i == j;
     eliminate_${degrees}(H, M);
@@ -161,16 +140,21 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]
     if not lagrangian:
         enumerators.append(f"NEWTON_STEPS = {description['iterations']}")
-    size = description[scale]
-    sizes = per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size)
     head = f"enum {{ {', '.join(enumerators)} }};\n\n/* Typical size of {second}, by which it is divided */\n"
-    head += table(scale, np.array(sizes), precision)
-    head += friction_table(friction, precision)
+    head += c_joints.scale_table(description, scale, needs, precision) + friction_table(friction, precision)
     functions = c_joints.functions(needs)
     functions += c_networks.trace(network, bends=True)
     functions += "" if lagrangian else c_networks.value(network)
     functions += c_networks.gradient(network) + c_networks.gradient_rate(network)
+    gradient = Template(_STATE_GRADIENT).substitute(place="inputs" if lagrangian else "momentum")
+    rates = Template(_RATE.replace("${gradient}", gradient))
     body = Template(_STATE + (_LAGRANGIAN if lagrangian else _HAMILTONIAN)).safe_substitute(
-        second=second, scale=scale, degrees=d, friction="" if friction is None else " + friction[i] * qd[i]"
+        state=gradient,
+        at_rest=rates.substitute(other="0"),
+        at_qdd=rates.substitute(other="qdd[i] / rate_scale[i]"),
+        second=second,
+        scale=scale,
+        degrees=d,
+        friction="" if friction is None else " + friction[i] * qd[i]",
     )
     return head + c_networks.tables(network, precision) + functions + body

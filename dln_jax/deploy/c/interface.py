@@ -33,17 +33,10 @@ _DECLARED = {
 """Result and arguments of each function, by kind of model."""
 
 
-def signatures(kind: str, precision: str, sizes: dict[str, int]) -> dict[str, tuple[str, str]]:
-    """Result and arguments in C of each function, by its name; sizes are d, or n and m of a differential network."""
-    real = PRECISIONS[precision][1]
-    return {
-        function: (result.format(real=real), arguments.format(real=real, **sizes))
-        for function, (result, arguments) in _DECLARED[kind].items()
-    }
-
-
 def interface(name: str, kind: str, precision: str, sizes: dict[str, Any], version: str) -> dict[str, Any]:
-    """The description of an exported source, JSON values; `version` is that of the release that wrote it.
+    """The description of an exported source, JSON values, with result and arguments of each function in C.
+
+    `sizes` are d, or n and m of a differential network; `version` is that of the release that wrote the source.
 
     Raises:
         InputError: no such kind or precision, or sizes that are no counts up to 10,000.
@@ -55,7 +48,10 @@ def interface(name: str, kind: str, precision: str, sizes: dict[str, Any], versi
     for key, size in sizes.items():
         if type(size) is not int or not 1 <= size <= LARGEST:
             raise InputError(f"{key} is {size!r}; expected a whole number from 1 to {LARGEST}")
-    declared = {function: list(each) for function, each in signatures(kind, precision, sizes).items()}
+    real = PRECISIONS[precision][1]
+    declared = {
+        function: [text.format(real=real, **sizes) for text in each] for function, each in _DECLARED[kind].items()
+    }
     stated = {"format": FORMAT, "version": version, "name": name, "kind": kind, "precision": precision}
     return {**stated, **sizes, "functions": declared}
 

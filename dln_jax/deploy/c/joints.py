@@ -1,7 +1,10 @@
 """What a network sees of the coordinates, as C: `models.features.joint_features`, its rate and its pull-back."""
 
 from collections.abc import Iterable
+from typing import Any
 
+from dln_jax.deploy.c.text import table
+from dln_jax.models.black_box import per_coordinate
 from dln_jax.types import Needs
 
 _HEADS = {
@@ -25,23 +28,27 @@ def count(needs: Needs) -> int:
     return sum(2 if joint == "revolute" else 1 for joint in needs.joints)
 
 
+def scale_table(description: dict[str, Any], scale: str, needs: Needs, precision: str) -> str:
+    """The sizes by which a model divides, one for each coordinate."""
+    size = description[scale]
+    return table(scale, per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size), precision)
+
+
 def functions(needs: Needs, names: Iterable[str] = _HEADS) -> str:
     """Definitions of `features(q, x)`, `feature_rates(x, qd, x_rate)` and `pull_back_features(x, x_adjoint, force)`."""
-    revolute = [joint for joint, kind in enumerate(needs.joints) if kind == "revolute"]
-    prismatic = [joint for joint, kind in enumerate(needs.joints) if kind == "prismatic"]
+    revolute, prismatic = (
+        [joint for joint, kind in enumerate(needs.joints) if kind == wanted] for wanted in ("revolute", "prismatic")
+    )
     n = len(revolute)
-    lines: dict[str, list[str]] = {name: [] for name in _HEADS}
+    # Lines of each function; without a revolute joint, two of them do not use x.
+    values, rates, forces = [], [] if n else ["(void)x;"], [] if n else ["(void)x;"]
     for k, joint in enumerate(revolute):
-        lines["features"] += [f"x[{k}] = cos${{f}}(q[{joint}]);", f"x[{n + k}] = sin${{f}}(q[{joint}]);"]
-        lines["feature_rates"].append(f"x_rate[{k}] = -x[{n + k}] * qd[{joint}];")
-        lines["feature_rates"].append(f"x_rate[{n + k}] = x[{k}] * qd[{joint}];")
-        pulled = f"x[{k}] * x_adjoint[{n + k}] - x[{n + k}] * x_adjoint[{k}]"
-        lines["pull_back_features"].append(f"force[{joint}] = {pulled};")
-    if not revolute:
-        lines["feature_rates"].append("(void)x;")
-        lines["pull_back_features"].append("(void)x;")
+        values += [f"x[{k}] = cos${{f}}(q[{joint}]);", f"x[{n + k}] = sin${{f}}(q[{joint}]);"]
+        rates += [f"x_rate[{k}] = -x[{n + k}] * qd[{joint}];", f"x_rate[{n + k}] = x[{k}] * qd[{joint}];"]
+        forces.append(f"force[{joint}] = x[{k}] * x_adjoint[{n + k}] - x[{n + k}] * x_adjoint[{k}];")
     for k, joint in enumerate(prismatic, start=2 * n):
-        lines["features"].append(f"x[{k}] = q[{joint}];")
-        lines["feature_rates"].append(f"x_rate[{k}] = qd[{joint}];")
-        lines["pull_back_features"].append(f"force[{joint}] = x_adjoint[{k}];")
+        values.append(f"x[{k}] = q[{joint}];")
+        rates.append(f"x_rate[{k}] = qd[{joint}];")
+        forces.append(f"force[{joint}] = x_adjoint[{k}];")
+    lines = dict(zip(_HEADS, (values, rates, forces), strict=True))
     return "".join(_HEADS[name] + "{\n" + "".join(f"    {line}\n" for line in lines[name]) + "}\n" for name in names)

@@ -62,6 +62,8 @@ _DOTS = """
 /* y[r] = sum_c table[r][c] x[c], r < $rows */
 static void dots_${rows}_$columns(const real *restrict table, const real *restrict x, real *restrict y)
 {
+"""
+_LONG_DOTS = """\
     for (int r = 0; r < $rows; ++r, table += $columns) {
         real part[$parts] = {0}, sum = 0;
         for (int c = 0; c < $whole; c += $parts)
@@ -73,10 +75,7 @@ static void dots_${rows}_$columns(const real *restrict table, const real *restri
     }
 }
 """
-_SHORT_DOTS = """
-/* y[r] = sum_c table[r][c] x[c], r < $rows */
-static void dots_${rows}_$columns(const real *restrict table, const real *restrict x, real *restrict y)
-{
+_SHORT_DOTS = """\
     for (int r = 0; r < $rows; ++r) {
         real sum = 0;
         for (int c = 0; c < $columns; ++c) sum += table[r * $columns + c] * x[c];
@@ -183,4 +182,4 @@ def _definition(call: re.Match, precision: str, activation: str) -> str:
         return fill(_PUSH, precision, **sizes)
     parts = _PARTS[precision] if sizes["columns"] % _PARTS[precision] == 0 else 8
     whole = sizes["columns"] // parts * parts
-    return fill(_DOTS if whole else _SHORT_DOTS, precision, parts=parts, whole=whole, **sizes)
+    return fill(_DOTS + (_LONG_DOTS if whole else _SHORT_DOTS), precision, parts=parts, whole=whole, **sizes)

@@ -5,6 +5,7 @@ library but <math.h>. The same model, name and precision give the same files, by
 """
 
 import importlib.metadata
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from dln_jax.deploy.c import structured as c_structured
 from dln_jax.deploy.c import trigonometric as c_trigonometric
 from dln_jax.deploy.c.activations import EXPORTABLE
 from dln_jax.deploy.c.demo import cmake, demo
-from dln_jax.deploy.c.interface import FORMAT, FUNCTION, interface, signatures
+from dln_jax.deploy.c.interface import FORMAT, FUNCTION, interface
 from dln_jax.deploy.c.library import helpers
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, fill
 from dln_jax.deploy.exports import described, write_exports
@@ -40,6 +41,10 @@ _MEANINGS = {
     "value": "y at x.",
     "value_and_jacobian": "y and dy/dx at x; element (k, j) of the Jacobian at k * {n} + j is dy_k/dx_j.",
 }
+_PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
+Arrays that are written must not overlap others. What is not finite in a state gives results that are not."""
+_NEEDED = """C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);
+results do not rely on reordered arithmetic (-ffast-math)."""
 
 
 def export_c(
@@ -65,9 +70,8 @@ def export_c(
         InputError: a model that has no C export, a name that is none in C, files that exist, or the folder of a run,
             whose files are never replaced.
     """
-    directory = Path(directory)
     texts = source_files(description, parameters, name=check_name(name), precision=precision)
-    return write_exports(directory, texts, overwrite=overwrite)
+    return write_exports(Path(directory), texts, overwrite=overwrite)
 
 
 def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[Path]:
@@ -78,33 +82,35 @@ def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[
 
 def source_files(description: Description, parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
     """Content of each file, by its name."""
-    name_of_model = _exportable(description)
-    precision = precision or str(description["precision"])
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is '{precision}'; expected f32 or f64")
+    kind, precision = str(description.get("name")), precision or str(description.get("precision"))
+    if kind not in SOURCES and kind != FUNCTION:
+        raise InputError(f"a {kind} has no C export; exportable are {', '.join((*SOURCES, FUNCTION))}")
+    require_complete(description, entry_of(kind).factory)
+    if description.get("friction_width") and description["needs"]["friction"]:
+        raise InputError("a friction that depends on q has no C export; train with one coefficient per coordinate")
     activation = str(description.get("activation", "tanh"))
     if activation not in EXPORTABLE:
         raise InputError(f"activation is '{activation}'; C export knows {', '.join(EXPORTABLE)}")
-    if name_of_model == FUNCTION:
+    if kind == FUNCTION:
         sizes = {"n": parameters[0][0].shape[1], "m": parameters[-1][0].shape[2]}
-        body = c_function.source(parameters, precision)
+        body = partial(c_function.source, parameters)
         about = f"{sizes['n']} inputs x, {sizes['m']} outputs y"
     else:
         needs = needs_from_json(description["needs"])
         sizes = {"d": needs.degrees_of_freedom}
-        body = SOURCES[name_of_model](description, parameters, needs, precision)
+        body = partial(SOURCES[kind], description, parameters, needs)
         units = ", ".join(f"{joint} ({'rad' if joint == 'revolute' else 'm'})" for joint in needs.joints)
-        about = f"joints: {units}; {'with' if needs.friction else 'without'} friction"
+        about = f"Joints: {units}; {'with' if needs.friction else 'without'} friction"
     version = importlib.metadata.version("dln-jax")
-    written_by = (
-        f"Written by dln-jax {version}, C format {FORMAT}, from a {name_of_model}.\n{about[0].upper()}{about[1:]}."
-    )
-    stated = interface(name, name_of_model, precision, sizes, version)
-    declared = signatures(name_of_model, precision, sizes)
-    filled = fill(body, precision, name=name)
+    stated = interface(name, kind, precision, sizes, version)
+    declared = stated["functions"]
+    written_by = f"Written by dln-jax {version}, C format {FORMAT}, from a {kind}.\n{about}."
+    constants, _, functions = fill(body(precision), precision, name=name).partition("\n")
+    about = comment(f"{name}.c", written_by, _NEEDED)
     texts = {
         f"{name}.h": _header(name, written_by, declared, sizes),
-        f"{name}.c": _source(name, written_by, filled, precision, activation),
+        f"{name}.c": f'{about}#include <math.h>\n\n#include "{name}.h"\n\ntypedef {PRECISIONS[precision][1]} real;\n\n'
+        f"{constants}\n{helpers(functions, precision, activation)}{functions}",
         f"{name}_demo.c": demo(name, declared, sizes, precision),
         "CMakeLists.txt": cmake(name),
     }
@@ -112,27 +118,9 @@ def source_files(description: Description, parameters: Any, *, name: str, precis
     return {**files, f"{name}.json": described(stated, files)}
 
 
-def _exportable(description: Description) -> str:
-    """The model's name, if it has a C export."""
-    name = str(description.get("name"))
-    if name not in SOURCES and name != FUNCTION:
-        raise InputError(f"a {name} has no C export; exportable are {', '.join((*SOURCES, FUNCTION))}")
-    require_complete(description, entry_of(name).factory)
-    if description.get("friction_width") and description["needs"]["friction"]:
-        raise InputError("a friction that depends on q has no C export; train with one coefficient per coordinate")
-    return name
-
-
-def _header(name: str, written_by: str, declared: dict[str, tuple[str, str]], sizes: dict[str, int]) -> str:
-    guard = f"{name.upper()}_H"
-    conventions = "Units: q in rad or m, qd in 1/s and qdd in 1/s^2 of that, tau in N m or N.\n" * ("d" in sizes)
-    about = comment(
-        f"{name}.h",
-        written_by,
-        conventions
-        + "Functions of one state, which keep their workspace on the stack and may run in several threads.\n"
-        "Arrays that are written must not overlap others. What is not finite in a state gives results that are not.",
-    )
+def _header(name: str, written_by: str, declared: dict[str, list[str]], sizes: dict[str, int]) -> str:
+    units = "Units: q in rad or m, qd in 1/s and qdd in 1/s^2 of that, tau in N m or N.\n" * ("d" in sizes)
+    about, guard = comment(f"{name}.h", written_by, units + _PROMISES), f"{name.upper()}_H"
     size_names = {"d": "DEGREES_OF_FREEDOM", "n": "INPUTS", "m": "OUTPUTS"}
     defines = "".join(f"#define {name.upper()}_{size_names[key]} {size}\n" for key, size in sizes.items())
     declarations = "".join(
@@ -143,16 +131,3 @@ def _header(name: str, written_by: str, declared: dict[str, tuple[str, str]], si
         f'{about}#ifndef {guard}\n#define {guard}\n\n{defines}\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
         f"{declarations}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
     )
-
-
-def _source(name: str, written_by: str, body: str, precision: str, activation: str) -> str:
-    about = comment(
-        f"{name}.c",
-        written_by,
-        "C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);\n"
-        "results do not rely on reordered arithmetic (-ffast-math).",
-    )
-    real = PRECISIONS[precision][1]
-    start = f'{about}#include <math.h>\n\n#include "{name}.h"\n\ntypedef {real} real;\n'
-    constants, _, functions = body.partition("\n")
-    return f"{start}\n{constants}\n{helpers(functions, precision, activation)}{functions}"

@@ -79,82 +79,64 @@ void ${name}_mass_matrix(const real q[D], real M[D * D])
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    d = needs.degrees_of_freedom
-    degree = description["degree"]
+    d, degree = needs.degrees_of_freedom, description["degree"]
     degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
-    potential_degrees = tuple(
-        max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)
-    )
     entries, size = parameters.mass.shape
-    potential = parameters.potential
-    head = [
-        f"enum {{ D = {d}, ENTRIES = {entries}, BASIS = {size} }};\n",
-        "\n/* Coefficients of M: its lower triangle row by row, times the basis */\n",
-        table("mass", np.asarray(parameters.mass).ravel(), precision),
-    ]
-    if potential is not None:
+    head = f"enum {{ D = {d}, ENTRIES = {entries}, BASIS = {size} }};\n"
+    head += "\n/* Coefficients of M: its lower triangle row by row, times the basis */\n"
+    head += table("mass", np.asarray(parameters.mass).ravel(), precision)
+    functions = _basis("mass_basis", needs, degrees)
+    gravity = energy = ""
+    if parameters.potential is not None:
         # The constant, which no motion shows, is not stored.
-        head += [
-            "\n/* Coefficients of V, J */\n",
-            table("potential", np.concatenate([[0.0], np.asarray(potential)]), precision),
-        ]
-    head.append(friction_table(parameters.friction, precision))
-    functions = [_basis("mass_basis", needs, degrees)]
-    gravity, energy = [], []
-    if potential is not None:
-        count = len(potential) + 1
-        if potential_degrees == degrees:
-            gravity = [f"    dots_{d}_{size}(slopes, potential, force);\n"]
-            basis = "mass_basis"
-        else:
-            basis = "potential_basis"
-            functions.append(_basis(basis, needs, potential_degrees))
-            gravity = [
-                f"    real terms[{count}], term_slopes[D * {count}];\n",
-                "    potential_basis(q, terms, term_slopes);\n",
-                f"    dots_{d}_{count}(term_slopes, potential, force);\n",
-            ]
-        gravity.append("    for (int i = 0; i < D; ++i) bias[i] += force[i];\n")
-        energy = [
-            f"    real terms[{count}], term_slopes[D * {count}];\n",
-            f"    {basis}(q, terms, term_slopes);\n",
-            f"    for (int l = 0; l < {count}; ++l) energy += potential[l] * terms[l];\n",
-        ]
+        coefficients = np.concatenate([[0.0], np.asarray(parameters.potential)])
+        head += "\n/* Coefficients of V, J */\n" + table("potential", coefficients, precision)
+        count = len(coefficients)
+        own_degrees = tuple(
+            max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)
+        )
+        declared = f"    real terms[{count}], term_slopes[D * {count}];\n"
+        basis, slopes = "mass_basis", "slopes"
+        if own_degrees != degrees:
+            basis, slopes = "potential_basis", "term_slopes"
+            functions += _basis(basis, needs, own_degrees)
+            gravity = f"{declared}    {basis}(q, terms, term_slopes);\n"
+        gravity += f"    dots_{d}_{count}({slopes}, potential, force);\n"
+        gravity += "    for (int i = 0; i < D; ++i) bias[i] += force[i];\n"
+        energy = f"{declared}    {basis}(q, terms, term_slopes);\n"
+        energy += f"    for (int l = 0; l < {count}; ++l) energy += potential[l] * terms[l];\n"
     if parameters.friction is not None:
-        gravity.append("    for (int i = 0; i < D; ++i) bias[i] += friction[i] * qd[i];\n")
-    texts = {"d": d, "entries": entries, "basis": size, "half": "0.5${f}"}
-    texts |= {"gravity": "".join(gravity), "potential": "".join(energy)}
-    return "".join([*head, *functions, Template(_BODY).safe_substitute(texts)])
+        gravity += "    for (int i = 0; i < D; ++i) bias[i] += friction[i] * qd[i];\n"
+    body = Template(_BODY).safe_substitute(
+        d=d, entries=entries, basis=size, half="0.5${f}", gravity=gravity, potential=energy
+    )
+    return head + friction_table(parameters.friction, precision) + functions + body
 
 
 def _basis(name: str, needs: Needs, degrees: tuple[int, ...]) -> str:
     """`NAME(q, b, slopes)`: products over joints of the functions of each, and their partial derivatives."""
-    d = needs.degrees_of_freedom
-    sizes = [2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(needs.joints, degrees, strict=True)]
-    lines = []
-    for joint, (kind, n, size) in enumerate(zip(needs.joints, degrees, sizes, strict=True)):
-        values, rates = ["1"], ["0"]
+    joints = range(needs.degrees_of_freedom)
+    lines, loops, size = "", "", 1
+    for joint, (kind, n) in enumerate(zip(needs.joints, degrees, strict=True)):
+        orders = range(1, n + 1)
         if kind == "revolute":
-            cosines = [f"cos${{f}}({k} * q[{joint}])" for k in range(1, n + 1)]
-            sines = [f"sin${{f}}({k} * q[{joint}])" for k in range(1, n + 1)]
-            values += cosines + sines
-            rates += [f"-{k} * v_{joint}[{n + k}]" for k in range(1, n + 1)]
-            rates += [f"{k} * v_{joint}[{k}]" for k in range(1, n + 1)]
+            values = [f"{function}${{f}}({k} * q[{joint}])" for function in ("cos", "sin") for k in orders]
+            rates = [f"-{k} * v_{joint}[{n + k}]" for k in orders] + [f"{k} * v_{joint}[{k}]" for k in orders]
         else:
-            values += [" * ".join([f"q[{joint}]"] * k) for k in range(1, n + 1)]
-            rates += [f"{k} * v_{joint}[{k - 1}]" for k in range(1, n + 1)]
-        lines.append(f"    const real v_{joint}[{size}] = {{{', '.join(values)}}};\n")
-        lines.append(f"    const real s_{joint}[{size}] = {{{', '.join(rates)}}};\n")
-    lines.append("    int l = 0;\n")
-    for joint, size in enumerate(sizes):
-        lines.append(f"    for (int k_{joint} = 0; k_{joint} < {size}; ++k_{joint})\n")
-    lines[-1] = lines[-1].rstrip("\n") + " {\n"
-    lines.append(f"        b[l] = {' * '.join(f'v_{joint}[k_{joint}]' for joint in range(d))};\n")
-    for row in range(d):
-        factors = " * ".join(f"{'s' if joint == row else 'v'}_{joint}[k_{joint}]" for joint in range(d))
-        lines.append(f"        slopes[{row} * {int(np.prod(sizes))} + l] = {factors};\n")
-    lines += ["        ++l;\n", "    }\n"]
+            values = [" * ".join([f"q[{joint}]"] * k) for k in orders]
+            rates = [f"{k} * v_{joint}[{k - 1}]" for k in orders]
+        count = 1 + len(values)
+        size *= count
+        lines += f"    const real v_{joint}[{count}] = {{{', '.join(['1', *values])}}};\n"
+        lines += f"    const real s_{joint}[{count}] = {{{', '.join(['0', *rates])}}};\n"
+        loops += f"\n    for (int k_{joint} = 0; k_{joint} < {count}; ++k_{joint})"
+    lines += f"    int l = 0;{loops} {{\n"
+    lines += f"        b[l] = {' * '.join(f'v_{joint}[k_{joint}]' for joint in joints)};\n"
+    for row in joints:
+        factors = " * ".join(f"{'s' if joint == row else 'v'}_{joint}[k_{joint}]" for joint in joints)
+        lines += f"        slopes[{row} * {size} + l] = {factors};\n"
     return (
         "\n/* Basis functions at q [.], and their partial derivatives [D, .] */\n"
-        f"static void {name}(const real *restrict q, real *restrict b, real *restrict slopes)\n{{\n{''.join(lines)}}}\n"
+        f"static void {name}(const real *restrict q, real *restrict b, real *restrict slopes)\n"
+        f"{{\n{lines}        ++l;\n    }}\n}}\n"
     )
