@@ -69,8 +69,7 @@ def export_dynamics(
         degrees_of_freedom: d.
         directory: is created where it is missing; all artefacts are written, or none.
         dtype: of the arguments; float64 needs `jax_enable_x64`.
-        platforms: as `export_stablehlo`.
-        overwrite: as `export_stablehlo`.
+        platforms, overwrite: as `export_stablehlo`.
 
     Raises:
         InputError: as `export_stablehlo`, or degrees of freedom that are no count.
@@ -104,12 +103,9 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     except Exception as error:  # the reader's exceptions are those of flatbuffers and of struct, and of no one class
         raise InputError(f"{path}: no artefact that JAX {jax.__version__} can read; export it again") from error
     # A GPU is "gpu" as a backend, and "cuda" or "rocm" as a platform.
-    platform = export.default_export_platform()
+    platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
-        raise InputError(
-            f"{path} is for {', '.join(exported.platforms)}, and JAX runs on {platform}; export it with that platform"
-        )
-
+        raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
     if any(each.dtype == "float64" for each in exported.in_avals):
         require_double_precision(str(path))
     return _refusing(path, exported)
@@ -125,19 +121,20 @@ def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
     wanted = exported.in_avals
     plain = exported.in_tree == jax.tree.structure(((0,) * len(wanted), {}))
 
-    def converted(number: int, argument: Any, like: Any) -> Array:
+    def converted(name: str, argument: Any, like: Any) -> Array:
         try:
             array = jnp.asarray(argument, like.dtype)
         except (TypeError, ValueError) as error:
-            raise InputError(f"argument {number} makes no array; expected {like}") from error
-        require_shape(f"argument {number}", array.shape, like.shape)
+            raise InputError(f"{name} makes no array; expected {like}") from error
+        require_shape(name, array.shape, like.shape)
         return array
 
     # What is refused is refused where JAX traces, that is once for each shape and type.
     @jax.jit
     def call(*arguments):
         if plain and len(arguments) == len(wanted):
-            arguments = [converted(*each) for each in zip(range(1, len(wanted) + 1), arguments, wanted, strict=True)]
+            names = (f"argument {number}" for number, _ in enumerate(wanted, 1))
+            arguments = list(map(converted, names, arguments, wanted))
         try:
             return exported.call(*arguments)
         except (ValueError, TypeError) as error:

@@ -9,6 +9,7 @@ m < 0. The decay 1 + m is squared along with it, for its relative accuracy in sa
 """
 
 import math
+from textwrap import indent
 
 from dln_jax.deploy.c.text import fill, number
 
@@ -48,59 +49,53 @@ _FORMULAS = {
 EXPORTABLE = ("tanh", *_FORMULAS)
 """Names of the activations."""
 
-_ARGUMENTS = {"value": "g(x)", "slope": "g'(x)", "curvature": "g''(x)"}
-_RESULTS = {
-    "activate": ("value",),
-    "activate_with_slope": ("value", "slope"),
-    "activate_with_curvature": ("value", "slope", "curvature"),
-}
+_RESULTS = {"value": "g(x)", "slope": "g'(x)", "curvature": "g''(x)"}
+_COUNTS = {"activate": 1, "activate_with_slope": 2, "activate_with_curvature": 3}
 
 
 def activate(function: str, width: int, activation: str, precision: str) -> str:
     """Definition of `activate_WIDTH`, `activate_with_slope_WIDTH` or `activate_with_curvature_WIDTH`."""
-    results = _RESULTS[function]
-    formulas = ", ".join(f"{name} = {_ARGUMENTS[name]}" for name in results)
+    results = list(_RESULTS)[: _COUNTS[function]]
+    formulas = ", ".join(f"{name} = {_RESULTS[name]}" for name in results)
     parameters = ", ".join(f"real *restrict {name}" for name in results)
-    body = _tanh(results, precision) if activation == "tanh" else _by_formula(results, activation, precision)
-    head = f"\n/* {formulas} with g = {activation} */\n"
-    lines = body.replace("WIDTH", str(width))
-    return f"{head}static void {function}_{width}(const real *restrict a, {parameters})\n{{\n{lines}}}\n"
+    lines = _tanh(results, precision) if activation == "tanh" else _by_formula(results, activation)
+    texts = {"half": 0.5, "root": math.sqrt(0.5), "density": 1 / math.sqrt(2 * math.pi)}
+    constants = {key: number(value, precision) for key, value in texts.items()}
+    return (
+        f"\n/* {formulas} with g = {activation} */\n"
+        f"static void {function}_{width}(const real *restrict a, {parameters})\n{{\n"
+        f"{fill(indent(lines, '    '), precision, width=width, **constants)}}}\n"
+    )
 
 
-def _by_formula(results: tuple[str, ...], activation: str, precision: str) -> str:
+def _by_formula(results: list[str], activation: str) -> str:
     before, *formulas = _FORMULAS[activation]
-    constants = {
-        "half": number(0.5, precision),
-        "root": number(math.sqrt(0.5), precision),
-        "density": number(1 / math.sqrt(2 * math.pi), precision),
-    }
     lines = ["const real x = a[k];", *[before] * bool(before)]
     lines += [f"{name}[k] = {formula};" for name, formula in zip(results, formulas, strict=False)]
-    inner = "\n".join(f"        {line}" for line in lines)
-    return fill(f"    for (int k = 0; k < WIDTH; ++k) {{\n{inner}\n    }}\n", precision, **constants)
+    return "for (int k = 0; k < $width; ++k) {\n" + "".join(f"    {line}\n" for line in lines) + "}\n"
 
 
-def _tanh(results: tuple[str, ...], precision: str) -> str:
+def _tanh(results: list[str], precision: str) -> str:
     bound, doublings, terms = _TANH[precision]
-    coefficients = [number(1 / math.factorial(order), precision) for order in range(2, terms + 1)]
+    bound, scale = number(bound, precision), number(-2 * 2.0**-doublings, precision)
+    *coefficients, last = (number(1 / math.factorial(order), precision) for order in range(2, terms + 1))
+    series = "".join(f"    m = {coefficient} + z * m;\n" for coefficient in reversed(coefficients))
     with_decay = "slope" in results
-    lines = [
-        "    real clamped[WIDTH]; /* a loop of its own, which keeps the next one free of branches */",
-        "    for (int k = 0; k < WIDTH; ++k) {",
-        "        const real size = fabs${f}(a[k]);",
-        f"        clamped[k] = size > {number(bound, precision)} ? {number(bound, precision)} : size;",
-        "    }",
-        "    for (int k = 0; k < WIDTH; ++k) {",
-        f"        const real z = {number(-2 * 2.0**-doublings, precision)} * clamped[k];",
-        f"        real m = {coefficients[-1]};",
-        *[f"        m = {coefficient} + z * m;" for coefficient in reversed(coefficients[:-1])],
-        "        m = z + z * z * m;",
-        *["        real decay = 1 + m;"] * with_decay,
-        *[f"        m *= 2 + m;{' decay *= decay;' * with_decay}"] * doublings,
-        "        const real scale = 1 / (2 + m), t = -m * scale;",
-        "        value[k] = a[k] < 0 ? -t : t;",
-        *["        slope[k] = 4 * decay * scale * scale;"] * with_decay,
-        *["        curvature[k] = -2 * value[k] * slope[k];"] * ("curvature" in results),
-        "    }",
-    ]
-    return fill("\n".join(lines) + "\n", precision)
+    decay = "    real decay = 1 + m;\n" * with_decay
+    doubling = f"    m *= 2 + m;{' decay *= decay;' * with_decay}\n"
+    slope = "    slope[k] = 4 * decay * scale * scale;\n" * with_decay
+    curvature = "    curvature[k] = -2 * value[k] * slope[k];\n" * ("curvature" in results)
+    return f"""real clamped[$width]; /* a loop of its own, which keeps the next one free of branches */
+for (int k = 0; k < $width; ++k) {{
+    const real size = fabs${{f}}(a[k]);
+    clamped[k] = size > {bound} ? {bound} : size;
+}}
+for (int k = 0; k < $width; ++k) {{
+    const real z = {scale} * clamped[k];
+    real m = {last};
+{series}    m = z + z * z * m;
+{decay}{doubling * doublings}\
+    const real scale = 1 / (2 + m), t = -m * scale;
+    value[k] = a[k] < 0 ? -t : t;
+{slope}{curvature}}}
+"""

@@ -2,6 +2,7 @@
 
 import re
 from string import Template
+from textwrap import TextWrapper
 
 import numpy as np
 
@@ -9,7 +10,6 @@ from dln_jax.types import InputError
 
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
 """NumPy type, C type, and the suffix of its literals and of the functions of <math.h>."""
-LINE = 116
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # C99 and C++ keywords that fit the pattern; a library or a header of that name would not build.
 _RESERVED = frozenset(
@@ -52,11 +52,14 @@ def number(value, precision: str) -> str:
     return f"{rounded!s}{suffix}"
 
 
+_wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
+
+
 def table(name: str, values, precision: str) -> str:
     """A constant array, row by row."""
     rows = np.atleast_2d(np.asarray(values))
     size = " * ".join(map(str, np.shape(values)))
-    lines = [line for row in rows for line in wrapped([number(value, precision) for value in row])]
+    lines = [line for row in rows for line in _wrapper.wrap(" ".join(f"{number(value, precision)}," for value in row))]
     return f"static const real {name}[{size}] = {{\n" + "\n".join(lines) + "\n};\n"
 
 
@@ -67,17 +70,6 @@ def friction_table(coefficients, precision: str) -> str:
     return "\n/* Viscous friction, N m s or N s/m */\n" + table("friction", coefficients, precision)
 
 
-def wrapped(words: list[str]) -> list[str]:
-    """Lines of words, a comma behind each."""
-    lines = ["   "]
-    for word in words:
-        if len(lines[-1]) + len(word) + 2 > LINE and lines[-1].strip():
-            lines.append("   ")
-        lines[-1] += f" {word},"
-    return lines
-
-
 def comment(*paragraphs: str) -> str:
     """A block comment of lines as given."""
-    lines = [line for paragraph in paragraphs for line in [*paragraph.splitlines(), ""]][:-1]
-    return "/*\n" + "\n".join(f" * {line}".rstrip() for line in lines) + "\n */\n"
+    return "/*\n" + "".join(f" * {line}".rstrip() + "\n" for line in "\n\n".join(paragraphs).splitlines()) + " */\n"
