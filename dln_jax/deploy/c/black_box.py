@@ -8,6 +8,7 @@ from typing import Any
 
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
+from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -38,43 +39,36 @@ _STATE_GRADIENT = """\
     energy_gradient(x, &trace, slope);
 """
 _RATE = """\
-${gradient}    feature_rates(x, qd, x_rate);
+    feature_rates(x, qd, x_rate);
     for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = ${other};
     energy_gradient_rate(&trace, x_rate, rate);
     pull_back_features(x, slope, force);
 """
-_LAGRANGIAN = """
-void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
-{
+_LAGRANGIAN = {
+    "inverse_dynamics": """\
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
 ${at_qdd}    for (int i = 0; i < D; ++i) tau[i] = rate[FEATURES + i] / rate_scale[i] - force[i]${friction};
-}
-
-void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
-{
+""",
+    "forward_dynamics": """\
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], M[D * D];
 ${at_rest}    for (int i = 0; i < D; ++i) qdd[i] = tau[i] - (rate[FEATURES + i] / rate_scale[i] - force[i]${friction});
     hessian(&trace, M);
     eliminate_1(M, qdd);
-}
-
-real ${name}_energy(const real q[D], const real qd[D])
-{
+""",
+    "energy": """\
     real x[INPUTS], slope[INPUTS], energy;
     energy_trace trace;
     inputs(q, qd, x);
     energy = -energy_gradient(x, &trace, slope);
     for (int i = 0; i < D; ++i) energy += slope[FEATURES + i] / rate_scale[i] * qd[i];
     return energy;
-}
-
-void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
-{
+""",
+    "mass_matrix": """\
     real x[INPUTS], slope[INPUTS];
 ${state}    hessian(&trace, M);
+""",
 }
-"""
-_HAMILTONIAN = """
+_MOMENTUM = """
 /* p where dH/dp = qd, by a fixed number of full Newton steps from 0; leaves the state (q, p) in x. */
 static void momentum(const real *restrict q, const real *restrict qd, real *restrict x)
 {
@@ -91,64 +85,60 @@ static void momentum(const real *restrict q, const real *restrict qd, real *rest
         for (int i = 0; i < D; ++i) x[FEATURES + i] = p[i] / momentum_scale[i];
     }
 }
-
-void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
-{
+"""
+_HAMILTONIAN = {
+    "inverse_dynamics": """\
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D], momentum_rate[D], H[D * D];
 ${at_rest}    for (int i = 0; i < D; ++i) momentum_rate[i] = qdd[i] - rate[FEATURES + i] / momentum_scale[i];
     hessian(&trace, H);
     eliminate_1(H, momentum_rate);
     for (int i = 0; i < D; ++i) tau[i] = momentum_rate[i] + force[i]${friction};
-}
-
-void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
-{
+""",
+    "forward_dynamics": """\
     real x[INPUTS], x_rate[INPUTS], slope[INPUTS], rate[INPUTS], force[D];
 ${state}    pull_back_features(x, slope, force);
     feature_rates(x, qd, x_rate);
     for (int i = 0; i < D; ++i) x_rate[FEATURES + i] = (tau[i] - (force[i]${friction})) / momentum_scale[i];
     energy_gradient_rate(&trace, x_rate, rate);
     for (int i = 0; i < D; ++i) qdd[i] = rate[FEATURES + i] / momentum_scale[i];
-}
-
-real ${name}_energy(const real q[D], const real qd[D])
-{
+""",
+    "energy": """\
     real x[INPUTS], energy;
     momentum(q, qd, x);
     energy_value(x, &energy);
     return energy;
-}
-
-void ${name}_mass_matrix(const real q[D], const real qd[D], real M[D * D])
-{
+""",
+    "mass_matrix": """\
     real x[INPUTS], slope[INPUTS], H[D * D];
 ${state}    hessian(&trace, H);
     for (int i = 0; i < D; ++i)
         for (int j = 0; j < D; ++j) M[i * D + j] = i == j;
     eliminate_${degrees}(H, M);
+""",
 }
-"""
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    lagrangian = not CATALOGUE[description["name"]].properties.canonical
-    scale, second = ("rate_scale", "qd") if lagrangian else ("momentum_scale", "p")
-    network = c_networks.from_haiku("energy", parameters, "lagrangian" if lagrangian else "hamiltonian")
+    kind, d, features = description["name"], needs.degrees_of_freedom, c_joints.count(needs)
+    head = f"enum {{ D = {d}, FEATURES = {features}, INPUTS = {features + d}"
+    if CATALOGUE[kind].properties.canonical:
+        network = c_networks.from_haiku("energy", parameters, "hamiltonian")
+        head += f", NEWTON_STEPS = {description['iterations']}"
+        scale, second, place, value = "momentum_scale", "p", "momentum", c_networks.value(network)
+        text = _STATE + _MOMENTUM + definitions(kind, _HAMILTONIAN)
+    else:
+        network = c_networks.from_haiku("energy", parameters, "lagrangian")
+        scale, second, place, value = "rate_scale", "qd", "inputs", ""
+        text = _STATE + definitions(kind, _LAGRANGIAN)
     friction = c_networks.friction_from_haiku(parameters)
-    d, features = needs.degrees_of_freedom, c_joints.count(needs)
-    enumerators = [f"D = {d}", f"FEATURES = {features}", f"INPUTS = {features + d}"]
-    if not lagrangian:
-        enumerators.append(f"NEWTON_STEPS = {description['iterations']}")
-    head = f"enum {{ {', '.join(enumerators)} }};\n\n/* Typical size of {second}, by which it is divided */\n"
+    head += f" }};\n\n/* Typical size of {second}, by which it is divided */\n"
     head += c_joints.scale_table(description, scale, needs, precision) + friction_table(friction, precision)
-    functions = c_joints.functions(needs)
-    functions += c_networks.trace(network, bends=True)
-    functions += "" if lagrangian else c_networks.value(network)
+    functions = c_joints.functions(needs) + c_networks.trace(network, bends=True) + value
     functions += c_networks.gradient(network) + c_networks.gradient_rate(network)
-    gradient = Template(_STATE_GRADIENT).substitute(place="inputs" if lagrangian else "momentum")
-    rates = Template(_RATE.replace("${gradient}", gradient))
-    body = Template(_STATE + (_LAGRANGIAN if lagrangian else _HAMILTONIAN)).safe_substitute(
+    gradient = Template(_STATE_GRADIENT).substitute(place=place)
+    rates = Template(gradient + _RATE)
+    body = Template(text).safe_substitute(
         state=gradient,
         at_rest=rates.substitute(other="0"),
         at_qdd=rates.substitute(other="qdd[i] / rate_scale[i]"),

@@ -8,6 +8,7 @@ import numpy as np
 
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
+from dln_jax.deploy.c.interface import FUNCTION, definitions
 from dln_jax.deploy.c.networks import Network
 from dln_jax.nn.differential_mlp import Layers, cheaper_jacobian
 from dln_jax.types import Needs
@@ -33,20 +34,8 @@ _FORWARD = """\
         }
 """
 _LINEAR = "    {\n        for (int k = 0; k < OUTPUTS * INPUTS; ++k) jacobian[k] += ${member}_weight_1[k] / MEMBERS;\n"
-_FUNCTIONS = """
-void ${name}_value(const real x[INPUTS], real y[OUTPUTS])
-{
-    real one[OUTPUTS];
-    for (int k = 0; k < OUTPUTS; ++k) y[k] = 0;
-${values}}
-
-void ${name}_value_and_jacobian(const real x[INPUTS], real y[OUTPUTS], real jacobian[OUTPUTS * INPUTS])
-{
-    real one[OUTPUTS];
-    for (int k = 0; k < OUTPUTS; ++k) y[k] = 0;
-    for (int k = 0; k < OUTPUTS * INPUTS; ++k) jacobian[k] = 0;
-${jacobians}}
-"""
+_START = "    real one[OUTPUTS];\n    for (int k = 0; k < OUTPUTS; ++k) y[k] = 0;\n"
+_CLEAR = "    for (int k = 0; k < OUTPUTS * INPUTS; ++k) jacobian[k] = 0;\n"
 _FEED_FORWARD = """
 void ${name}_${quantity}_dynamics(const real q[D], const real qd[D], const real ${given}[D], real ${wanted}[D])
 {
@@ -82,7 +71,8 @@ def source(layers: Layers, precision: str) -> str:
         "".join(Template(each).substitute(member=member.name) for member in members)
         for each in (f"{_VALUE}    {_SUM}", f"{jacobian}        {_SUM}    }}\n")
     )
-    return text + Template(_FUNCTIONS).safe_substitute(values=values, jacobians=jacobians)
+    bodies = {"value": _START + values, "value_and_jacobian": _START + _CLEAR + jacobians}
+    return text + definitions(FUNCTION, bodies)
 
 
 def feed_forward_source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:

@@ -1,5 +1,6 @@
 """What an exported source declares: functions and their signatures, and the description that states its sizes."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +49,22 @@ def interface(name: str, kind: str, precision: str, sizes: dict[str, Any], versi
     for key, size in sizes.items():
         if type(size) is not int or not 1 <= size <= LARGEST:
             raise InputError(f"{key} is {size!r}; expected a whole number from 1 to {LARGEST}")
-    real = PRECISIONS[precision][1]
-    declared = {
-        function: [text.format(real=real, **sizes) for text in each] for function, each in _DECLARED[kind].items()
-    }
+    declared = _signatures(kind, real=PRECISIONS[precision][1], **sizes)
     stated = {"format": FORMAT, "version": version, "name": name, "kind": kind, "precision": precision}
     return {**stated, **sizes, "functions": declared}
+
+
+def definitions(kind: str, bodies: Mapping[str, str]) -> str:
+    """The functions of a source from the bodies by name; `$name` is left to fill in."""
+    declared = _signatures(kind, real="real", d="D", n="INPUTS", m="OUTPUTS")
+    return "".join(
+        f"\n{result} ${{name}}_{function}({arguments})\n{{\n{bodies[function]}}}\n"
+        for function, (result, arguments) in declared.items()
+    )
+
+
+def _signatures(kind: str, **names: Any) -> dict[str, list[str]]:
+    return {function: [text.format(**names) for text in each] for function, each in _DECLARED[kind].items()}
 
 
 def read_interface(directory: Path, name: str) -> tuple[dict[str, Any], dict[str, bytes]]:

@@ -154,10 +154,8 @@ static void eliminate_$columns(real *restrict A, real *restrict b)
         }
 }
 """
-_CALL = re.compile(
-    r"\b(?:(combine|combine_rates|push|dots)_(\d+)_(\d+)|(activate(?:_with_slope|_with_curvature)?)_(\d+)"
-    rf"|eliminate_(\d+)|({'|'.join(_SCALAR)}))(?=\()"
-)
+_TEXTS = {"combine": _COMBINE, "combine_rates": _COMBINE_RATES, "push": _PUSH, "eliminate": _ELIMINATE, **_SCALAR}
+_CALL = re.compile(rf"\b(dots|activate(?:_with_slope|_with_curvature)?|{'|'.join(_TEXTS)})((?:_\d+)*)(?=\()")
 
 
 def helpers(body: str, precision: str, activation: str) -> str:
@@ -167,19 +165,11 @@ def helpers(body: str, precision: str, activation: str) -> str:
 
 
 def _definition(call: re.Match, precision: str, activation: str) -> str:
-    product, rows, columns, activate_name, width, right_sides, scalar = call.groups()
-    if scalar:
-        return fill(_SCALAR[scalar], precision)
-    if right_sides:
-        return fill(_ELIMINATE, precision, columns=right_sides)
-    if activate_name:
-        return activate(activate_name, int(width), activation, precision)
-    sizes = {"rows": int(rows), "columns": int(columns)}
-    if product in ("combine", "combine_rates"):
-        block = next((size for size in _BLOCK[precision] if sizes["columns"] % size == 0), 1)
-        return fill(_COMBINE if product == "combine" else _COMBINE_RATES, precision, block=block, **sizes)
-    if product == "push":
-        return fill(_PUSH, precision, **sizes)
-    parts = _PARTS[precision] if sizes["columns"] % _PARTS[precision] == 0 else 8
-    whole = sizes["columns"] // parts * parts
-    return fill(_DOTS + (_LONG_DOTS if whole else _SHORT_DOTS), precision, parts=parts, whole=whole, **sizes)
+    rows, columns = ([0, 0] + [int(size) for size in call[2].split("_")[1:]])[-2:]
+    if call[1].startswith("activate"):
+        return activate(call[1], columns, activation, precision)
+    block = next((size for size in _BLOCK[precision] if columns % size == 0), 1)
+    parts = _PARTS[precision] if columns % _PARTS[precision] == 0 else 8
+    whole = columns // parts * parts
+    text = _DOTS + (_LONG_DOTS if whole else _SHORT_DOTS) if call[1] == "dots" else _TEXTS[call[1]]
+    return fill(text, precision, rows=rows, columns=columns, block=block, parts=parts, whole=whole)

@@ -10,6 +10,7 @@ from typing import Any
 
 from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
+from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table, number
 from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -68,7 +69,7 @@ static void times_transposed(const real *restrict L, const real *restrict x, rea
     }
 }
 """
-_DELAN = """
+_DELAN_MOTION = """
 /* L, and the force that a motion without acceleration takes: dM/dt qd - dT/dq + dV/dq and friction.
  * With u = L^T qd: dM/dt qd = L (dL/dt^T qd) + dL/dt u, and dT/dq is the pull-back of qd u^T through dL/dq. */
 static void motion(const real *restrict q, const real *restrict qd, real *restrict L, real *restrict bias)
@@ -83,32 +84,28 @@ ${pull_back}    times_transposed(L_rate, qd, v);
         bias[i] += force[i]${friction};
     }
 }
-
-void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
-{
+"""
+_DELAN = {
+    "inverse_dynamics": """\
     real L[D * D], bias[D], v[D];
     motion(q, qd, L, bias);
     times_transposed(L, qdd, v);
     times(L, v, tau);
     for (int i = 0; i < D; ++i) tau[i] += bias[i];
-}
-
-void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
-{
+""",
+    "forward_dynamics": """\
     real L[D * D], bias[D], v[D];
     motion(q, qd, L, bias);
     for (int i = 0; i < D; ++i) bias[i] = tau[i] - bias[i];
     solve_lower(L, bias, v);
     solve_lower_transposed(L, v, qdd);
-}
-
-${energy}void ${name}_mass_matrix(const real q[D], real M[D * D])
-{
+""",
+    "mass_matrix": """\
     real L[D * D];
 ${factor_values}    for (int i = 0; i < D; ++i) times(L, &L[i * D], &M[i * D]);
+""",
 }
-"""
-_HAMILTONIAN = """
+_HAMILTONIAN_MOTION = """
 /* L with M^-1 = L L^T, and for u = L^-1 qd, p = L^-T u:
  * drift = dL/dt u, momentum_drift = dL/dt^T p, load = dT/dq + dV/dq and friction. */
 static void motion(const real *restrict q, const real *restrict qd, real *restrict L, real *restrict drift,
@@ -123,9 +120,9 @@ ${features}    solve_lower(L, qd, u);
     pack_covector(diagonal_slope, p, u, adjoint);
 ${pull_back}    for (int i = 0; i < D; ++i) load[i] = force[i]${friction};
 }
-
-void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
-{
+"""
+_HAMILTONIAN = {
+    "inverse_dynamics": """\
     real L[D * D], drift[D], momentum_drift[D], load[D], v[D];
     motion(q, qd, L, drift, momentum_drift, load);
     for (int i = 0; i < D; ++i) drift[i] = qdd[i] - drift[i];
@@ -133,10 +130,8 @@ void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[
     for (int i = 0; i < D; ++i) v[i] -= momentum_drift[i];
     solve_lower_transposed(L, v, tau);
     for (int i = 0; i < D; ++i) tau[i] += load[i];
-}
-
-void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
-{
+""",
+    "forward_dynamics": """\
     real L[D * D], drift[D], momentum_drift[D], load[D], v[D];
     motion(q, qd, L, drift, momentum_drift, load);
     for (int i = 0; i < D; ++i) load[i] = tau[i] - load[i];
@@ -144,27 +139,21 @@ void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[
     for (int i = 0; i < D; ++i) v[i] += momentum_drift[i];
     times(L, v, qdd);
     for (int i = 0; i < D; ++i) qdd[i] += drift[i];
-}
-
-${energy}void ${name}_mass_matrix(const real q[D], real M[D * D])
-{
+""",
+    "mass_matrix": """\
     real L[D * D], unit[D], v[D];
 ${factor_values}    for (int i = 0; i < D; ++i) {
         for (int j = 0; j < D; ++j) unit[j] = i == j;
         solve_lower(L, unit, v);
         solve_lower_transposed(L, v, &M[i * D]);
     }
+""",
 }
-"""
 _ENERGY = """\
-real ${name}_energy(const real q[D], const real qd[D])
-{
     real L[D * D], u[D], energy = 0;
 ${values}    ${velocity}(L, qd, u);
     for (int i = 0; i < D; ++i) energy += u[i] * u[i];
     return energy / 2${potential};
-}
-
 """
 # The network along the motion: its features, its outputs and their rates.
 _FEATURES = """\
@@ -197,7 +186,11 @@ _PULL_BACK_POTENTIAL = """\
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    delan = not CATALOGUE[description["name"]].properties.canonical
+    kind = description["name"]
+    if CATALOGUE[kind].properties.canonical:
+        motion, bodies, velocity = _HAMILTONIAN_MOTION, _HAMILTONIAN, "solve_lower"
+    else:
+        motion, bodies, velocity = _DELAN_MOTION, _DELAN, "times_transposed"
     shared = "energies/~/linear_0" in parameters
     factor = c_networks.from_haiku("factor", parameters, "energies" if shared else "cholesky")
     friction = c_networks.friction_from_haiku(parameters)
@@ -221,15 +214,13 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
         pull_back += _PULL_BACK_POTENTIAL
         energy = " + potential"
     outputs = "ENTRIES + 1" if shared else "ENTRIES"
-    body = Template(_DELAN if delan else _HAMILTONIAN).safe_substitute(
+    body = Template(motion + definitions(kind, {**bodies, "energy": _ENERGY})).safe_substitute(
         features=Template(_FEATURES).substitute(outputs=outputs, potential_trace=trace),
         pull_back=pull_back + "    pull_back_features(x, x_adjoint, force);\n",
         friction="" if friction is None else " + friction[i] * qd[i]",
-        energy=Template(_ENERGY).safe_substitute(
-            values=Template(_VALUES).substitute(outputs=outputs, potential_result=result) + value,
-            velocity="times_transposed" if delan else "solve_lower",
-            potential=energy,
-        ),
+        values=Template(_VALUES).substitute(outputs=outputs, potential_result=result) + value,
         factor_values=Template(_VALUES).substitute(outputs=outputs, potential_result=""),
+        velocity=velocity,
+        potential=energy,
     )
     return head + friction_table(friction, precision) + networks + functions + _FACTOR + body

@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table, table
 from dln_jax.models.trigonometric import SPRING_DEGREE
 from dln_jax.types import Needs
 
-_BODY = """
+_MOTION = """
 /* Symmetric M from its lower triangle, row by row, both row-major */
 static void unpack(const real *restrict triangle, real *restrict M)
 {
@@ -40,41 +41,35 @@ static void motion(const real *restrict q, const real *restrict qd, real *restri
     dots_${d}_${d}(M_rate, qd, bias);
     for (int i = 0; i < D; ++i) bias[i] -= force[i];
 ${gravity}}
-
-void ${name}_inverse_dynamics(const real q[D], const real qd[D], const real qdd[D], real tau[D])
-{
+"""
+_BODIES = {
+    "inverse_dynamics": """\
     real M[D * D], bias[D];
     motion(q, qd, M, bias);
     dots_${d}_${d}(M, qdd, tau);
     for (int i = 0; i < D; ++i) tau[i] += bias[i];
-}
-
-void ${name}_forward_dynamics(const real q[D], const real qd[D], const real tau[D], real qdd[D])
-{
+""",
+    "forward_dynamics": """\
     real M[D * D], bias[D];
     motion(q, qd, M, bias);
     for (int i = 0; i < D; ++i) qdd[i] = tau[i] - bias[i];
     eliminate_1(M, qdd);
-}
-
-real ${name}_energy(const real q[D], const real qd[D])
-{
+""",
+    "energy": """\
     real M[D * D], momentum[D], energy = 0;
     ${name}_mass_matrix(q, M);
     dots_${d}_${d}(M, qd, momentum);
     for (int i = 0; i < D; ++i) energy += momentum[i] * qd[i];
     energy /= 2;
 ${potential}    return energy;
-}
-
-void ${name}_mass_matrix(const real q[D], real M[D * D])
-{
+""",
+    "mass_matrix": """\
     real b[BASIS], slopes[D * BASIS], triangle[ENTRIES];
     mass_basis(q, b, slopes);
     dots_${entries}_${basis}(mass, b, triangle);
     unpack(triangle, M);
+""",
 }
-"""
 
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
@@ -107,7 +102,7 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
         energy += f"    for (int l = 0; l < {count}; ++l) energy += potential[l] * terms[l];\n"
     if parameters.friction is not None:
         gravity += "    for (int i = 0; i < D; ++i) bias[i] += friction[i] * qd[i];\n"
-    body = Template(_BODY).safe_substitute(
+    body = Template(_MOTION + definitions("trigonometric", _BODIES)).safe_substitute(
         d=d, entries=entries, basis=size, half="0.5${f}", gravity=gravity, potential=energy
     )
     return head + friction_table(parameters.friction, precision) + functions + body
