@@ -79,7 +79,7 @@ def export_dynamics(
     if jnp.dtype(dtype) == jnp.float64:
         require_double_precision("dtype float64")
     state = jax.ShapeDtypeStruct((degrees_of_freedom,), dtype)
-    files: dict[str, bytes] = {}
+    files = {}
     for name, count in _ARGUMENTS.items():
         if (function := getattr(dynamics, name, None)) is not None:
             files |= _artefact(f"{name}{SUFFIX}", function, [state] * count, platforms)
@@ -90,8 +90,8 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     """The function of an artefact, jitted; it takes arrays, or lists of numbers, of the exported shapes, and no others.
 
     Raises:
-        InputError: no such file, no note beside it, one that is altered or too old, one for other platforms, one in
-            double precision while JAX computes in single, or no `flatbuffers`.
+        InputError: no such file, no note beside it, one that is altered, too old, for other platforms, or in double
+            precision while JAX computes in single, or no `flatbuffers`.
     """
     path = Path(path)
     if path.suffix != SUFFIX or not path.is_file():

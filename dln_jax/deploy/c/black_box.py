@@ -6,7 +6,6 @@ All second derivatives are rates of the gradient along a direction, one pass for
 from string import Template
 from typing import Any
 
-from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
 from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table
@@ -120,7 +119,7 @@ ${state}    hessian(&trace, H);
 
 def source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source, with `$name` and `${f}` left to fill in."""
-    kind, d, features = description["name"], needs.degrees_of_freedom, c_joints.count(needs)
+    kind, d, features = description["name"], needs.degrees_of_freedom, c_networks.feature_count(needs)
     head = f"enum {{ D = {d}, FEATURES = {features}, INPUTS = {features + d}"
     if CATALOGUE[kind].properties.canonical:
         network = c_networks.from_haiku("energy", parameters, "hamiltonian")
@@ -133,8 +132,8 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
         text = _STATE + definitions(kind, _LAGRANGIAN)
     friction = c_networks.friction_from_haiku(parameters)
     head += f" }};\n\n/* Typical size of {second}, by which it is divided */\n"
-    head += c_joints.scale_table(description, scale, needs, precision) + friction_table(friction, precision)
-    functions = c_joints.functions(needs) + c_networks.trace(network, bends=True) + value
+    head += c_networks.scale_table(description, scale, needs, precision) + friction_table(friction, precision)
+    functions = c_networks.feature_functions(needs) + c_networks.trace(network, bends=True) + value
     functions += c_networks.gradient(network) + c_networks.gradient_rate(network)
     gradient = Template(_STATE_GRADIENT).substitute(place=place)
     rates = Template(gradient + _RATE)

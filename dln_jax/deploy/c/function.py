@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
 from dln_jax.deploy.c.interface import FUNCTION, definitions
 from dln_jax.deploy.c.networks import Network
@@ -77,12 +76,12 @@ def source(layers: Layers, precision: str) -> str:
 
 def feed_forward_source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
     """Body of the C source of the two networks of `models.feed_forward`."""
-    d, features = needs.degrees_of_freedom, c_joints.count(needs)
+    d, features = needs.degrees_of_freedom, c_networks.feature_count(needs)
     text = [f"enum {{ D = {d}, FEATURES = {features} }};\n\n/* Typical sizes of qd, qdd and tau */\n"]
     scales = {"qdd": "acceleration_scale", "tau": "tau_scale"}
     for scale in ("rate_scale", *scales.values()):
-        text.append(c_joints.scale_table(description, scale, needs, precision))
-    text.append(c_joints.functions(needs, ("features",)))
+        text.append(c_networks.scale_table(description, scale, needs, precision))
+    text.append(c_networks.feature_functions(needs, ("features",)))
     for quantity, given, wanted in (("inverse", "qdd", "tau"), ("forward", "tau", "qdd")):
         network = c_networks.from_haiku(quantity, parameters, quantity)
         body = Template(_FEED_FORWARD).safe_substitute(

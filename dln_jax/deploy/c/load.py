@@ -84,12 +84,11 @@ def load_c(
             library = ctypes.PyDLL(str(built))
     except OSError as error:
         raise InputError(f"{directory}: not to be built in a temporary folder ({error}); set TMPDIR") from error
-    numpy_type = PRECISIONS[interface["precision"]][0]
-    functions = {key: getattr(library, f"{name}_{key}") for key in interface["functions"]}
+    numpy_type, declared = PRECISIONS[interface["precision"]][0], interface["functions"]
+    functions = {key: getattr(library, f"{name}_{key}") for key in declared}
     if "d" not in interface:
         return _function(functions, interface["n"], interface["m"], numpy_type)
-    with_velocity = " qd[" in interface["functions"].get("mass_matrix", ["", ""])[1]
-    return _dynamics(functions, interface["d"], numpy_type, with_velocity)
+    return _dynamics(functions, interface["d"], numpy_type, " qd[" in declared.get("mass_matrix", ["", ""])[1])
 
 
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:

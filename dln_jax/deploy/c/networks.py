@@ -1,4 +1,6 @@
-"""Multilayer perceptrons as C functions: value, rate along a direction, pull-back of a covector, curvature.
+"""Networks as C functions: value, rate along a direction, pull-back of a covector, curvature; and their inputs.
+
+What a network sees of the coordinates is `models.features.joint_features`.
 
 The layer rules are those of `nn.differential_mlp`. With a_l = h_(l-1) W_l + b_l and h_l = g(a_l):
 
@@ -11,11 +13,13 @@ Hidden layers are padded with units of zero weight to a multiple of 8, so that a
 
 from collections.abc import Iterable
 from textwrap import indent
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dln_jax.deploy.c.text import table
+from dln_jax.models.black_box import per_coordinate
+from dln_jax.types import Needs
 
 _LANES = 8
 # What is below a layer, where that is the first.
@@ -27,6 +31,21 @@ _SCALE_ADJOINT = "for (int k = 0; k < {width}; ++k) adjoint_{l}[k] *= trace->slo
 _BACK = "dots_{below}_{width}({weight}, adjoint_{l}, {adjoint});\n"
 _OUTPUT = "dots_{width}_{below}({weight}, {h}, y);\nfor (int k = 0; k < {width}; ++k) y[k] += {bias}[k];\n"
 _OUTPUT_RATE = "dots_{width}_{below}({weight}, {h_rate}, y_rate);\n"
+
+_FEATURES = {
+    "features": """
+/* cos of the revolute joints, sin of them, then the prismatic ones */
+static void features(const real *restrict q, real *restrict x)
+""",
+    "feature_rates": """
+/* Rate of the features x where q changes at qd */
+static void feature_rates(const real *restrict x, const real *restrict qd, real *restrict x_rate)
+""",
+    "pull_back_features": """
+/* sum_k x_adjoint[k] dx_k/dq */
+static void pull_back_features(const real *restrict x, const real *restrict x_adjoint, real *restrict force)
+""",
+}
 
 
 class Network(NamedTuple):
@@ -51,6 +70,37 @@ class Network(NamedTuple):
     def last(self) -> int:
         """Number of the output layer; the hidden ones are from 1."""
         return len(self.layers)
+
+
+def feature_count(needs: Needs) -> int:
+    """Number of features."""
+    return sum(2 if joint == "revolute" else 1 for joint in needs.joints)
+
+
+def scale_table(description: dict[str, Any], scale: str, needs: Needs, precision: str) -> str:
+    """The sizes by which a model divides, one for each coordinate."""
+    size = description[scale]
+    return table(scale, per_coordinate(needs, scale, tuple(size) if isinstance(size, list) else size), precision)
+
+
+def feature_functions(needs: Needs, names: Iterable[str] = _FEATURES) -> str:
+    """Definitions of `features(q, x)`, `feature_rates(x, qd, x_rate)` and `pull_back_features(x, x_adjoint, force)`."""
+    revolute, prismatic = (
+        [joint for joint, kind in enumerate(needs.joints) if kind == wanted] for wanted in ("revolute", "prismatic")
+    )
+    n = len(revolute)
+    # Lines of each function; without a revolute joint, two of them do not use x.
+    values, rates, forces = [], [] if n else ["(void)x;"], [] if n else ["(void)x;"]
+    for k, joint in enumerate(revolute):
+        values += [f"x[{k}] = cos${{f}}(q[{joint}]);", f"x[{n + k}] = sin${{f}}(q[{joint}]);"]
+        rates += [f"x_rate[{k}] = -x[{n + k}] * qd[{joint}];", f"x_rate[{n + k}] = x[{k}] * qd[{joint}];"]
+        forces.append(f"force[{joint}] = x[{k}] * x_adjoint[{n + k}] - x[{n + k}] * x_adjoint[{k}];")
+    for k, joint in enumerate(prismatic, start=2 * n):
+        values.append(f"x[{k}] = q[{joint}];")
+        rates.append(f"x_rate[{k}] = qd[{joint}];")
+        forces.append(f"force[{joint}] = x_adjoint[{k}];")
+    lines = dict(zip(_FEATURES, (values, rates, forces), strict=True))
+    return "".join(_FEATURES[name] + "{\n" + "".join(f"    {line}\n" for line in lines[name]) + "}\n" for name in names)
 
 
 def from_haiku(name: str, parameters, module: str) -> Network:

@@ -8,7 +8,6 @@ given) as `force`.
 from string import Template
 from typing import Any
 
-from dln_jax.deploy.c import joints as c_joints
 from dln_jax.deploy.c import networks as c_networks
 from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table, number
@@ -194,12 +193,12 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
     shared = "energies/~/linear_0" in parameters
     factor = c_networks.from_haiku("factor", parameters, "energies" if shared else "cholesky")
     friction = c_networks.friction_from_haiku(parameters)
-    entries = needs.degrees_of_freedom * (needs.degrees_of_freedom + 1) // 2
-    head = f"enum {{ D = {needs.degrees_of_freedom}, FEATURES = {c_joints.count(needs)}, ENTRIES = {entries} }};\n"
+    d, features = needs.degrees_of_freedom, c_networks.feature_count(needs)
+    head = f"enum {{ D = {d}, FEATURES = {features}, ENTRIES = {d * (d + 1) // 2} }};\n"
     for constant in ("diagonal_shift", "diagonal_floor"):
         head += f"#define {constant.upper()} {number(float(description[constant]), precision)}\n"
     networks = c_networks.tables(factor, precision)
-    functions = c_joints.functions(needs) + c_networks.trace(factor)
+    functions = c_networks.feature_functions(needs) + c_networks.trace(factor)
     functions += c_networks.value(factor) + c_networks.rates(factor) + c_networks.pull_back(factor)
     trace, result, value = "", "", ""
     pull_back = "    adjoint[ENTRIES] = 1; /* the potential */\n" * shared
