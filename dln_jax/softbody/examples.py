@@ -69,14 +69,12 @@ def beam(
     """
     if mesh is None:
         _require_dimension(dimension)
-        mesh = (
-            beam_mesh(4.0, 1.0, 4 * cells, cells) if dimension == 2 else box((4.0, 1.0, 1.0), (4 * cells, cells, cells))
-        )
+        flat = dimension == 2
+        mesh = beam_mesh(4.0, 1.0, 4 * cells, cells) if flat else box((4.0, 1.0, 1.0), (4 * cells, cells, cells))
     if held is None:
         left, extent = mesh.vertices[:, 0].min(), np.ptp(mesh.vertices[:, 0])
         held = vertices_where(mesh, lambda x: x[:, 0] <= left + 1e-9 * extent)
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh)]
-    scene = make_scene(mesh, terms, density=DENSITY, held=held)
+    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), held=held)
     return Example(scene, dt=1 / 60, seconds=6.0, moments=(0.0, 0.4, 0.7, 1.0))
 
 
@@ -95,7 +93,7 @@ def twist(
     """
     mesh = box((1.0, 8.0, 1.0), (cells, 8 * cells, cells))
     held = vertices_where(mesh, lambda x: (x[:, 1] == 0.0) | (x[:, 1] == 8.0))
-    scene = make_scene(mesh, [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio)], density=DENSITY, held=held)
+    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), held=held)
     x, y, z = (mesh.vertices[held] - [0.5, 0.0, 0.5]).T
 
     def path(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k dim"]:
@@ -121,8 +119,7 @@ def slope(
     normal = np.array([-along[1], along[0]])
     mesh = mesh._replace(vertices=mesh.vertices[:, :1] * along + mesh.vertices[:, 1:] * normal)
     ground = _ground(mesh, friction, height=0.5, normal=normal)
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
-    scene = make_scene(mesh, terms, density=DENSITY)
+    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground)
     return Example(scene, dt=1 / 120, seconds=2.0, ground=SLOPE, moments=(0.0, 0.7, 1.2, 1.6, 2.0))
 
 
@@ -151,8 +148,7 @@ def drop(
     lift[-1] = height - mesh.vertices[:, -1].min()
     mesh = mesh._replace(vertices=mesh.vertices + lift)
     ground = _ground(mesh, friction, height=height, normal=np.eye(mesh.dimension)[-1])
-    terms = [_solid(mesh, strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground]
-    scene = make_scene(mesh, terms, density=DENSITY)
+    scene = _solid(mesh, (strain_energy, youngs_modulus, poisson_ratio), gravity(mesh), ground)
     arms = mesh.vertices - np.average(mesh.vertices, axis=0, weights=np.asarray(scene.params.masses))
     v = np.zeros_like(arms)
     v[:, 0], v[:, -1] = arms[:, -1], -arms[:, 0]
@@ -177,42 +173,25 @@ def creature() -> Example:
     def control(t: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T k"]:
         return mean + amplitude * np.sin(2 * np.pi * t[:, None] / WAVE_PERIOD + phase)
 
-    return Example(
-        scene,
-        dt=TIME_STEP,
-        seconds=6.0,
-        ground=0.0,
-        control=control,
-        muscles=body.muscles,
-        moments=(0.0, 3.0, 6.0),
-    )
+    moments = (0.0, 3.0, 6.0)
+    return Example(scene, TIME_STEP, 6.0, ground=0.0, control=control, muscles=body.muscles, moments=moments)
 
 
-EXAMPLES: dict[str, Callable[..., Example]] = {
-    "beam": beam,
-    "twist": twist,
-    "slope": slope,
-    "drop": drop,
-    "creature": creature,
-}
+EXAMPLES: dict[str, Callable[..., Example]] = {each.__name__: each for each in (beam, twist, slope, drop, creature)}
 """By name; their keyword arguments are what can be chosen."""
 
 
-def _solid(mesh: Mesh, density: StrainEnergy, youngs_modulus: float, poisson_ratio: float) -> Term:
-    return elastic(mesh, density, youngs_modulus=youngs_modulus, poisson_ratio=poisson_ratio)
+def _solid(mesh: Mesh, law: tuple[StrainEnergy, float, float], *others: Term, held: ArrayLike = ()) -> SoftScene:
+    """An elastic body, by its density of strain energy, E and nu, and what else acts on it."""
+    material = elastic(mesh, law[0], youngs_modulus=law[1], poisson_ratio=law[2])
+    return make_scene(mesh, [material, *others], density=DENSITY, held=held)
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:
     """A plane so stiff that a single vertex that carries the whole body sinks a thousandth of its height."""
-    weight = GRAVITY * float(lumped_masses(mesh, DENSITY).sum())
-    return plane_contact(
-        np.arange(len(mesh.vertices)),
-        normal=normal,
-        stiffness=1e3 * weight / height,
-        width=1e-3 * height,
-        friction=friction,
-        name="ground",
-    )
+    stiffness = 1e3 * (GRAVITY * float(lumped_masses(mesh, DENSITY).sum())) / height
+    every = np.arange(len(mesh.vertices))
+    return plane_contact(every, normal=normal, stiffness=stiffness, width=1e-3 * height, friction=friction)
 
 
 def _tilted(mesh: Mesh, random: np.random.Generator) -> Mesh:

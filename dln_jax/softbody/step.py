@@ -13,6 +13,7 @@ order and does not damp, so that it is for smooth motions.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -77,21 +78,6 @@ TOLERANCE = 1e-6
 """Default largest force that is left over, per mass, in m/s²; Newton's last step usually takes it far below."""
 
 
-class _Inertia(NamedTuple):
-    weight: Float[Array, " n"]
-    """m / h² in N/m."""
-    target: Float[Array, "n dim"]
-    """y in m."""
-
-
-def incremental_potential(scene: SoftScene) -> tuple[ElementEnergy, ...]:
-    """Inertia and the scene's terms, as energies whose data are an inertia's and the terms'."""
-    return (
-        ElementEnergy(_inertia, np.arange(len(scene.mesh.vertices))[:, None], written_out=True),
-        *element_energies(scene),
-    )
-
-
 class Stepper(NamedTuple):
     """A time step, and the states that fit it."""
 
@@ -126,8 +112,9 @@ def make_step(
     """
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
-    energies = incremental_potential(scene)
     free = scene.free
+    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
+    solve = partial(minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver)
     at = pattern(energies, free.shape[0], free.shape[1], free)
 
     def init(x: Any = None, v: Any = None) -> State:
@@ -142,23 +129,13 @@ def make_step(
     def step(params: Params, state: State, control: Any = None) -> tuple[State, Info]:
         h, target = integrator.target(state, dt)
         span = jnp.asarray(integrator.span * dt, state.x.dtype)
-        inertia = _Inertia(params.masses / jnp.asarray(h, state.x.dtype) ** 2, target)
-        data = (inertia, *prepare(scene, params, state.x, dt=span, control=control))
+        weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
+        data = ((weights, target), *prepare(scene, params, state.x, dt=span, control=control))
         carried = state.x + span * state.v
         # The better of two starts: where the body is, or where it would be without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
-        x, info = minimise(
-            energies,
-            start,
-            data,
-            free=free,
-            scale=params.masses,
-            tolerance=tolerance,
-            iterations=iterations,
-            linear_solver=linear_solver,
-            at=at,
-        )
+        x, info = solve(energies, start, data, scale=params.masses, at=at)
         x, v = integrator.finish(state, x, dt)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
         return State(jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v), before), info
@@ -188,22 +165,15 @@ def static_solve(
         params: of the scene.
         control: actuation, for scenes that have one.
         x: where the search starts; held vertices stay there.
-        tolerance: largest force left over per mass, in m/s²; rounding always counts as balanced.
-        iterations: Newton steps after which the search gives up, which `Info.converged` reports.
-        linear_solver: how linear systems are solved; by size unless said.
+        tolerance, iterations, linear_solver: as of `make_step`.
     """
     x = params.rest if x is None else x
-    return minimise(
-        element_energies(scene),
-        x,
-        prepare(scene, params, x, control=control),
-        free=scene.free,
-        scale=params.masses,
-        tolerance=tolerance,
-        iterations=iterations,
-        linear_solver=linear_solver,
-    )
+    data = prepare(scene, params, x, control=control)
+    limits: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
+    return minimise(element_energies(scene), x, data, free=scene.free, scale=params.masses, **limits)
 
 
-def _inertia(x: Corners, data: _Inertia) -> Float[Array, ""]:
-    return 0.5 * data.weight * sum((coordinate - data.target[i]) ** 2 for i, coordinate in enumerate(x[0]))
+def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:
+    """½ m/h² |x - y|² of one vertex."""
+    weight, target = weight_and_target
+    return 0.5 * weight * sum((coordinate - target[i]) ** 2 for i, coordinate in enumerate(x[0]))

@@ -61,9 +61,6 @@ def _drawn(name: str, size: float, *rows: str) -> Creature:
             vertices.append([x + 1 - POINT, y + 0.5])
     mesh = make_mesh(size * np.array(vertices, dtype=np.float64), triangles)
     skin = boundary(mesh)
-    return Creature(name, mesh, _left_to_right(mesh, skin[(mesh.vertices[skin, 1] > 0).any(axis=1)]))
-
-
-def _left_to_right(mesh: Mesh, pairs: np.ndarray) -> np.ndarray:
-    middle = mesh.vertices[pairs].mean(axis=1)
-    return np.sort(pairs, axis=1)[np.lexsort((middle[:, 1], middle[:, 0]))]
+    pairs = skin[(mesh.vertices[skin, 1] > 0).any(axis=1)]
+    x, y = mesh.vertices[pairs].mean(axis=1).T
+    return Creature(name, mesh, np.sort(pairs, axis=1)[np.lexsort((y, x))])

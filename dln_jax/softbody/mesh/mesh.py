@@ -1,7 +1,7 @@
 """Meshes of simplices: triangles in the plane, tetrahedra in space.
 
 Static NumPy arrays in float64: what a simulation compiles in. A body in the plane is 1 m thick: its areas in m² count
-as volumes in m³. `softbody/simplices.py` has the volumes for a rest shape that one differentiates by.
+as volumes in m³. `mesh/simplices.py` has the volumes for a rest shape that one differentiates by.
 """
 
 import itertools
@@ -118,8 +118,7 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
         raise InputError(
             f"density has shape {list(densities.shape)}; expected one number or [{m}], one for each element"
         )
-    right = (densities > 0) & np.isfinite(densities)
-    if not right.all():
+    if not (right := (densities > 0) & np.isfinite(densities)).all():
         bad = int(np.argmin(right))
         where = f" of element {bad}" if densities.ndim else ""
         raise InputError(f"density{where} is {densities.flat[bad]}; expected a positive number, in kg/m³")

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -22,25 +22,30 @@ def simplex_volumes(
     Takes NumPy and JAX arrays alike, so that it can be differentiated by the rest shape.
     """
     corners = vertices[elements]
-    return determinants(corners[:, 1:] - corners[:, :1]) / math.factorial(vertices.shape[1])
+    return determinant((corners[:, 1:] - corners[:, :1]).transpose(1, 2, 0)) / math.factorial(vertices.shape[1])
 
 
-def determinants(matrices: Float[AnyArray, "m dim dim"]) -> Float[AnyArray, " m"]:
-    """Of 2 x 2 or 3 x 3 matrices."""
-    if matrices.shape[1] == 2:
-        (a, b), (c, d) = ([matrices[:, i, j] for j in range(2)] for i in range(2))
-        return a * d - b * c
-    (a, b, c), (d, e, f), (g, h, k) = ([matrices[:, i, j] for j in range(3)] for i in range(3))
-    return a * (e * k - f * h) - b * (d * k - f * g) + c * (d * h - e * g)
+def determinant(F: Any) -> Any:
+    """Of a 2 x 2 or 3 x 3 matrix by its rows; entries are scalars, or arrays of as many as there are matrices."""
+    if len(F) == 2:
+        return F[0][0] * F[1][1] - F[0][1] * F[1][0]
+    cofactor = cofactors(F)
+    return F[0][0] * cofactor[0][0] + F[0][1] * cofactor[0][1] + F[0][2] * cofactor[0][2]
 
 
-def longest_edges(
-    vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]
-) -> Float[np.ndarray, " m"]:
-    """Length of each element's longest edge, in m."""
-    corners = vertices[elements]
-    pairs = itertools.combinations(range(elements.shape[1]), 2)
-    return np.max([np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in pairs], axis=0)
+def cofactors(F: Any) -> list[list[Any]]:
+    """Rows of cof F = det F F⁻ᵀ."""
+    if len(F) == 2:
+        return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
+    # Taking the indices cyclically gives the signs.
+    return [
+        [
+            F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
+            - F[(i + 1) % 3][(j + 2) % 3] * F[(i + 2) % 3][(j + 1) % 3]
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
 
 
 def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> Float[np.ndarray, " m"]:
@@ -48,12 +53,12 @@ def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "
 
     1 for a regular simplex, 0 for a flat one, negative for an inverted one; 0 also where all corners coincide.
     """
-    dim = vertices.shape[1]
-    longest = longest_edges(vertices, elements)
+    dim, corners = vertices.shape[1], vertices[elements]
+    pairs = itertools.combinations(range(dim + 1), 2)
+    longest = np.max([np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in pairs], axis=0)
     scale = np.where(longest > 0, longest, 1.0)
-    corners = vertices[elements]
     # Scaled before it is multiplied, so that no size of the mesh overflows or underflows.
-    shape = determinants((corners[:, 1:] - corners[:, :1]) / scale[:, None, None])
+    shape = determinant(((corners[:, 1:] - corners[:, :1]) / scale[:, None, None]).transpose(1, 2, 0))
     return shape / math.sqrt((dim + 1) / 2**dim)
 
 

@@ -24,8 +24,7 @@ def as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise InputError(f"vertices has shape {list(array.shape)}; expected [n, 2] (plane) or [n, 3] (space)")
     array = array.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
+    if (bad := np.flatnonzero(~np.isfinite(array).all(axis=1))).size:
         raise InputError(f"vertex {bad[0]} is at {array[bad[0]].tolist()}; expected finite numbers{_others(bad)}")
     return array
 
@@ -47,11 +46,17 @@ def as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
 def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> None:
     """Raises `InputError` unless the elements form a mesh: valid indices, volumes, none twice, none dangling."""
     _require_indices(vertices, elements)
-    _require_volumes(vertices, elements)
+    kind, measure = WORDS[vertices.shape[1]]
+    shape = regularity(vertices, elements)
+    if (bad := np.flatnonzero(np.abs(shape) <= FLAT)).size:
+        raise InputError(
+            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
+            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
+            f"leave it out, merge its corners or move one{_others(bad)}"
+        )
     used = np.zeros(len(vertices), bool)
     used[elements] = True
-    bad = np.flatnonzero(~used)
-    if bad.size:
+    if (bad := np.flatnonzero(~used)).size:
         raise InputError(
             f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
         )
@@ -68,8 +73,7 @@ def oriented(
 
 def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
     n = len(vertices)
-    bad = np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))
-    if bad.size:
+    if (bad := np.flatnonzero(((elements < 0) | (elements >= n)).any(axis=1))).size:
         corners = elements[bad[0]]
         wrong = corners[(corners < 0) | (corners >= n)][0]
         raise InputError(
@@ -78,8 +82,7 @@ def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
         )
     ordered = np.sort(elements, axis=1)
     same = ordered[:, 1:] == ordered[:, :-1]
-    bad = np.flatnonzero(same.any(axis=1))
-    if bad.size:
+    if (bad := np.flatnonzero(same.any(axis=1))).size:
         twice = ordered[bad[0], 1:][same[bad[0]]][0]
         raise InputError(
             f"element {bad[0]} has corner {twice} twice: {elements[bad[0]].tolist()}; "
@@ -87,21 +90,8 @@ def _require_indices(vertices: np.ndarray, elements: np.ndarray) -> None:
         )
     _, first, inverse = np.unique(ordered, axis=0, return_index=True, return_inverse=True)
     original = first[inverse.reshape(-1)]
-    bad = np.flatnonzero(original != np.arange(len(elements)))
-    if bad.size:
+    if (bad := np.flatnonzero(original != np.arange(len(elements)))).size:
         raise InputError(f"element {bad[0]} is a duplicate of element {original[bad[0]]}; remove one{_others(bad)}")
-
-
-def _require_volumes(vertices: np.ndarray, elements: np.ndarray) -> None:
-    kind, measure = WORDS[vertices.shape[1]]
-    shape = regularity(vertices, elements)
-    bad = np.flatnonzero(np.abs(shape) <= FLAT)
-    if bad.size:
-        raise InputError(
-            f"element {bad[0]} is degenerate: the {measure} of {kind} {elements[bad[0]].tolist()} is "
-            f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
-            f"leave it out, merge its corners or move one{_others(bad)}"
-        )
 
 
 def _as_array(name: str, value: ArrayLike) -> np.ndarray:

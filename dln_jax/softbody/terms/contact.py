@@ -1,4 +1,4 @@
-"""Contact of vertices with rigid surfaces, by a smooth penalty, and the friction there.
+"""Contact of vertices with rigid surfaces by a smooth penalty, and Coulomb friction there, smooth and lagged.
 
     V = k phi(d),   phi = 0 for d >= 0,  -d³/(6 w) for -w <= d < 0,  d²/2 + w d/2 + w²/6 for d < -w
 
@@ -6,27 +6,40 @@ with the signed distance d to the surface. phi is twice continuously differentia
 at a depth where k |phi'(d)| carries its weight. Contact and friction are one term, since they share the parameters
 of the surface: friction takes its normal force from the same k, by which it can be differentiated. A contact
 without a friction coefficient computes no friction.
+
+    D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
+
+after Li et al. 2020 (Incremental Potential Contact, section 5), with their constant chosen such that f(0) = 0, and
+normals n and normal forces lambda_n at the start of the step. The force is mu lambda_n against the slip from the
+threshold speed e/dt on, and falls smoothly to zero below it: a block that "sticks" on a slope creeps at less than the
+threshold. f is twice continuously differentiable. The slip e must be well above the rounding of the positions: in
+float32, 1e-4 m for a body of a metre.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.terms.friction import Slip, friction_energy, lagged_slip
-from dln_jax.softbody.terms.parameters import (
+from dln_jax.softbody.terms.term import (
     NOT_NEGATIVE,
+    Context,
+    Corners,
     Indices,
     Numbers,
+    Term,
     material,
     require_dimension,
     vector,
     vertex_list,
 )
-from dln_jax.softbody.terms.term import Context, Corners, Term
 from dln_jax.types import Scalar, require_positive
+
+# Squared slip over squared threshold, below which the cubic part of f is beyond rounding and its derivatives overflow.
+_NO_SLIP = 1e-16
 
 
 class PlaneContact(NamedTuple):
@@ -51,20 +64,17 @@ class DistanceContact(NamedTuple):
     """Coefficient of friction, or `None`."""
 
 
-class PlaneVertex(NamedTuple):
-    """What the contact of one vertex with a plane needs; [m, ...] for all."""
+class Slip(NamedTuple):
+    """What the friction of one vertex needs; [m, ...] for all."""
 
+    start: Float[Array, "*m dim"]
+    """Position x_n at the start of the step, in m."""
     normal: Float[Array, "*m dim"]
-    offset: Float[Array, "*m"]
-    stiffness: Float[Array, "*m"]
-    slip: Slip | None
-
-
-class DistanceVertex(NamedTuple):
-    """What the contact of one vertex with a surface needs; [m, ...] for all."""
-
-    stiffness: Float[Array, "*m"]
-    slip: Slip | None
+    """Unit normal n there."""
+    force: Float[Array, "*m"]
+    """Largest friction mu lambda_n, in N."""
+    threshold: Float[Array, "*m"]
+    """Slip e in a step from which friction is at its largest, in m."""
 
 
 def plane_contact(
@@ -81,34 +91,28 @@ def plane_contact(
     """Contact with the half-space n·x < offset, for the unit normal n.
 
     Stiffness k in N/m; width w in m, where 0 means ½ k d² below the plane, which is only once continuously
-    differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s (`friction.py`).
+    differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s.
     """
     indices = vertex_list("vertices in contact", vertices)
-    _require_widths(width, threshold_speed)
     parameters = PlaneContact(
         vector("the normal of a plane", normal, zero_allowed=False),
         jnp.asarray(offset, dtype=float),
         *_contact_parameters(stiffness, friction, len(indices)),
     )
 
-    def prepare(parameters: PlaneContact, context: Context) -> PlaneVertex:
-        x = context.x[indices[:, 0]]
+    def surface(parameters: PlaneContact, x: Array) -> tuple[Array, Array]:
         require_dimension("the normal of a plane", parameters.normal.shape[0], x.shape[1])
         normal = parameters.normal / jnp.sqrt(jnp.sum(parameters.normal**2))
-        normals = jnp.broadcast_to(normal, x.shape)
-        offset, stiffness = (jnp.broadcast_to(value, len(x)) for value in (parameters.offset, parameters.stiffness))
-        slip = None
-        if parameters.friction is not None:
-            force = stiffness * penalty_force(jnp.sum(x * normal, axis=1) - offset, width)
-            slip = lagged_slip(context, x, normals, force, parameters.friction, threshold_speed)
-        return PlaneVertex(normals, offset, stiffness, slip)
+        return jnp.broadcast_to(normal, x.shape), jnp.broadcast_to(parameters.offset, len(x))
 
-    def energy(x: Corners, vertex: PlaneVertex) -> Scalar:
-        height = sum(vertex.normal[i] * coordinate for i, coordinate in enumerate(x[0])) - vertex.offset
-        contact = vertex.stiffness * penalty(jnp.asarray(height), width)
-        return contact if vertex.slip is None else contact + friction_energy(x[0], vertex.slip)
+    def height(x: Any, plane: tuple[Array, Array]) -> Scalar:
+        return jnp.asarray(sum(plane[0][i] * coordinate for i, coordinate in enumerate(x)) - plane[1])
 
-    return Term(name, indices, energy, parameters, prepare)
+    def touched(x: Array, plane: tuple[Array, Array]) -> tuple[Array, Array, float]:
+        normals, offsets = plane
+        return jnp.sum(x * normals, axis=1) - offsets, normals, 1.0
+
+    return _contact(name, indices, parameters, surface, height, touched, width, threshold_speed)
 
 
 def distance_contact(
@@ -127,26 +131,18 @@ def distance_contact(
     gradient at the start of the step; where that vanishes (the centre of a ball), there is none.
     """
     indices = vertex_list("vertices in contact", vertices)
-    _require_widths(width, threshold_speed)
     parameters = DistanceContact(*_contact_parameters(stiffness, friction, len(indices)))
 
-    def prepare(parameters: DistanceContact, context: Context) -> DistanceVertex:
-        stiffness = jnp.broadcast_to(parameters.stiffness, len(indices))
-        slip = None
-        if parameters.friction is not None:
-            x = context.x[indices[:, 0]]
-            depth, slope = jax.vmap(jax.value_and_grad(distance))(x)
-            squared = jnp.sum(slope**2, axis=1)
-            steep = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-            force = jnp.where(squared > 0, stiffness * penalty_force(depth, width) * steep, 0.0)
-            slip = lagged_slip(context, x, slope / steep[:, None], force, parameters.friction, threshold_speed)
-        return DistanceVertex(stiffness, slip)
+    def touched(x: Array, _: None) -> tuple[Array, Array, Array]:
+        depth, slope = jax.vmap(jax.value_and_grad(distance))(x)
+        squared = jnp.sum(slope**2, axis=1)
+        steep = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        return depth, slope / steep[:, None], jnp.where(squared > 0, steep, 0.0)
 
-    def energy(x: Corners, vertex: DistanceVertex) -> Scalar:
-        contact = vertex.stiffness * penalty(distance(jnp.stack(x[0])), width)
-        return contact if vertex.slip is None else contact + friction_energy(x[0], vertex.slip)
+    def depth(x: Any, _: None) -> Scalar:
+        return distance(jnp.stack(x))
 
-    return Term(name, indices, energy, parameters, prepare)
+    return _contact(name, indices, parameters, lambda *_: None, depth, touched, width, threshold_speed)
 
 
 def penalty(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
@@ -171,7 +167,49 @@ def _contact_parameters(stiffness: Numbers, friction: Numbers | None, count: int
     return material("stiffness", stiffness, count, "vertex"), friction
 
 
-def _require_widths(width: float, threshold_speed: float) -> None:
+def _contact(
+    name: str,
+    indices: np.ndarray,
+    parameters: Any,
+    surface: Callable[[Any, Array], Any],
+    distance: Callable[[Any, Any], Scalar],
+    touched: Callable[[Array, Any], tuple],
+    width: float,
+    threshold_speed: float,
+) -> Term:
+    """The term of a surface: what of it each vertex needs, the distance, and (distance, normal, steepness) of all."""
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
+
+    def prepare(parameters: Any, context: Context) -> tuple[Any, Array, Slip | None]:
+        x = context.x[indices[:, 0]]
+        near, stiffness = surface(parameters, x), jnp.broadcast_to(parameters.stiffness, len(x))
+        if parameters.friction is None:
+            return near, stiffness, None
+        depth, normal, steepness = touched(x, near)
+        force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
+        # A static solve (dt infinite) has no velocities: there is no friction in it.
+        moving = jnp.isfinite(context.dt)
+        threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
+        slip = Slip(x, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, len(x)))
+        return near, stiffness, slip
+
+    def energy(x: Corners, vertex: tuple[Any, Array, Slip | None]) -> Scalar:
+        near, stiffness, slip = vertex
+        contact = stiffness * penalty(distance(x[0], near), width)
+        return contact if slip is None else contact + _friction_energy(x[0], slip)
+
+    return Term(name, indices, energy, parameters, prepare)
+
+
+def _friction_energy(x: Any, slip: Slip) -> Scalar:
+    """D in J of one vertex."""
+    axes = range(len(x))
+    moved = [x[i] - slip.start[i] for i in axes]
+    along = sum(moved[i] * slip.normal[i] for i in axes)
+    ratio = jnp.asarray(sum((moved[i] - along * slip.normal[i]) ** 2 for i in axes)) / slip.threshold**2
+    slipping = ratio > _NO_SLIP
+    root = jnp.sqrt(jnp.where(slipping, ratio, 1.0))
+    cubic = jnp.where(slipping, ratio * root, 0.0)
+    return slip.force * (slip.threshold * jnp.where(ratio < 1.0, ratio - cubic / 3.0, root - 1.0 / 3.0))

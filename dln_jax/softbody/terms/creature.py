@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
+from dln_jax.softbody.mesh.simplices import determinant
 from dln_jax.softbody.terms.elasticity import deformation_gradient, rest_geometry
 from dln_jax.softbody.terms.gravity import gravity as weight
-from dln_jax.softbody.terms.parameters import NOT_NEGATIVE, Indices, Numbers, material
 from dln_jax.softbody.terms.springs import muscles as driven_springs
-from dln_jax.softbody.terms.strain_energies import DeformationGradient, determinant, squared_norm
-from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.softbody.terms.strain_energies import squared_norm
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices, Numbers, Term, material
 from dln_jax.types import InputError, Scalar
 
 MASS = 6.0714288
@@ -55,24 +55,6 @@ class CreatureGround(NamedTuple):
     """k_f in kg/m."""
 
 
-class CreatureTriangle(NamedTuple):
-    """What one triangle's energy needs; [m, ...] for all."""
-
-    shape_gradients: Float[Array, "*m 3 2"]
-    mu: Float[Array, "*m"]
-    lam: Float[Array, "*m"]
-
-
-class CreatureVertex(NamedTuple):
-    """What one vertex on the ground needs; [n] for all."""
-
-    stiffness: Float[Array, "*n"]
-    drag: Float[Array, "*n"]
-    """k_f (0.01 - y_n)/h², in J/m²."""
-    start: Float[Array, "*n"]
-    """Coordinate x_n along the ground, in m."""
-
-
 def creature_terms(
     mesh: Mesh,
     muscles: Indices,
@@ -98,43 +80,39 @@ def creature_terms(
     )
 
 
-def creature_density(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
-    """½ mu (I1 - 2) - mu s(J) + ½ lambda s(J)², in J."""
-    change = determinant(F) - 1.0
-    strain = change - 0.5 * change**2
-    return 0.5 * mu * (squared_norm(F) - 2.0) - mu * strain + 0.5 * lam * strain**2
-
-
 def _triangles(mesh: Mesh, mu: Numbers, lam: Numbers) -> Term:
     count = len(mesh.elements)
     parameters = CreatureMaterial(
-        material("mu", mu, count, "element"),
-        material("lam", lam, count, "element", NOT_NEGATIVE),
+        material("mu", mu, count, "element"), material("lam", lam, count, "element", NOT_NEGATIVE)
     )
 
-    def prepare(parameters: CreatureMaterial, context: Context) -> CreatureTriangle:
+    def prepare(parameters: CreatureMaterial, context: Context) -> tuple[Array, ...]:
         gradients, _ = jax.vmap(rest_geometry)(context.rest[mesh.elements])
-        return CreatureTriangle(gradients, *(jnp.broadcast_to(value, count) for value in parameters))
+        return gradients, *(jnp.broadcast_to(value, count) for value in parameters)
 
-    def energy(x: Corners, triangle: CreatureTriangle) -> Scalar:
-        return creature_density(deformation_gradient(x, triangle.shape_gradients), triangle.mu, triangle.lam)
+    def energy(x: Corners, triangle: tuple[Array, ...]) -> Scalar:
+        """½ mu (I1 - 2) - mu s(J) + ½ lambda s(J)², in J."""
+        gradients, mu, lam = triangle
+        F = deformation_gradient(x, gradients)
+        change = determinant(F) - 1.0
+        strain = change - 0.5 * change**2
+        return 0.5 * mu * (squared_norm(F) - 2.0) - mu * strain + 0.5 * lam * strain**2
 
     return Term("elastic", mesh.elements, energy, parameters, prepare)
 
 
 def _ground(count: int, stiffness: Numbers, friction: Numbers) -> Term:
-    parameters = CreatureGround(
-        material("ground_stiffness", stiffness, count, "vertex"),
-        material("ground_friction", friction, count, "vertex", NOT_NEGATIVE),
-    )
+    rough = material("ground_friction", friction, count, "vertex", NOT_NEGATIVE)
+    parameters = CreatureGround(material("ground_stiffness", stiffness, count, "vertex"), rough)
 
-    def prepare(parameters: CreatureGround, context: Context) -> CreatureVertex:
-        x, y = context.x[:, 0], context.x[:, 1]
+    def prepare(parameters: CreatureGround, context: Context) -> tuple[Array, ...]:
+        x, y = context.x.T
         drag = parameters.friction * jnp.maximum(FRICTION_HEIGHT - y, 0.0) / context.dt**2
-        return CreatureVertex(jnp.broadcast_to(parameters.stiffness, count), drag, x)
+        return jnp.broadcast_to(parameters.stiffness, count), drag, x
 
-    def energy(x: Corners, vertex: CreatureVertex) -> Scalar:
-        along, height = x[0][0] - vertex.start, x[0][1]
-        return vertex.stiffness * jnp.where(height < 0, height**2, 0.0) + vertex.drag * along**2
+    def energy(x: Corners, vertex: tuple[Array, ...]) -> Scalar:
+        stiffness, drag, start = vertex
+        along, height = x[0][0] - start, x[0][1]
+        return stiffness * jnp.where(height < 0, height**2, 0.0) + drag * along**2
 
     return Term("ground", np.arange(count)[:, None], energy, parameters, prepare)

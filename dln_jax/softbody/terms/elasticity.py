@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.parameters import Bound, Numbers, material
-from dln_jax.softbody.terms.strain_energies import StrainEnergy, cofactors, determinant
-from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.softbody.mesh.simplices import cofactors, determinant
+from dln_jax.softbody.terms.strain_energies import StrainEnergy
+from dln_jax.softbody.terms.term import Bound, Context, Corners, Numbers, Term, material
 from dln_jax.types import Scalar
 
 _POISSON_BOUND = Bound(
@@ -31,19 +31,6 @@ class Material(NamedTuple):
     """E in Pa."""
     poisson_ratio: Float[Array, "..."]
     """nu, between -1 and 0.5."""
-
-
-class ElasticElement(NamedTuple):
-    """What one element's energy needs; [m, ...] for all."""
-
-    shape_gradients: Float[Array, "*m corners dim"]
-    """Gradients of the linear shape functions in the rest shape, in 1/m: F = sum over corners of x_k (grad N_k)ᵀ."""
-    volume: Float[Array, "*m"]
-    """In m³, or m² in 2-D; negative if the rest shape is inverted."""
-    mu: Float[Array, "*m"]
-    """In Pa."""
-    lam: Float[Array, "*m"]
-    """In Pa."""
 
 
 def elastic(
@@ -66,26 +53,25 @@ def elastic(
         material("poisson_ratio", poisson_ratio, count, "element", _POISSON_BOUND),
     )
 
-    def prepare(parameters: Material, context: Context) -> ElasticElement:
-        gradients, volume = jax.vmap(rest_geometry)(context.rest[mesh.elements])
-        mu, lam = lame_parameters(*parameters)
-        return ElasticElement(gradients, volume, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count))
+    def prepare(parameters: Material, context: Context) -> tuple[Array, ...]:
+        youngs_modulus, poisson_ratio = parameters
+        mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
+        lam = 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
+        geometry = jax.vmap(rest_geometry)(context.rest[mesh.elements])
+        return *geometry, jnp.broadcast_to(mu, count), jnp.broadcast_to(lam, count)
 
-    def energy(x: Corners, element: ElasticElement) -> Scalar:
-        F = deformation_gradient(x, element.shape_gradients)
-        return element.volume * density(F, element.mu, element.lam)
+    def energy(x: Corners, element: tuple[Array, ...]) -> Scalar:
+        gradients, volume, mu, lam = element
+        return volume * density(deformation_gradient(x, gradients), mu, lam)
 
     return Term(name, mesh.elements, energy, parameters, prepare)
 
 
-def lame_parameters(youngs_modulus: Float[Array, "..."], poisson_ratio: Float[Array, "..."]):
-    """(mu, lambda) in Pa, of the solid and of plane strain."""
-    mu = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
-    return mu, 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
-
-
 def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:
-    """Gradients of the shape functions in 1/m, and signed volume, of a simplex; written out and differentiable."""
+    """Gradients of the linear shape functions in 1/m, F = sum over corners of x_k (grad N_k)ᵀ, and signed volume.
+
+    Of a simplex, in m³, or m² in 2-D; written out and differentiable.
+    """
     axes = range(corners.shape[1])
     edges = [[corners[k + 1, i] - corners[0, i] for k in axes] for i in axes]
     size = determinant(edges)

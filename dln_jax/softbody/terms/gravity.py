@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.mesh.mesh import Mesh
-from dln_jax.softbody.terms.parameters import Numbers, require_dimension, vector
-from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.softbody.terms.term import Context, Corners, Numbers, Term, require_dimension, vector
 from dln_jax.types import InputError, Scalar, require_positive
 
 

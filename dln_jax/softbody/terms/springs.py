@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.softbody.terms.parameters import NOT_NEGATIVE, Indices, Numbers, material, vertex_pairs
-from dln_jax.softbody.terms.term import Context, Corners, Term
+from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices, Numbers, Term, material, vertex_pairs
 from dln_jax.types import InputError, Scalar, require_positive
 
 
@@ -26,15 +26,6 @@ class Muscles(NamedTuple):
     """Energy per squared relative strain, in J."""
 
 
-class Spring(NamedTuple):
-    """What the energy of one spring or muscle needs; [m] for all."""
-
-    stiffness: Float[Array, "*m"]
-    """In N/m."""
-    rest_length: Float[Array, "*m"]
-    """In m."""
-
-
 def springs(
     pairs: Indices,
     *,
@@ -51,18 +42,16 @@ def springs(
     is the whole truth for l0 = 0.
     """
     indices = vertex_pairs("pairs of springs", pairs)
-    _require_softening(softening)
     count = len(indices)
-    parameters = Springs(
-        material("stiffness", stiffness, count, "spring"),
-        None if rest_length is None else material("rest_length", rest_length, count, "spring", NOT_NEGATIVE),
-    )
+    if rest_length is not None:
+        rest_length = material("rest_length", rest_length, count, "spring", NOT_NEGATIVE)
+    parameters = Springs(material("stiffness", stiffness, count, "spring"), rest_length)
 
-    def prepare(parameters: Springs, context: Context) -> Spring:
+    def prepare(parameters: Springs, context: Context) -> tuple[Array, Array]:
         length = parameters.rest_length
         if length is None:
-            length = _length(_squared_distances(context, indices), softening)
-        return Spring(jnp.broadcast_to(parameters.stiffness, count), jnp.broadcast_to(length, count))
+            length = _rest_lengths(context, indices, softening)
+        return jnp.broadcast_to(parameters.stiffness, count), jnp.broadcast_to(length, count)
 
     return Term(name, indices, _energy(softening), parameters, prepare)
 
@@ -74,28 +63,31 @@ def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name
     in the order of the pairs. k is in J, and softening in m.
     """
     indices = vertex_pairs("pairs of muscles", pairs)
-    _require_softening(softening)
     count = len(indices)
     parameters = Muscles(material("stiffness", stiffness, count, "muscle"))
 
-    def prepare(parameters: Muscles, context: Context) -> Spring:
+    def prepare(parameters: Muscles, context: Context) -> tuple[Array, Array]:
         actuation = context.control
         if actuation is None or actuation.shape != (count,):
             got = "no control" if actuation is None else f"a control of shape {actuation.shape}"
             raise InputError(f"{name} got {got}; expected shape ({count},): the actuation a > 0 of each muscle")
-        length = actuation * _length(_squared_distances(context, indices), 0.0)
-        return Spring(parameters.stiffness / length**2, length)
+        length = actuation * _rest_lengths(context, indices, 0.0)
+        return parameters.stiffness / length**2, length
 
     return Term(name, indices, _energy(softening), parameters, prepare)
 
 
 def _energy(softening: float):
-    def energy(x: Corners, spring: Spring) -> Scalar:
+    if softening != 0.0:
+        require_positive(softening=softening)
+
+    def energy(x: Corners, spring: tuple[Array, Array]) -> Scalar:
+        stiffness, rest_length = spring
         squared = jnp.asarray(sum((end - start) ** 2 for start, end in zip(*x, strict=True)))
-        deviation = (_length(squared, softening) - spring.rest_length) ** 2
+        deviation = (_length(squared, softening) - rest_length) ** 2
         if softening == 0.0:
-            deviation = jnp.where(squared > 0, deviation, squared + spring.rest_length**2)
-        return 0.5 * spring.stiffness * deviation
+            deviation = jnp.where(squared > 0, deviation, squared + rest_length**2)
+        return 0.5 * stiffness * deviation
 
     return energy
 
@@ -108,10 +100,6 @@ def _length(squared_distance: Float[Array, "*m"], softening: float) -> Float[Arr
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared_distance, 1.0)), 0.0)
 
 
-def _squared_distances(context: Context, indices) -> Float[Array, " m"]:
-    return jnp.sum((context.rest[indices[:, 1]] - context.rest[indices[:, 0]]) ** 2, axis=1)
-
-
-def _require_softening(softening: float) -> None:
-    if softening != 0.0:
-        require_positive(softening=softening)
+def _rest_lengths(context: Context, indices: np.ndarray, softening: float) -> Float[Array, " m"]:
+    squared = jnp.sum((context.rest[indices[:, 1]] - context.rest[indices[:, 0]]) ** 2, axis=1)
+    return _length(squared, softening)

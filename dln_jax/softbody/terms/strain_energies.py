@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.mesh.simplices import cofactors, determinant
 from dln_jax.types import Scalar
 
 DeformationGradient = Float[Array, "dim dim"] | Sequence[Sequence[Array]]
@@ -74,29 +75,6 @@ def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
 def squared_norm(F: DeformationGradient) -> Scalar:
     """I1 = |F|²."""
     return jnp.asarray(sum(entry * entry for row in F for entry in row))
-
-
-def determinant(F: DeformationGradient) -> Scalar:
-    """J = det F."""
-    if len(F) == 2:
-        return F[0][0] * F[1][1] - F[0][1] * F[1][0]
-    cofactor = cofactors(F)
-    return F[0][0] * cofactor[0][0] + F[0][1] * cofactor[0][1] + F[0][2] * cofactor[0][2]
-
-
-def cofactors(F: DeformationGradient) -> list[list[Array]]:
-    """Rows of cof F = J F⁻ᵀ."""
-    if len(F) == 2:
-        return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
-    # Taking the indices cyclically gives the signs.
-    return [
-        [
-            F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
-            - F[(i + 1) % 3][(j + 2) % 3] * F[(i + 2) % 3][(j + 1) % 3]
-            for j in range(3)
-        ]
-        for i in range(3)
-    ]
 
 
 def rotation_trace(F: DeformationGradient) -> Scalar:
