@@ -22,7 +22,7 @@ from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import expect, largest
-from dln_jax.studies.stability.random_models import random_parameters
+from dln_jax.studies.stability.random_models import untrained
 from dln_jax.types import InputError, Needs
 
 WIDTH = 8
@@ -80,11 +80,8 @@ def batches() -> Findings:
 
 def not_finite() -> Findings:
     """NaN and infinity: refused with their place in a file, and never turned into a finite answer by a model."""
-    good = {
-        "t": np.arange(6.0),
-        "trajectory": np.zeros(6, int),
-        **{k: np.ones((6, 2)) for k in ("q", "qd", "qdd", "tau")},
-    }
+    good = {"t": np.arange(6.0), "trajectory": np.zeros(6, int)}
+    good |= {key: np.ones((6, 2)) for key in ("q", "qd", "qdd", "tau")}
     cases = []
     for label, value in (("nan", np.nan), ("infinity", np.inf)):
         accepted = 0
@@ -110,17 +107,16 @@ def not_finite() -> Findings:
 
 
 def _systems() -> dict[str, Dynamics | PlainDynamics]:
-    needs, cart = Needs(joints=("revolute", "revolute")), Needs(joints=("prismatic", "revolute"))
+    arm, cart = Needs(joints=("revolute", "revolute")), Needs(joints=("prismatic", "revolute"))
     models = {
-        "structured-delan": make_delan(needs, width=WIDTH, dtype=jnp.float64),
-        "structured-delan-prismatic": make_delan(cart, width=WIDTH, dtype=jnp.float64),
-        "black-box-delan": make_black_box_lagrangian(needs, width=WIDTH, dtype=jnp.float64),
-        "feed-forward": make_feed_forward(needs, width=WIDTH, dtype=jnp.float64),
+        "structured-delan": (make_delan, arm),
+        "structured-delan-prismatic": (make_delan, cart),
+        "black-box-delan": (make_black_box_lagrangian, arm),
+        "feed-forward": (make_feed_forward, arm),
     }
-    return {
-        **{name: dynamics(model.energies(random_parameters(model))) for name, model in models.items()},
-        "double-pendulum": dynamics(double_pendulum().energies),
-    }
+    built = {name: make(needs, width=WIDTH, dtype=jnp.float64) for name, (make, needs) in models.items()}
+    systems = {name: untrained(model) for name, model in built.items()}
+    return {**systems, "double-pendulum": dynamics(double_pendulum().energies)}
 
 
 def _answers(system: Dynamics | PlainDynamics) -> Callable[..., list[np.ndarray]]:

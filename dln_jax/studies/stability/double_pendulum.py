@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.mechanics import hamiltonian, natural
+from dln_jax.mechanics import hamiltonian, integrators, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import gauss_legendre4, rk4, rollout, second_order
+from dln_jax.mechanics.integrators import gauss_legendre4, rk4, second_order
 from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.rollout import rollout
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.studies.case import Findings
@@ -100,7 +101,7 @@ def _motions(system: Dynamics, steps: int) -> Chaos:
     def motion(q):
         x = jnp.concatenate([q, jnp.zeros_like(q)])
         direction = jnp.full(4, 0.5)
-        return jax.lax.scan(advance, (x, direction, direction), length=steps)[1]
+        return rollout(advance, (x, direction, direction), steps=steps, observe=lambda state, seen: seen)[1]
 
     x, tangent, pair = (np.asarray(each) for each in jax.jit(jax.vmap(motion, out_axes=1))(STARTS))
     return Chaos(x[..., :2], x[..., 2:], tangent, pair)
@@ -113,7 +114,7 @@ def _distance(chaos: Chaos, system: Dynamics, *, every: int) -> np.ndarray:
 
     @jax.jit
     def motions(starts):
-        return jax.vmap(lambda q: rollout(step, (q, jnp.zeros_like(q)), t)[0], out_axes=1)(starts)
+        return jax.vmap(lambda q: integrators.rollout(step, (q, jnp.zeros_like(q)), t)[0], out_axes=1)(starts)
 
     return abs(np.asarray(motions(STARTS))[1:] - chaos.q[every - 1 :: every]).max(axis=-1)
 
@@ -143,12 +144,9 @@ def _energy_drift(scene: Scene, steps: int) -> Row:
 
     @jax.jit
     def energies(q):
-        def advance(state, _):
-            state = step(0.0, state, DT)
-            return state, H(*state)
-
         start = (q, jnp.zeros_like(q))
-        return jax.lax.scan(advance, start, length=steps)[1] - H(*start)
+        advance = lambda state, _: (step(0.0, state, DT), None)  # noqa: E731
+        return rollout(advance, start, steps=steps, observe=lambda state, _: H(*state))[1] - H(*start)
 
     error = np.asarray(energies(jnp.asarray(STARTS[0])))
     tenth = max(1, steps // 10)

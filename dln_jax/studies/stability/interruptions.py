@@ -45,7 +45,7 @@ def cases(names: Sequence[str] = tuple(RUNS), *, kills: int = 10, seed: int = 0)
 def killed_and_resumed(name: str, random: np.random.Generator, kills: int) -> Findings:
     """How many of the resumed runs are the unbroken one, and the moments of the kills in s after a checkpoint."""
     with tempfile.TemporaryDirectory() as place:
-        same, moments = interrupted(RUNS[name], Path(place) / name, random, kills=kills)
+        same, moments = interrupted(RUNS[name], Path(place), random, kills=kills)
     row = Row(name, "resumed_bit_for_bit", same, "runs", bound=kills, at_least=True)
     return Findings([row], {"moments": moments})
 
@@ -54,7 +54,6 @@ def interrupted(
     command: Sequence[str], place: Path, random: np.random.Generator, *, kills: int
 ) -> tuple[int, list[float]]:
     """How many of `kills` interrupted runs end as the unbroken one, and when they were killed, s after a checkpoint."""
-    place.mkdir()
     # Twice: the second has the compiled programs of the first, as the runs that are killed do.
     for name in ("first", "unbroken"):
         length = lasted(start(command, place, name), place / name)

@@ -41,29 +41,24 @@ def noise() -> Findings:
     inertia = np.linalg.norm(np.asarray(jax.vmap(scene.mass_matrix)(jnp.asarray(data.q))), axis=(1, 2))
     assert data.tau_inertial is not None
     for level in LEVELS:
-        size = level * data.tau.std(axis=0)
-        fit, error = _fit(model, data, tau=data.tau + size * random.normal(size=data.tau.shape))
-        # Channels are weighed by their own deviation, so that noise is the same in all.
-        predicted = float(np.mean(size**2) * fit.rank / SAMPLES)
-        unequal = float(np.max(size**2) / np.mean(size**2))
-        bound = unequal * (1 + DEVIATIONS * (2 / fit.rank) ** 0.5)
-        text = f"torque MSE in units of s² P / N, P = {fit.rank}, within {DEVIATIONS:.0f} deviations of its chance"
-        name = f"noise/torque-{level:g}"
-        cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
-        curves["torque"][0].append(error)
-        curves["torque"][1].append(predicted)
-
-        size = level * data.qdd.std(axis=0)
-        fit, error = _fit(model, data, qdd=data.qdd + size * random.normal(size=data.qdd.shape))
-        variance = float(np.mean(inertia**2) * np.max(size**2))
-        bias = level**4 * mean_square(data.tau_inertial)
-        predicted = variance * fit.rank / SAMPLES + bias
-        text = "torque MSE in units of |M|² s² P / N plus the square of the bias s²/var(qdd) of M"
-        bound = 1 + DEVIATIONS * (2 / fit.rank) ** 0.5
-        name = f"noise/acceleration-{level:g}"
-        cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
-        curves["acceleration"][0].append(error)
-        curves["acceleration"][1].append(predicted)
+        for kind, key in (("torque", "tau"), ("acceleration", "qdd")):
+            clean = getattr(data, key)
+            size = level * clean.std(axis=0)
+            fit, error = _fit(model, data, **{key: clean + size * random.normal(size=clean.shape)})
+            bound = 1 + DEVIATIONS * (2 / fit.rank) ** 0.5
+            if kind == "torque":
+                # Channels are weighed by their own deviation, so that noise is the same in all.
+                predicted = float(np.mean(size**2) * fit.rank / SAMPLES)
+                bound *= float(np.max(size**2) / np.mean(size**2))
+                text = f"s² P / N, P = {fit.rank}, within {DEVIATIONS:.0f} deviations of its chance"
+            else:
+                variance = float(np.mean(inertia**2) * np.max(size**2))
+                predicted = variance * fit.rank / SAMPLES + level**4 * mean_square(data.tau_inertial)
+                text = "|M|² s² P / N plus the square of the bias s²/var(qdd) of M"
+            name, text = f"noise/{kind}-{level:g}", f"torque MSE in units of {text}"
+            cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
+            curves[kind][0].append(error)
+            curves[kind][1].append(predicted)
     return Findings(cases, {"levels": LEVELS, **curves})
 
 
@@ -79,22 +74,21 @@ def missing_friction() -> Findings:
         fit = fit_linear(model, noisy)
         misfit = velocity_misfit(noisy.qd, noisy.tau - _torque(model, fit, noisy), noisy.trajectory)
         name = f"friction/model-{kind}-it"
+        missing = misfit.missing.sum()
         if kind == "having":
-            got = float(misfit.missing.sum())
             text = "a model with friction leaves noise, in which nothing is found"
-            cases.append(expect(name, "joints_reported", text, got, 0.0))
+            cases.append(expect(name, "joints_reported", text, missing, 0.0))
             continue
         text = "both joints are reported, by the power that the residual takes"
-        cases.append(expect(name, "joints_reported", text, float(misfit.missing.sum()), 2.0, at_least=True))
+        cases.append(expect(name, "joints_reported", text, missing, 2.0, at_least=True))
         # A sum over samples of qd (noise and what the fit left), over that of qd².
         allowed = float(np.max(DEVIATIONS * misfit.residual_rms / np.sqrt(np.sum(noisy.qd**2, axis=0))))
-        text = (
-            f"the coefficient is {FRICTION} within {DEVIATIONS:.0f} standard errors: friction is odd in time, tau not"
-        )
-        got = float(abs(misfit.coefficient - FRICTION).max())
+        errors = f"{DEVIATIONS:.0f} standard errors"
+        text = f"the coefficient is {FRICTION} within {errors}: friction is odd in time, tau not"
+        got = abs(misfit.coefficient - FRICTION).max()
         cases.append(expect(name, "coefficient_error", text, got, allowed, "N m s"))
         text = "the residual is that of friction, b rms(qd), far above the noise"
-        got = float(np.min(misfit.residual_rms) / sigma)
+        got = np.min(misfit.residual_rms) / sigma
         expected = FRICTION * float(np.sqrt(np.mean(noisy.qd**2))) / sigma
         cases.append(expect(name, "residual_over_noise", text, got, 0.8 * expected, at_least=True, reference=expected))
     return Findings(cases)

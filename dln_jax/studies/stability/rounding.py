@@ -20,12 +20,11 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import make_delan
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
-from dln_jax.models.model import Model
 from dln_jax.nn.activations import activation
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import expect, largest
-from dln_jax.studies.stability.random_models import random_parameters
+from dln_jax.studies.stability.random_models import random_parameters, random_states, untrained
 from dln_jax.types import Needs
 
 DTYPES = (np.float32, np.float64)
@@ -34,6 +33,8 @@ ROUNDINGS = 8.0
 TURNS = 1_000
 WIDTH = 16
 LAYERS = 3
+RANGES = (np.pi, 3.0, 10.0)
+"""Of q, qd and qdd (or tau): with these all parts of the torque count."""
 
 _DENSITY = 1 / math.sqrt(2 * math.pi)
 _Values = Callable[[np.ndarray], tuple]
@@ -107,17 +108,13 @@ def activations() -> Findings:
 def turned_angles() -> Findings:
     """A joint turned by 2 pi k, k = 1000, is where it was: the angle keeps eps 2 pi k, and the torque no less."""
     needs = Needs(joints=("revolute", "revolute"))
-    scene = double_pendulum()
+    double = {"needs": needs, "width": WIDTH, "dtype": jnp.float64}
     systems = [
-        ("structured-delan", _initialised(make_delan(needs, width=WIDTH, dtype=jnp.float64)), np.float64),
-        ("structured-delan-f32", _initialised(make_delan(needs, width=WIDTH)), np.float32),
-        ("black-box-delan", _initialised(make_black_box_lagrangian(needs, width=WIDTH, dtype=jnp.float64)), np.float64),
-        (
-            "structured-hnn",
-            _initialised(make_structured_hamiltonian(needs, width=WIDTH, dtype=jnp.float64)),
-            np.float64,
-        ),
-        ("double-pendulum", dynamics(scene.energies), np.float64),
+        ("structured-delan", untrained(make_delan(**double)), np.float64),
+        ("structured-delan-f32", untrained(make_delan(needs, width=WIDTH)), np.float32),
+        ("black-box-delan", untrained(make_black_box_lagrangian(**double)), np.float64),
+        ("structured-hnn", untrained(make_structured_hamiltonian(**double)), np.float64),
+        ("double-pendulum", dynamics(double_pendulum().energies), np.float64),
     ]
     text = (
         f"tau after {TURNS} turns differs by |dtau/dq| times the rounding of the angle, 1.25 eps 2 pi k for the sum, "
@@ -125,9 +122,10 @@ def turned_angles() -> Findings:
     )
     cases = []
     for name, system, dtype in systems:
-        q, qd, qdd = _states(32, 2, dtype)
+        q, qd, qdd = random_states(32, 2, RANGES, dtype)
         turn = np.asarray(2 * np.pi * TURNS, dtype) * np.array([1, -1], dtype)
-        torque = _in_one_program(system.inverse_dynamics)
+        compiled = jax.jit(jax.vmap(system.inverse_dynamics))
+        torque = lambda *states, compiled=compiled: np.asarray(compiled(*states))  # noqa: E731
         # Central differences: of a thousandth of a radian, or the square root of the rounding unit.
         steps = np.eye(2, dtype=dtype) * np.sqrt(np.finfo(dtype).eps)
         slopes = [abs(torque(q + step, qd, qdd) - torque(q - step, qd, qdd)) / (2 * step.max()) for step in steps]
@@ -137,7 +135,7 @@ def turned_angles() -> Findings:
     return Findings(cases)
 
 
-def single_precision() -> Findings:
+def float32() -> Findings:
     """float32 against float64: same parameters, same states, so that all that differs is rounding on the way."""
     needs = Needs(joints=("revolute", "revolute"))
     model = make_delan(needs, width=WIDTH)
@@ -150,10 +148,9 @@ def single_precision() -> Findings:
     roundings = LAYERS * WIDTH
     cases = []
     for name, narrow, exact in pairs:
-        states = _states(64, 2, np.float32)
-        found = _in_one_program(_both_ways(narrow))(*states)
-        wanted = _in_one_program(_both_ways(exact))
-        sizes = _sizes(exact, wanted, *(each.astype(np.float64) for each in states))
+        states = random_states(64, 2, RANGES, np.float32)
+        found = _both_ways(narrow)(*states)
+        sizes = _sizes(exact, *(each.astype(np.float64) for each in states))
         for quantity, value, (truth, size) in zip(("inverse", "forward"), np.swapaxes(found, 0, 1), sizes, strict=True):
             got = largest(abs(value - truth).max(axis=1) / size) / float(np.finfo(np.float32).eps)
             text = (
@@ -196,34 +193,20 @@ def _curvature_curves() -> dict:
     truth = 8 * decay * np.expm1(-2 * exact) / (1 + decay) ** 3
     nested = jax.vmap(jax.grad(jax.grad(lambda x: 1 - 2 / (jnp.exp(2 * x) + 1))))
     found = {"formula": activation("tanh").second(jnp.asarray(x)), "1 - 2/(e^2x + 1), differentiated twice": nested(x)}
-    return {
-        "x": exact,
-        "errors": {key: abs(np.asarray(value, float) - truth) / abs(truth) for key, value in found.items()},
-    }
-
-
-def _initialised(model: Model) -> Dynamics:
-    return dynamics(model.energies(random_parameters(model)))
-
-
-def _states(samples: int, d: int, dtype) -> list[np.ndarray]:
-    """q, qd and qdd (or tau), of a size with which all parts of the torque count."""
-    random = np.random.default_rng(0)
-    return [(random.uniform(-1, 1, (samples, d)) * size).astype(dtype) for size in (np.pi, 3.0, 10.0)]
-
-
-def _in_one_program(function: Callable) -> Callable[..., np.ndarray]:
-    compiled = jax.jit(jax.vmap(function))
-    return lambda *states: np.asarray(compiled(*states))
+    errors = {key: abs(np.asarray(value, float) - truth) / abs(truth) for key, value in found.items()}
+    return {"x": exact, "errors": errors}
 
 
 def _both_ways(system: Dynamics) -> Callable:
-    return lambda *state: jnp.stack([system.inverse_dynamics(*state), system.forward_dynamics(*state)])
+    one = lambda *state: jnp.stack([system.inverse_dynamics(*state), system.forward_dynamics(*state)])  # noqa: E731
+    compiled = jax.jit(jax.vmap(one))
+    return lambda *states: np.asarray(compiled(*states))
 
 
-def _sizes(system: Dynamics, both_ways: Callable, q, qd, x) -> list[tuple[np.ndarray, np.ndarray]]:
+def _sizes(system: Dynamics, q, qd, x) -> list[tuple[np.ndarray, np.ndarray]]:
     """(torque, size) and (acceleration, size): by how much one relative rounding of everything changes each."""
-    truth, small = both_ways(q, qd, x), 1e-6
+    both_ways, small = _both_ways(system), 1e-6
+    truth = both_ways(q, qd, x)
     moved = np.zeros(truth.shape)
     for index in range(3):
         for column in range(2):
