@@ -10,41 +10,21 @@ from dln_jax.studies.soft_bodies.figures import FIGURES
 
 __all__ = ["SUBJECTS", "cases"]
 
-SUBJECTS: dict[str, dict[str, Callable[[bool], Findings]]] = {
-    "references": {
-        "free-fall": motions.free_fall,
-        "invariants": motions.invariants,
-        "oscillator": motions.oscillator,
-        "orders": motions.orders,
-        "block": sliding.block,
-        "slope": sliding.slope,
-        "uniaxial": statics.uniaxial,
-        "patch-test": statics.patch_test,
-        "elastica": statics.elastica,
-        "cantilever": statics.cantilever,
-    },
-    "hard": {
-        "time-steps": robustness.time_steps,
-        "materials": robustness.materials,
-        "bad-starts": robustness.bad_starts,
-        "mass-ratio": robustness.mass_ratio,
-        "chain": robustness.chain,
-        "twist": robustness.twist,
-        "float32": robustness.single_precision,
-        "not-converged": robustness.not_converged,
-    },
-    "gradients": {
-        "crawler": gradients.creature,
-        "coulomb": gradients.coulomb,
-        "modes": gradients.modes,
-    },
-    "speed": {
-        "creature": speed.creature,
-        "beams": speed.beams,
-        "backward": speed.backward,
-        "linear-solvers": speed.linear_solvers,
-        "speed-against-error": speed.speed_against_error,
-    },
+MEASURES: dict[str, tuple[Callable[[bool], Findings], ...]] = {
+    "references": (
+        *(motions.free_fall, motions.invariants, motions.oscillator, motions.orders, sliding.block, sliding.slope),
+        *(statics.uniaxial, statics.patch_test, statics.elastica, statics.cantilever),
+    ),
+    "hard": (
+        *(robustness.time_steps, robustness.materials, robustness.bad_starts, robustness.mass_ratio),
+        *(robustness.chain, robustness.twist, robustness.float32, robustness.not_converged),
+    ),
+    "gradients": (gradients.crawler, gradients.coulomb, gradients.modes),
+    "speed": (speed.creature, speed.beams, speed.backward, speed.linear_solvers, speed.speed_against_error),
+}
+SUBJECTS = {
+    subject: {measure.__name__.replace("_", "-"): measure for measure in measures}
+    for subject, measures in MEASURES.items()
 }
 """quick -> findings, by subject and by name; only `speed` depends on the machine."""
 

@@ -20,19 +20,17 @@ from jaxtyping import Array
 
 from dln_jax.rollout import rollout
 from dln_jax.softbody.examples import creature_scene
-from dln_jax.softbody.mesh.creatures import crawler
+from dln_jax.softbody.mesh import creatures
 from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, with_parameters
 from dln_jax.softbody.step import Step, make_step
 from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.creature import TIME_STEP
-from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
-from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import expect
-from dln_jax.studies.soft_bodies.common import GRAVITY
+from dln_jax.studies.soft_bodies.common import GRAVITY, solid
 
 BOUND = 1e-7
 STEPS = 100
@@ -45,7 +43,7 @@ LARGEST_STEP = 2.0**-8
 Loss = Callable[[dict[str, Any]], Array]
 
 
-def creature(quick: bool) -> Findings:
+def crawler(quick: bool) -> Findings:
     """A crawler of 28 vertices over contact steps with ground, friction and muscles: reverse mode for everything."""
     loss, at = crawling(40 if quick else STEPS)
     return _compared("crawler", loss, at)
@@ -83,14 +81,11 @@ def modes(quick: bool) -> Findings:
         return slopes(jax.tree.map(lambda leaf, change: leaf + e * change, at, along))
 
     steps = 2.0 ** -np.arange(3, 12)
-    ahead, behind = ([shifted(sign * e) for e in steps] for sign in (1, -1))
+    central = [jax.tree.map(np.subtract, shifted(e), shifted(-e)) for e in steps]
     differences = [
-        jax.tree.map(
-            lambda a, b, c, d, e=steps[k]: (8 * (a - b) - (c - d)) / (12 * e),
-            ahead[k], behind[k], ahead[k - 1], behind[k - 1],
-        )
-        for k in range(1, len(steps))
-    ]  # fmt: skip
+        jax.tree.map(lambda near, far, e=e: (8 * near - far) / (12 * e), near, far)
+        for e, near, far in zip(steps[1:], central[1:], central, strict=False)
+    ]
     changes = [_distance(a, b) for a, b in zip(differences[1:], differences, strict=False)]
     chosen = differences[1 + int(np.argmin(changes))]
     text = "Hessian-vector product against differences of the gradient"
@@ -110,8 +105,7 @@ def coulomb(quick: bool) -> Findings:
         friction=0.3,
         threshold_speed=0.1,
     )
-    material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5, poisson_ratio=0.3)
-    scene = make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY)), ground])
+    scene = solid(mesh, ground, modulus=1e5)
     init, step = make_step(scene, 0.01, tolerance=TOLERANCE)
     terms = scene.params.terms
     at = {
@@ -135,7 +129,7 @@ def coulomb(quick: bool) -> Findings:
 
 def crawling_scene() -> tuple[SoftScene, int]:
     """The crawler of the preset, and how many muscles it has."""
-    body = crawler()
+    body = creatures.crawler()
     return creature_scene(body), len(body.muscles)
 
 

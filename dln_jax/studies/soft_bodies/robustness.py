@@ -5,7 +5,6 @@ of all elements, or the difference between two precisions.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ import numpy as np
 from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.softbody.scene import Params, SoftScene, State, make_scene, with_parameters
+from dln_jax.softbody.scene import Params, State, make_scene, with_parameters
 from dln_jax.softbody.step import make_step
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
@@ -24,10 +23,8 @@ from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.solvers.info import Info
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, expect, largest
-from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, motion
+from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, cantilever_of, converges, motion
 
-MODULUS = 1e6
-"""In Pa, unless a case says otherwise; a beam of 4 m x 1 m then sags by about a length."""
 DT = 1 / 30
 STEPS = 60
 """Of motions of length 2 s."""
@@ -35,23 +32,23 @@ STEPS = 60
 
 def time_steps(quick: bool) -> Findings:
     """The first steps from rest, of 1 ms to 10 s, of a beam that falls under its weight."""
-    scene = _beam(quick)
-    cases = []
+    scene = _beam(quick)[0]
+    rows = []
     for dt in (10.0,) if quick else (1e-3, 1e-2, 1e-1, 1.0, 10.0):
         init, step = make_step(scene, dt)
         found = motion(step, 3)(scene.params, init())
-        cases += _converged(f"time-step/{dt:g}-s", found, 12, "2 to 12 Newton iterations, from rest")
-    return Findings(cases)
+        rows += _converged(f"time-step/{dt:g}-s", found, 12, "2 to 12 Newton iterations, from rest")
+    return Findings(rows)
 
 
 def materials(quick: bool) -> Findings:
     """Two seconds of a beam from soft to stiff and from compressible to nearly incompressible, by one program."""
-    params, init, run = _beam_motion(quick)
+    scene, init, run = _beam(quick)
     cases = []
     table = [(f"modulus/{modulus:.0e}", modulus, 0.3) for modulus in (1e4, 1e6, 1e8, 1e10)]
-    table += [(f"poisson/{ratio}", MODULUS, ratio) for ratio in (0.4, 0.49, 0.4999)]
+    table += [(f"poisson/{ratio}", 1e6, ratio) for ratio in (0.4, 0.49, 0.4999)]
     for name, modulus, ratio in table:
-        found = run(with_parameters(params, elastic={"youngs_modulus": modulus, "poisson_ratio": ratio}), init())
+        found = run(with_parameters(scene.params, elastic={"youngs_modulus": modulus, "poisson_ratio": ratio}), init())
         most = largest(found.iterations[:3])
         text = "3 to 4 Newton iterations in a prototype, in the first steps from rest"
         cases += _converged(name, found, 100, f"below what the solver allows, in {STEPS} steps")
@@ -61,32 +58,28 @@ def materials(quick: bool) -> Findings:
 
 def bad_starts(quick: bool) -> Findings:
     """Meshes that are scrambled, or collapsed to a point or a line, under their weight: they recover in a few steps."""
-    params, init, run = _beam_motion(quick)
-    mesh, free = _beam(quick).mesh, _beam(quick).free
-    random = np.random.default_rng(0)
-    rest = mesh.vertices
-    scrambled = random.uniform(rest.min(axis=0), rest.max(axis=0), rest.shape)
+    scene, init, run = _beam(quick)
+    rest = scene.mesh.vertices
     starts = {
-        "scrambled": scrambled,
+        "scrambled": np.random.default_rng(0).uniform(rest.min(axis=0), rest.max(axis=0), rest.shape),
         "point-collapsed": np.broadcast_to(rest.mean(axis=0), rest.shape),
         "line-collapsed": rest * np.array([1.0, 0.0]) + np.array([0.0, 0.5]),
     }
     cases, curves = [], {}
     for name, x in starts.items():
-        found = run(params, init(np.where(free, x, rest)))
+        found = run(scene.params, init(np.where(scene.free, x, rest)))
         cases += _converged(f"start/{name}", found, 100, "below what the solver allows")
-        least = _least_J(mesh, found.x)
-        curves[name] = least
+        curves[name] = _least_J(scene.mesh, found.x)
         text = "no element is inverted in the end (a prototype: 0.779)"
-        cases.append(expect(f"start/{name}", "least_J", text, float(least[-1]), 0.0, at_least=True))
+        cases.append(expect(f"start/{name}", "least_J", text, curves[name][-1], 0.0, at_least=True))
     return Findings(cases, curves)
 
 
 def mass_ratio(quick: bool) -> Findings:
     """Vertices that are 1e4 times heavier than their neighbours, in turn."""
-    params, init, run = _beam_motion(quick)
-    heavy = np.where(np.arange(len(params.masses)) % 2, 1e4, 1.0)
-    stiffer = with_parameters(params, elastic={"youngs_modulus": 1e7})
+    scene, init, run = _beam(quick)
+    heavy = np.where(np.arange(len(scene.mesh.vertices)) % 2, 1e4, 1.0)
+    stiffer = with_parameters(scene.params, elastic={"youngs_modulus": 1e7})
     found = run(stiffer._replace(masses=jnp.asarray(heavy)), init())
     return Findings(_converged("mass-ratio/1e4", found, 20, "a few more than with even masses"))
 
@@ -104,12 +97,8 @@ def chain(quick: bool) -> Findings:
     stretch = np.linalg.norm(np.diff(found.x, axis=1), axis=2).sum(axis=1) / 10.0
     text = "the springs stretch by the load over their stiffness: 3 m g (the fall's pull) over 1e7 N/m, doubled"
     bound = 2 * 3 * 101 * GRAVITY / (1e7 * 0.1)
-    return Findings(
-        [
-            *_converged("chain/100-springs", found, 30, "from level, where springs resist no sideways motion"),
-            expect("chain/100-springs", "largest_stretch", text, largest(abs(stretch - 1)), bound),
-        ]
-    )
+    rows = _converged("chain/100-springs", found, 30, "from level, where springs resist no sideways motion")
+    return Findings([*rows, expect("chain/100-springs", "largest_stretch", text, largest(abs(stretch - 1)), bound)])
 
 
 def twist(quick: bool) -> Findings:
@@ -135,35 +124,26 @@ def twist(quick: bool) -> Findings:
     shown = np.linspace(0, steps - 1, 4).round().astype(int)
     t = DT * (shown + 1)
     curves = {"mesh": mesh, "x": found.x[shown], "t": t, "turns": turns * t / (DT * steps)}
-    return Findings(
-        [
-            *_converged(f"twist/{turns:g}-turns", found, 30, "a bar of constant strain tetrahedra"),
-            expect(f"twist/{turns:g}-turns", "least_J", text, float(least.min()), 0.0, at_least=True),
-        ],
-        curves,
-    )
+    name = f"twist/{turns:g}-turns"
+    rows = _converged(name, found, 30, "a bar of constant strain tetrahedra")
+    return Findings([*rows, expect(name, "least_J", text, least.min(), 0.0, at_least=True)], curves)
 
 
-def single_precision(quick: bool) -> Findings:
+def float32(quick: bool) -> Findings:
     """A beam that swings, in float32 and in float64."""
-    params, init, run = _beam_motion(quick)
-    double = run(params, init())
-    single = run(*jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (params, init())))
-    moved = largest(abs(double.x - params.rest))
+    scene, init, run = _beam(quick)
+    double = run(scene.params, init())
+    single = run(*jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (scene.params, init())))
+    moved = largest(abs(double.x - scene.params.rest))
     difference = largest(abs(single.x.astype(np.float64) - double.x)) / moved
     text = f"{STEPS} steps in float32 differ from float64 by less than 1e-3 of the motion"
-    return Findings(
-        [
-            *_converged("float32", single, 20, "the line search accepts what rounding hides"),
-            expect("float32", "relative_difference", text, difference, 1e-3),
-        ]
-    )
+    rows = _converged("float32", single, 20, "the line search accepts what rounding hides")
+    return Findings([*rows, expect("float32", "relative_difference", text, difference, 1e-3)])
 
 
 def not_converged(quick: bool) -> Findings:
     """A solver that may take one Newton step only: it says that it has not converged, and the gradient is NaN."""
-    mesh = beam(1.0, 0.25, 4, 1)
-    scene = cantilever_scene(mesh, modulus=1e4)
+    scene = cantilever_of(beam(1.0, 0.25, 4, 1), modulus=1e4)
     init, step = make_step(scene, 0.1, iterations=1)
 
     def height(params: Params):
@@ -172,39 +152,24 @@ def not_converged(quick: bool) -> Findings:
 
     (_, converged), slopes = jax.jit(jax.value_and_grad(height, has_aux=True))(scene.params)
     finite = sum(int(np.isfinite(leaf).sum()) for leaf in jax.tree.leaves(slopes.terms))
-    return Findings(
-        [
-            expect("one-iteration", "reported_as_converged", "Info.converged is false", float(converged), 0.0),
-            expect("one-iteration", "finite_derivatives", "by a material and gravity: all NaN", float(finite), 0.0),
-        ]
-    )
-
-
-def cantilever_scene(mesh: Mesh, modulus: float = MODULUS) -> SoftScene:
-    """A body that is held where x = 0 and falls under its weight."""
-    material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=0.3)
-    held = vertices_where(mesh, lambda x: x[:, 0] == 0)
-    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY))], held=held)
+    rows = [
+        expect("one-iteration", "reported_as_converged", "Info.converged is false", converged, 0.0),
+        expect("one-iteration", "finite_derivatives", "by a material and gravity: all NaN", finite, 0.0),
+    ]
+    return Findings(rows)
 
 
 @functools.cache
-def _beam(quick: bool) -> SoftScene:
-    return cantilever_scene(beam(4.0, 1.0, *((16, 4) if quick else (40, 10))))
-
-
-@functools.cache
-def _beam_motion(quick: bool) -> tuple[Params, Callable[..., State], Callable[[Params, State], Seen]]:
-    scene = _beam(quick)
+def _beam(quick: bool):
+    """The scene, its `init`, and its motion of `STEPS` steps."""
+    scene = cantilever_of(beam(4.0, 1.0, *((16, 4) if quick else (40, 10))))
     init, step = make_step(scene, DT)
-    return scene.params, init, motion(step, STEPS)
+    return scene, init, motion(step, STEPS)
 
 
 def _converged(name: str, found: Seen, iterations: int, text: str) -> list[Row]:
-    failed = float(np.sum(~found.converged))
-    return [
-        expect(name, "steps_not_converged", "every step converges", failed, 0.0),
-        expect(name, "most_iterations", text, largest(found.iterations), float(iterations)),
-    ]
+    most = expect(name, "most_iterations", text, largest(found.iterations), iterations)
+    return [converges(name, found.converged), most]
 
 
 def _least_J(mesh: Mesh, x: Any) -> np.ndarray:

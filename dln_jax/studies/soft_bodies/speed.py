@@ -2,7 +2,6 @@
 
 import functools
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -22,8 +21,8 @@ from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, dense, matrix_free
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import expect, largest
+from dln_jax.studies.soft_bodies.common import cantilever_of, converges
 from dln_jax.studies.soft_bodies.gradients import crawling, crawling_scene, gait
-from dln_jax.studies.soft_bodies.robustness import cantilever_scene
 
 LANES = 64
 DT = 1 / 30
@@ -50,39 +49,29 @@ def creature(quick: bool) -> Findings:
 
     compiling, seconds, (_, (_, converged)) = timed(jax.jit(run), init(), scene.params, controls)
     alone = f"28 vertices, {len(controls)} steps; compiled in {compiling:.1f} s"
-    failed = largest(~np.asarray(converged))
-    text = f"{LANES} gaits side by side by vmap, 100 steps each"
-    lanes = _lanes_rate()
-    return Findings(
-        [
-            expect("speed/crawler", "steps_per_second", alone, len(controls) / seconds, 6000.0, "1/s", at_least=True),
-            expect("speed/crawler", "steps_not_converged", "every step converges", failed, 0.0),
-            expect(
-                f"speed/{LANES}-crawlers", "environment_steps_per_second", text, lanes, 15_000.0, "1/s", at_least=True
-            ),
-        ]
-    )
-
-
-def _lanes_rate() -> float:
-    scene, muscles = crawling_scene()
-    init, step = make_step(scene, TIME_STEP)
+    rate = len(controls) / seconds
     controls = gait(100, muscles) * jnp.linspace(0.8, 1.0, LANES)[:, None, None]
 
     @jax.jit
     @jax.vmap
-    def run(controls: Any) -> Any:
+    def run_lane(controls: Any) -> Any:
         return rollout(functools.partial(step, scene.params), init(), controls)[0].x
 
-    _, seconds, _ = timed(run, controls)
-    return controls.shape[0] * controls.shape[1] / seconds
+    lanes, text = f"speed/{LANES}-crawlers", f"{LANES} gaits side by side by vmap, 100 steps each"
+    lanes_rate = controls.shape[0] * controls.shape[1] / timed(run_lane, controls)[1]
+    rows = [
+        expect("speed/crawler", "steps_per_second", alone, rate, 6000.0, "1/s", at_least=True),
+        converges("speed/crawler", converged),
+        expect(lanes, "environment_steps_per_second", text, lanes_rate, 15_000.0, "1/s", at_least=True),
+    ]
+    return Findings(rows)
 
 
 def beams(quick: bool) -> Findings:
     """Time per step of cantilevers of 902 and 3402 unknowns that fall under their weight."""
     cases = []
     for cells, bound in (((40, 10), 8e-3), ((80, 20), 40e-3)):
-        scene = cantilever_scene(beam(4.0, 1.0, *cells))
+        scene = cantilever_of(beam(4.0, 1.0, *cells))
         (init, step), steps = make_step(scene, DT), 10 if quick else 30
 
         def run(state: State, params: Params, step=step, steps=steps) -> Any:
@@ -93,7 +82,7 @@ def beams(quick: bool) -> Findings:
         name = f"speed/beam-{scene.mesh.vertices.size}-unknowns"
         text = f"{np.mean(np.asarray(iterations)):.1f} Newton iterations; compiled in {compiling:.1f} s"
         cases.append(expect(name, "seconds_per_step", text, seconds / steps, bound, "s"))
-        cases.append(expect(name, "steps_not_converged", "every step converges", largest(~np.asarray(converged)), 0.0))
+        cases.append(converges(name, converged))
     return Findings(cases)
 
 
@@ -120,7 +109,8 @@ def linear_solvers(quick: bool) -> Findings:
     """Time per factor-and-solve of each linear solver by the number of unknowns."""
     cases, curves = [], {}
     solvers = {"dense": dense, "block-tridiagonal": block_tridiagonal, "matrix-free": matrix_free}
-    for mesh in _meshes(quick):
+    for cells in ((8, 2, 2), (40, 10), (16, 4, 4), (80, 20), *(() if quick else ((32, 8, 8),))):
+        mesh = beam(4.0, 1.0, *cells) if len(cells) == 2 else box((4.0, 1.0, 1.0), cells)
         material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e6, poisson_ratio=0.4)
         scene = make_scene(mesh, [material])
         rest, masses = scene.params.rest, scene.params.masses
@@ -142,8 +132,7 @@ def linear_solvers(quick: bool) -> Findings:
             times.append(seconds)
             text = "as accurate as rounding allows" if name != "matrix-free" else "to a relative residual of 1e-10"
             assert np.isfinite(np.asarray(p)).all()
-            reference = PROTOTYPE[at.unknowns].get(name)
-            where = f"speed/{name}/{at.unknowns}-unknowns"
+            where, reference = f"speed/{name}/{at.unknowns}-unknowns", PROTOTYPE[at.unknowns].get(name)
             cases.append(expect(where, "seconds_per_solve", text, seconds, LIMIT, "s", reference=reference))
     return Findings(cases, curves)
 
@@ -152,20 +141,11 @@ def _inertia(x: Any, weight: Any) -> Any:
     return 0.5 * weight * sum(coordinate**2 for coordinate in x[0])
 
 
-def _meshes(quick: bool) -> Iterator[Any]:
-    yield box((4.0, 1.0, 1.0), (8, 2, 2))
-    yield beam(4.0, 1.0, 40, 10)
-    yield box((4.0, 1.0, 1.0), (16, 4, 4))
-    yield beam(4.0, 1.0, 80, 20)
-    if not quick:
-        yield box((4.0, 1.0, 1.0), (32, 8, 8))
-
-
 def speed_against_error(quick: bool) -> Findings:
     """Error of a swing of a beam against the time step, and how many steps and simulated seconds a second brings."""
-    scene = cantilever_scene(beam(4.0, 1.0, 8, 2), modulus=1e7)
+    scene = cantilever_of(beam(4.0, 1.0, 8, 2), modulus=1e7)
     duration, counts = 0.4, (20, 80) if quick else (10, 40, 160)
-    texts: dict[str, str] = {}
+    texts = {}
     curves: dict[str, Any] = {"dt": duration / np.array(counts)}
     exact = _swung(scene, MIDPOINT, duration, 1600)[0]
     moved = largest(abs(exact - scene.mesh.vertices))
@@ -175,20 +155,15 @@ def speed_against_error(quick: bool) -> Findings:
             x, seconds = _swung(scene, integrator, duration, count)
             errors.append(largest(abs(x - exact)) / moved)
             rates.append(count / seconds)
-        spent = ", ".join(
-            f"{e:.1g} at {count / rate:.2g} s" for e, count, rate in zip(errors, counts, rates, strict=True)
-        )
+        pairs = zip(errors, np.array(counts) / rates, strict=True)
+        spent = ", ".join(f"{error:.1g} at {seconds:.2g} s" for error, seconds in pairs)
         texts[name] = f"error of the motion against seconds: {spent}"
         curves[name] = (np.array(errors), np.array(rates))
-    first_order = curves["backward-euler"][0]
-    fewer = float(first_order[0] / first_order[-1])
-    where = "speed/backward-euler"
-    cases = [expect(where, "error_gain_by_shorter_steps", texts["backward-euler"], fewer, 2.0, at_least=True)]
-    for name in ("bdf2", "midpoint"):
-        gain = float(first_order[-1] / curves[name][0][-1])
-        where = f"speed/{name}"
-        cases.append(expect(where, "error_gain_over_backward_euler", texts[name], gain, 2.0, at_least=True))
-    return Findings(cases, curves)
+    first, gain = curves["backward-euler"][0], "error_gain_over_backward_euler"
+    gains = {"backward-euler": ("error_gain_by_shorter_steps", first[0] / first[-1])}
+    gains |= {name: (gain, first[-1] / curves[name][0][-1]) for name in ("bdf2", "midpoint")}
+    rows = [expect(f"speed/{name}", what, texts[name], by, 2.0, at_least=True) for name, (what, by) in gains.items()]
+    return Findings(rows, curves)
 
 
 def _swung(scene: Any, integrator: Integrator, duration: float, count: int) -> tuple[np.ndarray, float]:
@@ -203,10 +178,5 @@ def timed(function: Any, *arguments: Any, repeats: int = 9) -> tuple[float, floa
     began = time.perf_counter()
     compiled = function.lower(*arguments).compile()
     compiling = time.perf_counter() - began
-    result = jax.block_until_ready(compiled(*arguments))
-    seconds = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        result = jax.block_until_ready(compiled(*arguments))
-        seconds.append(time.perf_counter() - began)
-    return compiling, float(np.median(seconds)), result
+    seconds = medians_in_turns({"": compiled}, arguments, repetitions=repeats, warm_up=1)[""]
+    return compiling, seconds, jax.block_until_ready(compiled(*arguments))
