@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,28 +32,22 @@ def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: s
 
 def farthest_so_far(records: Sequence[Record]) -> Float[np.ndarray, " r"]:
     """The best distance up to each evaluation, 0 at least."""
-    return np.maximum.accumulate(
-        [max(record.distance, 0.0) if record.distance == record.distance else 0.0 for record in records]
-    )
+    return np.maximum.accumulate(np.fmax([record.distance for record in records], 0.0))
 
 
 def median_curve(seeds: Sequence[Sequence[Record]], field: str) -> tuple[np.ndarray, np.ndarray]:
     """Median over seeds of the farthest so far, at all their places; a seed that has ended keeps its last."""
-    places = np.unique([getattr(record, field) for records in seeds for record in records])
-    heights = []
-    for records in seeds:
-        own = np.array([getattr(record, field) for record in records])
-        held = np.concatenate([[0.0], farthest_so_far(records)])
-        heights.append(held[np.searchsorted(own, places, side="right")])
-    return places, np.median(heights, axis=0)
+    own = [[getattr(record, field) for record in records] for records in seeds]
+    places = np.unique(np.concatenate(own))
+    held = [_held(at, farthest_so_far(records), places) for at, records in zip(own, seeds, strict=True)]
+    return places, np.median(held, axis=0)
 
 
 def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Record]], field: str) -> float | None:
     """The place after which the first's median stays ahead of the second's; `None` where it always or never is."""
     curves = [median_curve(seeds, field) for seeds in (first, second)]
     places = np.unique(np.concatenate([places for places, _ in curves]))
-    heights = [np.concatenate([[0.0], values])[np.searchsorted(own, places, side="right")] for own, values in curves]
-    behind = np.flatnonzero(heights[0] < heights[1])
+    behind = np.flatnonzero(_held(*curves[0], places) < _held(*curves[1], places))
     if len(behind) == 0 or behind[-1] == len(places) - 1:
         return None
     return float(places[behind[-1] + 1])
@@ -61,9 +56,8 @@ def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Recor
 def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
     """Farthest distance so far against environment steps and against wall seconds: seeds thin, their median thick."""
     figure, [panels] = style.figure(1, 2, height=3.6, sharey=True)
-    for axis, field, label in zip(
-        panels, ("steps", "seconds"), ("environment steps", "wall time incl. compilation, s"), strict=True
-    ):
+    labels = {"steps": "environment steps", "seconds": "wall time incl. compilation, s"}
+    for axis, (field, label) in zip(panels, labels.items(), strict=True):
         _panel(axis, curves, field, distance)
         axis.set(xlabel=label, xscale="log")
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if field == "seconds" else (1,)))
@@ -80,13 +74,17 @@ def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure
     """The distance of every evaluation against environment steps, a line for each seed."""
     figure, [[axis]] = style.figure(height=3.4)
     for records in seeds:
-        places = [record.steps for record in records]
-        distances = [record.distance for record in records]
-        axis.plot(places, distances, color=COLOURS.get(method, style.PURPLE), linewidth=1.2, alpha=0.8)
+        steps, distances = [record.steps for record in records], [record.distance for record in records]
+        axis.plot(steps, distances, color=COLOURS.get(method, style.PURPLE), linewidth=1.2, alpha=0.8)
     axis.axhline(1.0, color="0.6", linewidth=0.8, linestyle="--")
     axis.set(xlabel="environment steps", ylabel="distance in one episode, body lengths")
     style.title(axis, f"{method}, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}")
     return figure
+
+
+def _held(own: Any, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """The last value up to each place, 0 before the first."""
+    return np.concatenate([[0.0], values])[np.searchsorted(own, places, side="right")]
 
 
 def _panel(axis: Axes, curves: Curves, field: str, distance: float) -> None:
@@ -102,13 +100,10 @@ def _panel(axis: Axes, curves: Curves, field: str, distance: float) -> None:
         if not math.isinf(median):
             axis.plot(median, distance, "o", color=colour, markersize=6, zorder=4)
     first = curves.get("gradient")
-    others = {name: seeds for name, seeds in curves.items() if name != "gradient"}
-    places = [crossover(first, seeds, field) for seeds in others.values()] if first else []
+    places = [crossover(first, seeds, field) for name, seeds in curves.items() if name != "gradient"] if first else []
     if known := [place for place in places if place is not None]:
-        axis.axvline(max(known), color=COLOURS["gradient"], linewidth=0.9, linestyle=":")
+        place, colour, where = max(known), COLOURS["gradient"], ("data", "axes fraction")
+        axis.axvline(place, color=colour, linewidth=0.9, linestyle=":")
         text = "gradient ahead\nof all from here"
-        axis.annotate(
-            text, (max(known), 0.7), xycoords=("data", "axes fraction"), fontsize=style.SMALL, color=COLOURS["gradient"]
-        )
-    heading = {"title": "median to reach the dashed line", "title_fontsize": style.SMALL}
-    style.legend(axis, loc="upper left", **heading)
+        axis.annotate(text, (place, 0.7), xycoords=where, fontsize=style.SMALL, color=colour)
+    style.legend(axis, loc="upper left", title="median to reach the dashed line", title_fontsize=style.SMALL)

@@ -10,6 +10,12 @@ from jaxtyping import Float
 from dln_jax.locomotion.task import FALLEN, Task, actuation_of, advance, beginning, observe
 
 
+def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of observations and of actions."""
+    seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
+    return seen, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
+
+
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """One creature: an action in [-1, 1] per muscle is an actuation in [0.25, 1], the reward is that of the task.
 
@@ -19,10 +25,8 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, task: Task):
         self.task = task
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
-        self._start = beginning(task)
-        self._place = self._start
+        self.observation_space, self.action_space = spaces(task)
+        self._place = self._start = beginning(task)
         self._advance = jax.jit(lambda place, action: advance(task, place, actuation_of(action)))
         self._observe = jax.jit(lambda place: observe(task, place))
 

@@ -60,11 +60,11 @@ def centred_ranks(fitness: Float[Array, " m"]) -> Float[Array, " m"]:
 def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettings = EvolutionSettings()) -> Learner:  # noqa: B008
     """The learner; episodes with a step that does not converge rank last and count as skipped."""
     require_positive(**settings._asdict())
-    like, unravel = _flat(policy, 0)
+    like, unravel = ravel_pytree(policy.init(jax.random.key(0)))
     optimiser = optax.adam(settings.learning_rate)
 
     def start(seed: int) -> EvolutionState:
-        parameters, _ = _flat(policy, seed)
+        parameters, _ = ravel_pytree(policy.init(jax.random.key(seed)))
         zero = jnp.asarray(0)
         return EvolutionState(parameters, optimiser.init(parameters), jnp.asarray(seed), zero, zero)
 
@@ -79,10 +79,8 @@ def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettin
         plus, minus = jnp.split(centred_ranks(found), 2)
         gradient = estimate(plus, minus, noise, settings.deviation)
         change, moments = optimiser.update(-gradient, state.optimiser, state.parameters)
-        skipped = state.skipped + jnp.isnan(found).sum()
-        return EvolutionState(
-            optax.apply_updates(state.parameters, change), moments, state.seed, state.generation + 1, skipped
-        ), None
+        moved, skipped = optax.apply_updates(state.parameters, change), state.skipped + jnp.isnan(found).sum()
+        return EvolutionState(moved, moments, state.seed, state.generation + 1, skipped), None
 
     return Learner(
         policy=policy,
@@ -92,8 +90,3 @@ def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettin
         skipped=lambda state: state.skipped,
         steps=settings.generations * 2 * settings.pairs * task.episode,
     )
-
-
-def _flat(policy: Policy, seed: int) -> tuple[Any, Any]:
-    """First parameters as a vector, and the way back."""
-    return ravel_pytree(policy.init(jax.random.key(seed)))

@@ -150,7 +150,8 @@ def learn(
         seconds = before + time.perf_counter() - began
         records.append(Record(steps, seconds, distance, int(learner.skipped(state))))
         if directory is not None:
-            stored = {**identity, "records": [_json(record) for record in records]}
+            rows = [[value if math.isfinite(value) else None for value in record] for record in records]
+            stored = {**identity, "records": rows}
             checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
         report(records[-1])
     return Learned(best, records, compiled.seconds, len(records) * compiled.episode)
@@ -178,7 +179,3 @@ def _restored(directory: Path, name: str, identity: dict[str, Any], like: Any) -
     rows = stored_rows(directory / f"{name}.json", manifest, "records", (int, float, float | None, int))
     records = [Record(steps, seconds, math.nan if d is None else d, n) for steps, seconds, d, n in rows]
     return checkpoints.load_tree(directory, name, like), records
-
-
-def _json(record: Record) -> list[Any]:
-    return [value if math.isfinite(value) else None for value in record]

@@ -1,6 +1,7 @@
 """The ways of learning by name, and several seeds of one of them."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -73,31 +74,15 @@ def train(
         if resume:
             raise InputError("runs of ppo are not stored on their way; train again without --resume")
         actor = make_actor(task)
-        return Trained(actor, [learn_ppo(task, seed=s, goal=goal, report=_of(report, s)) for s in seeds])
-    policy = make_policy(task, width=width)
-    if method == "gradient":
-        chosen = settings_of(method, task.creature.name, window)
-        learner = make_gradient_learner(task, policy, chosen)
-    else:
-        chosen = settings_of(method, task.creature.name)
-        learner = make_evolution_learner(task, policy, chosen)
-    compiled = compile_learner(task, learner)
+        return Trained(actor, [learn_ppo(task, seed=s, goal=goal, report=partial(report, s)) for s in seeds])
+    policy, chosen = make_policy(task, width=width), settings_of(method, task.creature.name, window)
+    make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
+    compiled = compile_learner(task, make_learner(task, policy, chosen))
     settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
     settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
     settings |= chosen._asdict()
-    runs = [
-        learn(
-            compiled,
-            seed=seed,
-            goal=goal,
-            directory=directory,
-            settings=settings,
-            resume=resume,
-            report=_of(report, seed),
-        )
-        for seed in seeds
-    ]
-    return Trained(policy, runs)
+    one = partial(learn, compiled, goal=goal, directory=directory, settings=settings, resume=resume)
+    return Trained(policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
 def settings_of(method: Method, creature: str, window: int | None = None) -> Any:
@@ -111,7 +96,3 @@ def shown_walk(task: Task, policy: Policy, parameters: Parameters, steps: int) -
     """What a policy does from rest, as NumPy arrays."""
     program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), beginning(task), steps)[1])
     return jax.tree.map(np.asarray, program(jax.tree.map(jnp.asarray, parameters)))
-
-
-def _of(report: Report, seed: int) -> Callable[[Record], None]:
-    return lambda record: report(seed, record)

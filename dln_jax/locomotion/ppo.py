@@ -49,16 +49,15 @@ def require_stable_baselines3() -> None:
 
 def make_actor(task: Task) -> Policy:
     """The actor's mean as a policy; parameters are "w" and "b" of each layer, without an initialisation."""
-    sizes = (task.observation_size, task.muscle_count)
 
     def apply(parameters: Parameters, observation: Float[Array, " o"]) -> Float[Array, " k"]:
-        h = observation.astype(parameters[0]["w"].dtype)
-        for layer in parameters[:-1]:
+        h, (*hidden, last) = observation.astype(parameters[0]["w"].dtype), parameters
+        for layer in hidden:
             h = jnp.tanh(layer["w"] @ h + layer["b"])
-        mean = parameters[-1]["w"] @ h + parameters[-1]["b"]
-        return actuation_of(mean).astype(observation.dtype)
+        return actuation_of(last["w"] @ h + last["b"]).astype(observation.dtype)
 
     def init(key: Array) -> Parameters:
+        sizes = task.observation_size, task.muscle_count
         raise InputError(f"an actor of {sizes} is trained by stable-baselines3, which initialises it")
 
     return Policy(init, apply)
@@ -114,8 +113,7 @@ def learn_ppo(
     )
     evaluate = compile_evaluation(task, make_actor(task), actor_parameters(model))
     compile_seconds = time.perf_counter() - began
-    best, records = actor_parameters(model), []
-    farthest = -math.inf
+    best, records, farthest = actor_parameters(model), [], -math.inf
     while not reached(records, goal):
         model.learn(settings.steps * settings.lanes, reset_num_timesteps=not records)
         parameters = actor_parameters(model)

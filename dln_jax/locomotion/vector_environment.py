@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
+from dln_jax.locomotion.environment import spaces
 from dln_jax.locomotion.learning import chosen
 from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
 
@@ -17,9 +17,8 @@ class VectorEnvironment(VecEnv):
     """Lanes of `CreatureEnvironment`, with rewards times a constant."""
 
     def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0):
-        infinite = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
         self.render_mode = None
-        super().__init__(lanes, infinite, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32))
+        super().__init__(lanes, *spaces(task))
         self._scale = reward_scale
         self._start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (lanes, *leaf.shape)), beginning(task))
         self._places, self._actions = self._start, np.zeros((lanes, task.muscle_count), np.float32)
