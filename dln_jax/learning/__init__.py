@@ -6,13 +6,12 @@
 """
 
 from dln_jax.learning import dynamics, frames, functions, motions, rates
-from dln_jax.learning.basis_degrees import choose_degrees
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
 from dln_jax.learning.growth import grow
-from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
 from dln_jax.learning.rates import match_linear
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics
-from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Potential, Scalar, Vector
 
 

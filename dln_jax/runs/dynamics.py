@@ -15,12 +15,11 @@ from dln_jax.command_line.running import stored_arguments
 from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning import dynamics
-from dln_jax.learning.basis_degrees import choose_degrees
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import TORQUE
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target

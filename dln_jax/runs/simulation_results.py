@@ -16,7 +16,7 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh.mesh import Mesh, volumes
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 from dln_jax.studies.report import Row
 
 TITLES = {

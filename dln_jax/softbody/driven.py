@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import BACKWARD_EULER, Integrator, Stepper, make_step
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 
 Path = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k dim"]]
 Signal = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k"]]

@@ -26,7 +26,7 @@ from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[[Params, State, Any], tuple[State, Info]]

@@ -1,14 +1,16 @@
-"""Gaussian elimination with partial pivoting for small general matrices, written out row by row.
+"""Small linear systems, written out row by row: Gaussian elimination, and substitution with triangular matrices.
 
-The Hessians of learned energies need not be definite, so that Cholesky does not apply. Up to a dozen rows the
-written-out form needs no library call: batched ones that run side by side in one program can wait for each other for
-ever on a machine with few cores (seen with jaxlib 0.10.2 on two).
+The Hessians of learned energies need not be definite, so that Cholesky does not apply. The matrices of mechanics have a
+few rows and come in batches. Written out, they fuse with what surrounds them, which is faster than one library call per
+matrix up to a dozen rows; and several batched LAPACK calls in one program can wait for each other for ever on a machine
+with few cores (seen with jaxlib 0.10.2 on two).
 """
 
 import functools
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 # Beyond this size the library call is faster, and the written-out program slow to compile.
@@ -51,3 +53,22 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
             remainder -= coefficient * solved
         solution.insert(0, remainder / pivot[0])
     return jnp.stack(solution).reshape(b.shape)
+
+
+def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
+    if b.shape[0] > _WRITTEN_OUT_ROWS:
+        return solve_triangular(factor, b, lower=True)
+    x = []
+    for i in range(b.shape[0]):
+        remainder = b[i]
+        for j, solved in enumerate(x):
+            remainder -= factor[i, j] * solved
+        x.append(remainder / factor[i, i])
+    return jnp.stack(x)
+
+
+def solve_lower_transposed(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """x [n] with Lᵀ x = b, by back substitution. A zero on the diagonal gives non-finite values."""
+    # Reversing both axes turns the upper triangle of Lᵀ into a lower one.
+    return solve_lower(factor.T[::-1, ::-1], b[::-1])[::-1]

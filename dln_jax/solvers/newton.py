@@ -15,13 +15,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elimination import solve
-from dln_jax.solvers.info import Info
 from dln_jax.types import InputError, require_positive
 
 Root = Float[Array, " n"]
 
 # A root that is right to the last digit has a residual of about eps |J| |x|; evaluating f adds a few times that.
 _ROUNDING_UNITS = 16
+
+
+class Info(NamedTuple):
+    """How a search for a root or a minimum ended."""
+
+    residual: Float[Array, ""]
+    """Largest |f| at the last point judged: of the equations, or of the gradient in units of its scale."""
+    iterations: Int[Array, ""]
+    """Newton steps taken."""
+    converged: Bool[Array, ""]
+    """Whether the residual is within the tolerance or at the level of rounding; false for values that are not
+    finite."""
+    definite: Bool[Array, ""] | None = None
+    """Of a minimum: whether the Hessian there, as it is, is positive definite, so that it is no saddle. Costs a
+    factorisation, which is left out of the program where this is not used."""
 
 
 class _State(NamedTuple):
@@ -73,17 +87,13 @@ def _newton(
 ) -> tuple[Root, tuple[Array, Array, Array]]:
     rounding = _ROUNDING_UNITS * jnp.finfo(start.dtype).eps
 
-    def value_and_jacobian(x: Root):
-        def twice(x: Root):
-            value = function(x)
-            return value, value
-
-        jacobian, value = jax.jacfwd(twice, has_aux=True)(x)
-        return value, jacobian
+    def twice(x: Root) -> tuple[Root, Root]:
+        value = function(x)
+        return value, value
 
     def iterate(state: _State) -> _State:
         # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
-        value, jacobian = value_and_jacobian(state.x)
+        jacobian, value = jax.jacfwd(twice, has_aux=True)(state.x)
         step = solve(jacobian, value)
         residual = jnp.max(jnp.abs(value))
         floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(state.x))

@@ -24,7 +24,7 @@ from dln_jax.softbody.mesh.creatures import body_length, crawler
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 from dln_jax.types import InputError
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.derivatives import time_derivative
+from dln_jax.data.schema import time_derivative
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
 from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole

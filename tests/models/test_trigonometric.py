@@ -12,8 +12,7 @@ from jax.flatten_util import ravel_pytree
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, split
 from dln_jax.datasets.generators import uniform
-from dln_jax.learning.basis_degrees import choose_degrees
-from dln_jax.learning.linear import LinearFit, design_matrix, fit_linear
+from dln_jax.learning.linear import LinearFit, choose_degrees, design_matrix, fit_linear
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics

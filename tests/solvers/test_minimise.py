@@ -11,11 +11,10 @@ from scipy.spatial import Delaunay
 
 from dln_jax.softbody.mesh.shapes import beam, box
 from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
-from dln_jax.solvers.elements.conjugate_gradients import conjugate_gradients
-from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, square, value
+from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.elements.projection import project
+from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients
 from dln_jax.types import InputError
 
 SOLVERS = {"dense": dense, "block-tridiagonal": block_tridiagonal, "matrix-free": matrix_free}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.scipy.linalg import solve_triangular
 
-from dln_jax.solvers.triangular import solve_lower, solve_lower_transposed
+from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 12, 16, 17, 30])

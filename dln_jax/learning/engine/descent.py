@@ -14,8 +14,7 @@ from jax import Array
 
 from dln_jax.learning.engine import optimisers
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.engine.problem import Best, Problem, Stop, better_of, loss_of, no_best
-from dln_jax.learning.engine.stage import Dispatch, Stage
+from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, loss_of, no_best
 
 
 class State(NamedTuple):

@@ -10,8 +10,7 @@ from jax import Array, lax
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.engine.problem import Best, Problem, Stop, better_of, no_best
-from dln_jax.learning.engine.stage import Dispatch, Stage
+from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, no_best
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.solvers.levenberg_marquardt import Arrays, Status
 from dln_jax.types import InputError

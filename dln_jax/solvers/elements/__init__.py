@@ -4,7 +4,7 @@ from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Blocks, Corners, ElementEnergy
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, by_size, dense, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 
 __all__ = [
     "Blocks",

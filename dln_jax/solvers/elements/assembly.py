@@ -4,7 +4,7 @@ Which elements meet where is known before anything is traced: assembly is by gat
 made here once, because scattering costs a loop iteration per element.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, local
-from dln_jax.solvers.linear_map import linear_map
 from dln_jax.types import InputError
 
 
@@ -105,7 +104,8 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):
         return components.T.reshape(corners.shape[:2])
     padding = components.size
-    # Where each component goes; the transposed map reads there, where differentiation would scatter.
+    # Where each component goes; the transposed map reads there, where differentiation would scatter, which costs a loop
+    # iteration per element on a CPU.
     unknown, slot = np.divmod(np.flatnonzero(corners.reshape(-1) < padding), corners.shape[2])
     to = np.empty(padding, int)
     to[corners.reshape(-1, corners.shape[2])[unknown, slot]] = unknown
@@ -113,10 +113,21 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
     def add(flat: Array) -> Array:
         return jnp.append(flat, 0)[corners].sum(-1).reshape(-1)
 
-    def read(unknowns: Array) -> Array:
-        return unknowns[to]
+    # y = G x, whose transpose is to be a gather too, is the second half of the solution of
+    #     [[1, 0], [-G, 1]] (u, w) = (x, 0),    with the transposed solution u = x + Gᵀ w,
+    # because a linear solve is what JAX lets one give a transpose of, and map over.
+    def product(both: Array) -> Array:
+        return jnp.concatenate([both[:padding], both[padding:] - add(both[:padding])])
 
-    return linear_map(add, read, components.reshape(-1), corners[..., 0].size).reshape(corners.shape[:2])
+    def solve(_: Callable, both: Array) -> Array:
+        return jnp.concatenate([both[:padding], both[padding:] + add(both[:padding])])
+
+    def solve_transposed(_: Callable, both: Array) -> Array:
+        return jnp.concatenate([both[:padding] + both[padding:][to], both[padding:]])
+
+    both = jnp.concatenate([components.reshape(-1), jnp.zeros(corners[..., 0].size, components.dtype)])
+    solution = jax.lax.custom_linear_solve(product, both, solve, transpose_solve=solve_transposed)
+    return solution[padding:].reshape(corners.shape[:2])
 
 
 def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:

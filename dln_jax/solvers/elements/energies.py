@@ -89,3 +89,21 @@ def _written_out_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float
 
 def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
     return x if np.array_equal(blocks, np.arange(len(x))) else x[blocks]
+
+
+def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
+    """Element Hessians (lower triangles) with negative eigenvalues set to zero, plus a multiple of the unit matrix.
+
+    `shift` is what is added to the diagonals, relative to the largest eigenvalue of all.
+    """
+    wholes = [square(lower) for lower in hessians]
+    largest = max(h.shape[-1] for h in wholes)
+    # One call for all: several batched LAPACK calls in one program can wait for each other for ever.
+    padded = [jnp.pad(h, ((0, 0), (0, largest - h.shape[-1]), (0, largest - h.shape[-1]))) for h in wholes]
+    stacked = jnp.concatenate(padded)
+    finite = jnp.where(jnp.isfinite(stacked), stacked, 0)
+    values, vectors = jnp.linalg.eigh(finite)
+    values = jnp.maximum(values, 0) + shift * jnp.max(values, initial=0)
+    projected = (vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2)
+    parts = jnp.split(projected, np.cumsum([len(h) for h in wholes])[:-1])
+    return tuple(lower_triangles(part[:, : h.shape[-1], : h.shape[-1]]) for part, h in zip(parts, wholes, strict=True))

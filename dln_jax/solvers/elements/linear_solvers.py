@@ -22,9 +22,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dln_jax.solvers.elements.assembly import Pattern, assemble
-from dln_jax.solvers.elements.block_tridiagonal import factorise_blocks, solve_blocks
-from dln_jax.solvers.elements.conjugate_gradients import conjugate_gradients
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
+from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
 
 # Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160

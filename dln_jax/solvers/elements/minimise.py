@@ -20,11 +20,10 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from dln_jax.solvers.elements.assembly import Pattern, entries, gradient, pattern, value_and_gradient
-from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians
+from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, element_hessians, project
 from dln_jax.solvers.elements.line_search import Point, line_search
 from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFactory, by_size
-from dln_jax.solvers.elements.projection import project
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 from dln_jax.types import InputError, require_positive
 
 # Gradients and energies cannot be told from zero below so many units of rounding.

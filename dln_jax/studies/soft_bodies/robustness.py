@@ -20,7 +20,7 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
-from dln_jax.solvers.info import Info
+from dln_jax.solvers.newton import Info
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, expect, largest
 from dln_jax.studies.soft_bodies.common import GRAVITY, Seen, cantilever_of, converges, motion
