@@ -30,8 +30,6 @@ JOINTS = get_args(JointKind)
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "needs")
-
-
 LARGEST_INDEX = 2**53
 """Up to which float64 tells whole numbers apart."""
 
@@ -100,7 +98,11 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     if "tau" not in arrays:
         checked["tau"] = np.zeros_like(q)
         estimated.append("tau")
-    needs = _stated_needs(arrays, q.shape[1])
+    needs = needs_from_text(str(arrays["needs"])) if "needs" in arrays else None
+    if needs is not None and needs.degrees_of_freedom != q.shape[1]:
+        raise InputError(
+            f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
+        )
     return Trajectories(t=t, trajectory=trajectory, label=label, needs=needs, estimated=tuple(estimated), **checked)
 
 
@@ -196,15 +198,6 @@ def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.nd
         sample = int(np.flatnonzero(backward)[0]) + 1
         name = label[trajectory[sample]]
         raise InputError(f"t does not increase at sample {sample} of trajectory '{name}'; sort the samples by time")
-
-
-def _stated_needs(arrays: dict[str, Any], d: int) -> Needs | None:
-    if "needs" not in arrays:
-        return None
-    needs = needs_from_text(str(arrays["needs"]))
-    if needs.degrees_of_freedom != d:
-        raise InputError(f"needs states {needs.degrees_of_freedom} joints, but q has {d} columns; make them agree")
-    return needs
 
 
 def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:

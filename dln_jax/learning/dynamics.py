@@ -48,8 +48,11 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
         squares = _squares(objective, model, parameters, held_out, scale)
         return squares[: len(selected_by[0])].mean(), squares[len(selected_by[0]) :].mean()
 
-    seed = seeds if isinstance(seeds, int) else jnp.asarray(seeds)
-    return Problem(residual, initial_parameters(model, seeds), fitted, score, seed)
+    if isinstance(seeds, int):
+        return Problem(residual, jax.jit(model.init)(jax.random.key(seeds)), fitted, score, seeds)
+    numbers = jnp.asarray(seeds)
+    initial = jax.jit(lambda each: jax.lax.map(lambda seed: model.init(jax.random.key(seed)), each))
+    return Problem(residual, initial(numbers), fitted, score, numbers)
 
 
 def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[Array, ...]:
@@ -62,15 +65,6 @@ def identity_of(
 ) -> dict[str, Any]:
     """By what a `Checkpoint` of a training recognises it."""
     return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
-
-
-def initial_parameters(model: Model, seeds: int | Sequence[int]) -> Parameters:
-    """The parameters that training starts from; with a leading axis for a sequence of seeds."""
-    if isinstance(seeds, int):
-        return jax.jit(model.init)(jax.random.key(seeds))
-    return jax.jit(lambda numbers: jax.lax.map(lambda seed: model.init(jax.random.key(seed)), numbers))(
-        jnp.asarray(seeds)
-    )
 
 
 def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[type[Optimiser], str]:

@@ -58,17 +58,8 @@ class Network(NamedTuple):
     """Of the initial parameters and the order of the samples."""
 
 
-class Targets(NamedTuple):
-    """What a loss reads, samples on axis 0; `None` is what it does not read, and is never computed."""
-
-    x: Array
-    """[N, n]"""
-    y: Array
-    """[N, m]"""
-    dy: Array | None = None
-    """[N, m, n]"""
-    d2y: Array | None = None
-    """[N, m, n, n]"""
+Targets = tuple[Array, Array | None, Array | None, Array | None]
+"""x, y, dy and d2y of `FunctionSamples`; `None` is what a loss does not read, and is never computed."""
 
 
 def published_adam(
@@ -101,25 +92,39 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
     require_network(width=network.width, depth=network.depth)
     activation(network.activation)
     dtype = data_type(network.precision)
-    return Targets(**{key: on_device(key, getattr(data, key), dtype) for key in _needed(data, network)})
+    if network.loss not in LOSSES:
+        raise InputError(f"loss is '{network.loss}'; expected one of {', '.join(LOSSES)}")
+    if network.derivative not in (1, 2):
+        raise InputError(f"derivative is {network.derivative}; expected 1, or 2 to fit the Hessian too")
+    given = data._replace(
+        dy=data.dy if network.loss == "type1" else None, d2y=data.d2y if network.derivative == 2 else None
+    )
+    if network.loss == "type1" and given.dy is None:
+        raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
+    if network.derivative == 2 and given.d2y is None:
+        raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
+    x, y, dy, d2y = (None if a is None else on_device(key, a, dtype) for key, a in given._asdict().items())
+    assert x is not None
+    return x, y, dy, d2y
 
 
-def residual(layers: Layers, sample: Targets, *, activation: Activation) -> Float[Array, "r"]:
-    """r of one sample, as far as the sample has targets: value, Jacobian and Hessian, flat, one after the other."""
-    if sample.d2y is not None:
-        predicted = differential_mlp.value_jacobian_and_hessian(layers, sample.x, activation=activation)
-    elif sample.dy is not None:
-        predicted = differential_mlp.value_and_jacobian(layers, sample.x, activation=activation)
+def residual(
+    layers: Layers, x: Array, y: Array | None, dy: Array | None, d2y: Array | None, *, activation: Activation
+) -> Float[Array, "r"]:
+    """r of one sample, as far as there are targets: value, Jacobian and Hessian, flat, one after the other."""
+    if d2y is not None:
+        predicted = differential_mlp.value_jacobian_and_hessian(layers, x, activation=activation)
+    elif dy is not None:
+        predicted = differential_mlp.value_and_jacobian(layers, x, activation=activation)
     else:
-        predicted = (differential_mlp.value(layers, sample.x, activation=activation),)
-    pairs = zip(predicted, sample[1:], strict=False)
+        predicted = (differential_mlp.value(layers, x, activation=activation),)
+    pairs = zip(predicted, (y, dy, d2y), strict=False)
     return jnp.concatenate([(ours - theirs).ravel() for ours, theirs in pairs if theirs is not None])
 
 
 def mean_loss(layers: Layers, batch: Targets, *, activation: Activation) -> Scalar:
     """Mean over samples of |r|²."""
-    residuals = jax.vmap(lambda sample: residual(layers, sample, activation=activation))(batch)
-    return jnp.mean(jnp.sum(residuals**2, axis=-1))
+    return mean_square(functools.partial(residual, layers, activation=activation), batch)
 
 
 def train(
@@ -162,18 +167,10 @@ def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool)
     layers = ensembles.init(
         jax.random.key(network.seed), sizes, members=network.members, dtype=data_type(network.precision)
     )
-    function, keys = activation(network.activation), [key for key, each in ours._asdict().items() if each is not None]
-    arrays = tuple(getattr(ours, key) for key in keys)
+    function = activation(network.activation)
+    of_member = functools.partial(mean_loss, activation=function)
 
-    held_out = tuple(getattr(theirs, key) for key in keys)
-
-    def of_sample(member: Layers, *sample: Array) -> Array:
-        return residual(member, Targets(**dict(zip(keys, sample, strict=True))), activation=function)
-
-    def of_member(member: Layers, batch: tuple[Array, ...]) -> Scalar:
-        return mean_square(functools.partial(of_sample, member), batch)
-
-    def together(layers: Layers, batch: tuple[Array, ...]) -> Scalar:
+    def together(layers: Layers, batch: Targets) -> Scalar:
         """A sum, so that each member's gradient, and with it its training, is the same as alone."""
         if network.members == 1:
             # An axis of one member would make every product a batch of products, at two or three times the cost.
@@ -182,30 +179,13 @@ def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool)
 
     if each_member_by_itself:
         seeds = jnp.full(network.members, network.seed)
-        return Problem(of_sample, layers, arrays, lambda member: unmonitored(of_member(member, held_out)), seeds)
+        of_sample = functools.partial(residual, activation=function)
+        return Problem(of_sample, layers, ours, lambda member: unmonitored(of_member(member, theirs)), seeds)
 
     def score(layers: Layers) -> tuple[Scalar, Scalar]:
-        return unmonitored(together(layers, held_out) / network.members)
+        return unmonitored(together(layers, theirs) / network.members)
 
-    return Problem(None, layers, arrays, score, network.seed, together)
-
-
-def _needed(data: FunctionSamples, network: Network) -> list[str]:
-    """Keys of the data that the loss reads."""
-    if network.loss not in LOSSES:
-        raise InputError(f"loss is '{network.loss}'; expected one of {', '.join(LOSSES)}")
-    if network.derivative not in (1, 2):
-        raise InputError(f"derivative is {network.derivative}; expected 1, or 2 to fit the Hessian too")
-    needed = ["x", "y"]
-    if network.loss == "type1":
-        if data.dy is None:
-            raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
-        needed.append("dy")
-    if network.derivative == 2:
-        if data.d2y is None:
-            raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
-        needed.append("d2y")
-    return needed
+    return Problem(None, layers, ours, score, network.seed, together)
 
 
 def grow_width(
@@ -225,12 +205,12 @@ def grow_width(
 
 def validation_errors(sets: SampleSplit, network: Network, layers: Layers) -> Float[np.ndarray, " N"]:
     """|r|² of each validation sample, the mean over the ensemble's members."""
-    function = activation(network.activation)
+    of_sample = functools.partial(residual, activation=activation(network.activation))
 
     @jax.jit
     def squares(batch: Targets) -> Array:
         def of_member(member: Layers) -> Array:
-            return jax.vmap(lambda sample: jnp.sum(residual(member, sample, activation=function) ** 2))(batch)
+            return jax.vmap(lambda *sample: jnp.sum(of_sample(member, *sample) ** 2))(*batch)
 
         return jnp.mean(jax.vmap(of_member)(layers), axis=0)
 

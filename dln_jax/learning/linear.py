@@ -60,14 +60,6 @@ class LinearFit(NamedTuple):
     """Of the whole call, compilation included."""
 
 
-def design_matrix(model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi [d, P] = d tau / d theta of one state; columns in the order of `ravel_pytree(parameters)`.
-
-    The same for all parameters if the model is linear in them.
-    """
-    return _linearised(model, parameters, q, qd, qdd)[0]
-
-
 def fit_linear(
     model: Model,
     data: Trajectories,
@@ -98,7 +90,7 @@ def fit_linear(
         scale = np.asarray(torque_scale(data))
         zero = np.zeros(count(like))
         # One program for both passes.
-        one = functools.partial(_linearised, model)
+        one = functools.partial(linearised, model)
         linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
         def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -127,10 +119,10 @@ def fit_linear(
     )
 
 
-def _linearised(
+def linearised(
     model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
 ) -> tuple[Float[Array, "d P"], Vector]:
-    """Phi and tau of one state."""
+    """Phi = d tau / d theta of one state, columns in the order of `ravel_pytree(parameters)`, and tau."""
 
     def torque(parameters: Parameters) -> Vector:
         return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)

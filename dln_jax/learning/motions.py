@@ -105,9 +105,7 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
 
 def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
     """Some of the windows."""
-    rows = np.asarray(chosen, int)
-    rate = None if windows.rate is None else windows.rate[rows]
-    return Windows(windows.t[rows], windows.state[rows], rate, windows.weight[rows])
+    return jax.tree.map(lambda array: array[np.asarray(chosen, int)], windows)
 
 
 def motion(field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, substeps: int) -> Float[Array, "T two_d"]:
@@ -118,7 +116,7 @@ def motion(field: Flow | PlainFlow, start: Array, t: Float[Array, " T"], *, subs
 
 
 def window_residual(
-    field: Flow | PlainFlow, weights: Weights, start: Array, window: tuple[Array, ...], *, substeps: int
+    field: Flow | PlainFlow, start: Array, window: tuple[Array, ...], *, weights: Weights, substeps: int
 ) -> Array:
     """Weighted residuals of one window (t, state, weight[, rate]); their squares sum to a mean over its samples."""
     t, measured, weight, *rate = window
@@ -167,15 +165,13 @@ def problem(
 
     def residual(unknowns, index: Array, *window: Array) -> Array:
         start = unknowns["starts"][index] if free_starts else window[1][0]
-        return error(flow(model.energies(unknowns["model"])), start=start, window=window)
+        return error(flow(model.energies(unknowns["model"])), start, window)
 
     def score(unknowns) -> tuple[Scalar, Scalar]:
         field = flow(model.energies(unknowns["model"]))
 
         def closest(*window: Array) -> Array:
-            def from_start(start: Array) -> Array:
-                return error(field, start=start, window=window)
-
+            from_start = functools.partial(error, field, window=window)
             start = window[1][0]
             return from_start(_nearest(from_start, start) if free_starts else start)
 
@@ -199,14 +195,11 @@ def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tupl
             raise InputError("the weights count rates, which the windows lack; leave their weight out")
     if not len(windows.t) or not len(validation.t):
         raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
-    return [_arrays(each, weights) for each in (windows, validation)]
-
-
-def _arrays(windows: Windows, weights: Weights) -> tuple[Array, ...]:
-    given = {"t": windows.t, "state": windows.state, "weight": windows.weight}
-    if weights.rate is not None and windows.rate is not None:
-        given["rate"] = windows.rate
-    return tuple(on_device(name, array, jnp.result_type(float)) for name, array in given.items())
+    keys = ("t", "state", "weight", *(["rate"] if weights.rate is not None else []))
+    return [
+        tuple(on_device(key, getattr(each, key), jnp.result_type(float)) for key in keys)
+        for each in (windows, validation)
+    ]
 
 
 def _nearest(residual: Callable[[Array], Array], start: Array) -> Array:

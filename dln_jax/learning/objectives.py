@@ -13,7 +13,7 @@ from dln_jax.data.magnitudes import on_device, spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import Canonical, System, dynamics, hamiltonian_of
-from dln_jax.types import InputError, Scalar, Vector
+from dln_jax.types import InputError, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
 
@@ -118,11 +118,6 @@ def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array,
 def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) -> Float[Array, "N r"]:
     """Residuals of a batch, in SI units."""
     return vmap(lambda *sample: objective.residual(system, *sample))(*batch)
-
-
-def mean_loss(objective: Objective, system: System, batch: tuple[Array, ...], scale: Float[Array, " r"]) -> Scalar:
-    """Mean over samples of the sum of squared residuals in units of `scale` (Lutter et al. 2019)."""
-    return jnp.mean(jnp.sum((residuals(objective, system, batch) / scale) ** 2, axis=-1))
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:

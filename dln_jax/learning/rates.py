@@ -29,9 +29,6 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
-FIELD = ("q", "p", "qd", "pd")
-"""Arrays that a fit reads."""
-
 
 def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
     """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d], whose sum of squares is the sample's part of the loss."""
@@ -63,7 +60,8 @@ def problem(
     require_seed(seed)
     parameters = jax.jit(model.init)(jax.random.key(seed))
     dtype = jnp.result_type(*jax.tree.leaves(parameters))
-    fitted, held_out = (_drawn(part, seed, most_samples, dtype) for part in (train, validation))
+    orders = (np.random.default_rng(seed).permutation(len(part.t))[:most_samples] for part in (train, validation))
+    fitted, held_out = (samples(part, dtype, order) for part, order in zip((train, validation), orders, strict=True))
 
     def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
         return unmonitored(loss(model, parameters, held_out))
@@ -98,22 +96,12 @@ def match_linear(
     return Training(jnp.asarray(found.x), [at], Stop("finished", 1), 1, 0.0), squares
 
 
-def samples(data: Trajectories, dtype: Any = jnp.float64) -> tuple[Array, ...]:
-    """q, p, qd, pd on the device.
+def samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(None)) -> tuple[Array, ...]:
+    """q, p, qd, pd of all samples, or of those chosen, on the device.
 
     Raises:
         InputError: no p or pd in the data, or numbers whose squares overflow.
     """
-    return tuple(on_device(name, array, dtype) for name, array in zip(FIELD, _arrays(data), strict=True))
-
-
-def _drawn(data: Trajectories, seed: int, most: int, dtype: Any) -> tuple[Array, ...]:
-    """At most so many samples, in random order."""
-    chosen = np.random.default_rng(seed).permutation(len(data.t))[:most]
-    return tuple(on_device(name, array[chosen], dtype) for name, array in zip(FIELD, _arrays(data), strict=True))
-
-
-def _arrays(data: Trajectories) -> tuple[np.ndarray, ...]:
     if data.p is None or data.pd is None:
         raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
-    return data.q, data.p, data.qd, data.pd
+    return tuple(on_device(name, getattr(data, name)[chosen], dtype) for name in ("q", "p", "qd", "pd"))

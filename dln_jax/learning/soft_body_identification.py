@@ -77,8 +77,7 @@ def identify(
         given = controls if controls.shape[1] else None
         advance = functools.partial(step, params_of(theta))
         _, x = rollout(advance, init(x0, v0), given, steps=observed.shape[0], observe=lambda state, info: state.x)
-        seen = jnp.isfinite(observed)
-        return jnp.where(seen, x - jnp.where(seen, observed, 0), 0) / noise
+        return _seen_difference(x, observed) / noise
 
     return _fitted(lambda theta: jax.vmap(functools.partial(residual, theta))(*motions), guess, iterations)
 
@@ -102,13 +101,16 @@ def design(
     """
     require_positive(noise=noise, iterations=iterations)
 
-    seen = jnp.isfinite(wanted)
-
     def residual(theta: Any) -> Array:
-        x, _ = static_solve(scene, params_of(theta), x=scene.params.rest)
-        return jnp.where(seen, x - jnp.where(seen, wanted, 0), 0) / noise
+        return _seen_difference(static_solve(scene, params_of(theta), x=scene.params.rest)[0], wanted) / noise
 
     return _fitted(residual, guess, iterations)
+
+
+def _seen_difference(x: Array, given: Array) -> Array:
+    """Zero where what is given is not finite, with derivatives that are."""
+    seen = jnp.isfinite(given)
+    return jnp.where(seen, x - jnp.where(seen, given, 0), 0)
 
 
 def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int) -> Fitted:

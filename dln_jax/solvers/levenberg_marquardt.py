@@ -31,8 +31,8 @@ from jax.flatten_util import ravel_pytree
 from dln_jax.solvers import normal_equations as equations
 from dln_jax.solvers.normal_equations import SampleResidual
 
-Arrays = tuple[Array, ...]
-"""Samples on axis 0."""
+Arrays = tuple[Any, ...]
+"""Samples on axis 0; `None` is handed on as it is."""
 FIRST_DAMPING = 1e-3
 """Relative to the largest diagonal entry of the first A."""
 LEAST_DAMPING = 1e-16

@@ -29,8 +29,8 @@ _ROWS_PER_BLOCK = 200
 class Chunks(NamedTuple):
     """Samples in `k` equal chunks of `c`; the last one is filled up with samples of weight 0."""
 
-    arrays: tuple[Array, ...]
-    """Each [k, c, ...]."""
+    arrays: tuple[Any, ...]
+    """Each [k, c, ...], or None."""
     weights: Array
     """1 for a sample, 0 for a filler, [k, c]."""
 
@@ -84,22 +84,22 @@ def check_precision(tree: Any, what: str) -> None:
         )
 
 
-def check_data(sample_residual: SampleResidual, parameters: Any, arrays: tuple[Array, ...]) -> tuple[int, int]:
+def check_data(sample_residual: SampleResidual, parameters: Any, arrays: tuple[Any, ...]) -> tuple[int, int]:
     """Samples, and residuals of a sample.
 
     Raises:
         InputError: something is not float64, or arrays differ in length.
     """
     check_precision(parameters, "parameters")
-    lengths = [array.shape[0] if array.ndim else 0 for array in arrays]
+    lengths = [array.shape[0] if array.ndim else 0 for array in jax.tree.leaves(arrays)]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise InputError(f"data arrays have {lengths} samples on axis 0; expected the same positive number in each")
-    residual = jax.eval_shape(sample_residual, parameters, *(array[0] for array in arrays))
+    residual = jax.eval_shape(sample_residual, parameters, *jax.tree.map(lambda array: array[0], arrays))
     check_precision(residual, "residuals")
     return lengths[0], residual.size
 
 
-def split(arrays: tuple[Array, ...], chunk_size: int) -> Chunks:
+def split(arrays: tuple[Any, ...], chunk_size: int) -> Chunks:
     """The samples in as few equal chunks of at most `chunk_size` as hold them; fillers are the first sample."""
     samples = arrays[0].shape[0]
     pieces = -(-samples // chunk_size)
@@ -108,7 +108,7 @@ def split(arrays: tuple[Array, ...], chunk_size: int) -> Chunks:
     rows = jnp.concatenate([jnp.arange(samples), jnp.zeros(fillers, int)])
     weights = jnp.concatenate([jnp.ones(samples), jnp.zeros(fillers)])
     return Chunks(
-        tuple(array[rows].reshape(pieces, length, *array.shape[1:]) for array in arrays),
+        jax.tree.map(lambda array: array[rows].reshape(pieces, length, *array.shape[1:]), arrays),
         weights.reshape(pieces, length),
     )
 
@@ -128,7 +128,7 @@ def normal_equations(
     def one(*sample):
         return jax.vjp(lambda each: jnp.ravel(sample_residual(each, *sample)), parameters)
 
-    def forward(samples: tuple[Array, ...]) -> Array:
+    def forward(samples: tuple[Any, ...]) -> Array:
         def along(direction: Array) -> Array:
             return jax.jvp(lambda x: residuals_of(sample_residual, unravel(x), samples), (point,), (direction,))[1]
 
@@ -167,7 +167,7 @@ def normal_equations(
     return NormalEquations(lower, vector, squares, jacobian)
 
 
-def residuals_of(sample_residual: SampleResidual, parameters: Any, samples: tuple[Array, ...]) -> Float[Array, "r c"]:
+def residuals_of(sample_residual: SampleResidual, parameters: Any, samples: tuple[Any, ...]) -> Float[Array, "r c"]:
     """Residuals of c samples, one row per residual of a sample."""
     return jax.vmap(lambda *sample: jnp.ravel(sample_residual(parameters, *sample)))(*samples).T
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from dln_jax.files import finite, is_file, matches
 from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import Progress, plain
+from dln_jax.learning.engine.problem import Progress
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
@@ -52,7 +52,10 @@ def fingerprint(arrays: Iterable[np.ndarray | Array | None]) -> str:
 
 def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
     """Writes the state of a run and what it has reported so far."""
-    facts = {**checkpoint.identity, "history": [[_json(value) for value in row] for row in history]}
+    facts = {
+        **checkpoint.identity,
+        "history": finite([[np.asarray(value).tolist() for value in row] for row in history]),
+    }
     number = int(np.max(history[-1].step)) if history else 0
     checkpoints.save_tree(checkpoint.directory, checkpoint.name, state, facts, number=number)
 
@@ -100,16 +103,6 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, types: Sequence[
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
     """Whether a run in this folder got as far as its first checkpoint."""
     return is_file(directory / f"{name}.json")
-
-
-def _json(value: Any) -> Any:
-    """NaN and infinity are no JSON."""
-    if isinstance(value, str):
-        return value
-    if np.ndim(value):
-        return [_json(each) for each in value]
-    value = plain(value)
-    return value if isinstance(value, int) or math.isfinite(value) else None
 
 
 def _number(value: Any) -> Any:

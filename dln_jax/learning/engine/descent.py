@@ -45,7 +45,11 @@ class Lengths(NamedTuple):
 
 def stages(problem: Problem, adam: Adam) -> list[Stage]:
     """The one stage of a run."""
-    lengths = _lengths(adam, problem.arrays[0].shape[0])
+    samples = problem.arrays[0].shape[0]
+    batch = min(adam.batch, samples)
+    batches = samples // batch
+    epochs = -(-adam.steps // batches)
+    lengths = Lengths(batch, batches, epochs, min(epochs, -(-adam.steps_per_dispatch // batches)))
     prepare = jax.vmap if problem.several else lambda function, *axes: function
     begin = jax.jit(prepare(lambda parameters, seed: _begin(adam, parameters, seed)))
     dispatch = jax.jit(
@@ -66,13 +70,6 @@ def stages(problem: Problem, adam: Adam) -> list[Stage]:
         return None
 
     return [Stage("", lambda before: begin(problem.parameters, problem.seed), compile_, ended)]
-
-
-def _lengths(adam: Adam, samples: int) -> Lengths:
-    batch = min(adam.batch, samples)
-    batches = samples // batch
-    epochs = -(-adam.steps // batches)
-    return Lengths(batch, batches, epochs, min(epochs, -(-adam.steps_per_dispatch // batches)))
 
 
 def _epoch(state: State) -> int:

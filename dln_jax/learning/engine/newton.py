@@ -37,10 +37,10 @@ def stages(problem: Problem, optimiser: GaussNewton) -> list[Stage]:
     """One stage, or two."""
     if problem.residual is None:
         raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
-    arrays = tuple(map(jnp.asarray, problem.arrays))
+    arrays = jax.tree.map(jnp.asarray, problem.arrays)
     if not optimiser.has_coarse_stage(len(arrays[0])):
         return [_stage(problem, optimiser, "", arrays, optimiser.steps)]
-    some = tuple(array[: optimiser.coarse_samples] for array in arrays)
+    some = jax.tree.map(lambda array: array[: optimiser.coarse_samples], arrays)
     return [
         _stage(problem, optimiser, SOME, some, optimiser.coarse_steps),
         _stage(problem, optimiser, ALL, arrays, optimiser.steps),

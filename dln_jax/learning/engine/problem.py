@@ -23,14 +23,14 @@ class Problem(NamedTuple):
     of their squares. `None` where the loss is no such sum."""
     parameters: Any
     """To start from."""
-    arrays: tuple[Array, ...]
-    """Samples on axis 0."""
+    arrays: tuple[Any, ...]
+    """Samples on axis 0; `None` is handed on as it is."""
     score: Callable[[Any], tuple[Array, Array]]
     """Parameters of one seed -> the value that is to be low, and one that is only shown (NaN for none)."""
     seed: int | Array = 0
     """Of the order of the samples. An array [K] trains K seeds in one program, each as it would alone: the parameters
     then have a leading axis of K."""
-    loss: Callable[[Any, tuple[Array, ...]], Array] | None = None
+    loss: Callable[[Any, Any], Array] | None = None
     """(parameters, batch) -> what Adam makes small, where that is not the mean of squared residuals."""
 
     @property
@@ -39,7 +39,7 @@ class Problem(NamedTuple):
         return np.ndim(self.seed) > 0
 
 
-def loss_of(problem: Problem) -> Callable[[Any, tuple[Array, ...]], Scalar]:
+def loss_of(problem: Problem) -> Callable[[Any, Any], Scalar]:
     """(parameters of one seed, batch) -> the loss."""
     if problem.loss is not None:
         return problem.loss
@@ -49,7 +49,7 @@ def loss_of(problem: Problem) -> Callable[[Any, tuple[Array, ...]], Scalar]:
     return lambda parameters, batch: mean_square(lambda *sample: residual(parameters, *sample), batch)
 
 
-def mean_square(residual: Callable[..., Array], batch: tuple[Array, ...]) -> Scalar:
+def mean_square(residual: Callable[..., Array], batch: tuple[Any, ...]) -> Scalar:
     """Mean over samples of the sum of squared residuals."""
     each = jax.vmap(residual)(*batch)
     return jnp.mean(jnp.sum(each**2, axis=tuple(range(1, each.ndim))))
@@ -60,7 +60,7 @@ def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
     return value, jnp.full_like(value, jnp.nan)
 
 
-def require_finite_start(problem: Problem, arrays: tuple[Array, ...]) -> None:
+def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
     """Raises `InputError` unless the (first seed's) loss on these arrays is finite where training starts.
 
     Takes a compilation.
