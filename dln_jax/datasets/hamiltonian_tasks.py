@@ -41,9 +41,9 @@ from dln_jax.datasets.phase_samples import Task, make_task
 from dln_jax.mechanics import hamiltonian
 from dln_jax.precision import in_float64
 from dln_jax.scenes.double_pendulum import double_pendulum as double_pendulum_scene
-from dln_jax.scenes.henon_heiles import henon_heiles as henon_heiles_scene
-from dln_jax.scenes.mass_spring import mass_spring
 from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.oscillators import henon_heiles as henon_heiles_scene
+from dln_jax.scenes.oscillators import mass_spring
 from dln_jax.scenes.pendulum import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector
@@ -76,7 +76,7 @@ def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-1
         x = 0.5 + random.rand(2)
         velocity = _turned(x, np.pi / 2) / (2 * np.hypot(*x) ** 1.5) * (1 + 0.05 * random.randn())
         starts.append(([*x, *-x], [*velocity, *-velocity]))
-    return _bodies(2, np.array(starts), np.linspace(0, 20, 50), tolerance)
+    return _without_noise(*_attracting(2), np.array(starts), np.linspace(0, 20, 50), tolerance)
 
 
 @in_float64
@@ -94,23 +94,17 @@ def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e
         change = 1 + 0.2 * (2 * random.rand(3, 2) - 1)
         q, p = (np.array([_turned(vector, k * third) for k in range(3)]) for vector in (x, velocity))
         starts.append((q.ravel(), (change * p).ravel()))
-    return _bodies(3, np.array(starts), np.linspace(0, 5, 20), tolerance)
+    return _without_noise(*_attracting(3), np.array(starts), np.linspace(0, 5, 20), tolerance)
 
 
-def damped_spring(seed: int = 0, *, trajectories: int = 50, friction: float = 0.1) -> Task:
-    """The mass on a spring that loses energy."""
-    return spring(seed, trajectories=trajectories, friction=friction)
-
-
-def damped_pendulum(seed: int = 0, *, trajectories: int = 50, friction: float = 0.1) -> Task:
-    """The pendulum that loses energy."""
-    return pendulum(seed, trajectories=trajectories, friction=friction)
+damped_spring = functools.partial(spring, friction=0.1)
+damped_pendulum = functools.partial(pendulum, friction=0.1)
 
 
 @in_float64
 def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
     """A unit mass in the well of Hénon and Heiles, on orbits that stay in it."""
-    scene = _scene(henon_heiles_scene)
+    scene, H = _system(henon_heiles_scene)
     assert scene.potential is not None
     random = np.random.default_rng(seed)
     angle, direction = random.uniform(0, 2 * np.pi, (2, trajectories))
@@ -118,7 +112,7 @@ def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1
     q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(scene.potential)(jnp.asarray(q)))
     p = np.sqrt(2 * kinetic)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-    return _without_noise(scene, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
+    return _without_noise(scene, H, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
 
 
 @in_float64
@@ -126,24 +120,30 @@ def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float 
     """The double pendulum of 1 kg and 1 m, released from rest."""
     q = np.random.default_rng(seed).uniform(-1.2, 1.2, (trajectories, 2))
     starts = np.stack([q, np.zeros_like(q)], axis=1)
-    return _without_noise(_scene(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
+    return _without_noise(*_system(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
 
 
-def _without_noise(scene: Scene, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
-    H = _energy(scene)
+def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
     return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
 # One object for each, by which compiled functions are found again.
 @functools.cache
-def _scene(make: Callable[[], Scene]) -> Scene:
-    return make()
+def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
+    scene = make()
+    # Exact in one step: the kinetic energy is quadratic.
+    return scene, hamiltonian.legendre(scene.lagrangian, iterations=1)
 
 
 @functools.cache
-def _energy(scene: Scene) -> Hamiltonian:
-    # Exact in one step: the kinetic energy is quadratic.
-    return hamiltonian.legendre(scene.lagrangian, iterations=1)
+def _attracting(n: int) -> tuple[Scene, Hamiltonian]:
+    scene = n_body(n)
+
+    def H(q: Vector, p: Vector) -> Scalar:
+        assert scene.potential is not None
+        return 0.5 * jnp.sum(p**2) + scene.potential(q)
+
+    return scene, H
 
 
 def _circle(q: Vector, p: Vector) -> Scalar:
@@ -183,22 +183,6 @@ def _oscillator(
     t = np.linspace(0, 3, samples)
     starts, errors = np.array(starts).reshape(-1, 2, 1), np.array(errors).reshape(-1, 2, samples, 1)
     return make_task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
-
-
-@functools.cache
-def _attracting(n: int) -> tuple[Scene, Hamiltonian]:
-    scene = n_body(n)
-
-    def H(q: Vector, p: Vector) -> Scalar:
-        assert scene.potential is not None
-        return 0.5 * jnp.sum(p**2) + scene.potential(q)
-
-    return scene, H
-
-
-def _bodies(n: int, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
-    scene, H = _attracting(n)
-    return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
 Protocol = Callable[..., Task]

@@ -55,16 +55,14 @@ class LetterPath(NamedTuple):
 
 
 class _Stroke(NamedTuple):
-    """A curve over phase 0..1: a closed contour, or a straight pen-up move (whose harmonics are zero)."""
+    """A curve over phase 0..1: a closed contour, or a straight pen-up move (whose harmonics are zero); all in m."""
 
     cosines: Float[np.ndarray, "harmonics 2"]
-    """Coefficients of cos(2 pi k phase), k = 0, 1, ..., m."""
+    """Coefficients of cos(2 pi k phase), k = 0, 1, ...."""
     sines: Float[np.ndarray, "harmonics 2"]
-    """Coefficients of sin(2 pi k phase), m."""
     displacement: Float[np.ndarray, "2"]
-    """End minus start, m; zero for a contour."""
+    """End minus start; zero for a contour."""
     length: float
-    """Length of the curve, m."""
 
 
 class _TimedStrokes(NamedTuple):
@@ -87,14 +85,9 @@ class _DesignUnits(TextToPath):
 
 
 def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
-    """Closed polygons along the outline of a glyph of DejaVu Sans.
+    """Closed polygons along the outline of a glyph of DejaVu Sans, one [points, 2] per contour.
 
-    Args:
-        character: one printable character.
-
-    Returns:
-        One polygon [points, 2] per contour in font units (1/2048 em), y up from the baseline; the last point
-        repeats the first.
+    In font units (1/2048 em), y up from the baseline; the last point repeats the first.
 
     Raises:
         InputError: `character` is no single printable character whose glyph has an outline.
@@ -142,10 +135,8 @@ def _contour(
     weight = stretch * (1.0 + (curvature * bend_radius) ** 2) ** 0.25
     # Blurred as well, so that the pen brakes ahead of a bend and not in it.
     weight = np.fft.ifft(np.fft.fft(weight) * blur).real
-    if pen is None:
-        start = np.argmax(curve.imag - 0.5 * curve.real)
-    else:
-        start = np.argmin(np.abs(curve - pen @ np.array([1.0, 1.0j])))
+    top_left = np.argmax(curve.imag - 0.5 * curve.real)
+    start = top_left if pen is None else np.argmin(np.abs(curve - pen @ np.array([1.0, 1.0j])))
     curve, weight = np.roll(curve, -start), np.roll(weight, -start)
     curve, weight = np.append(curve, curve[0]), np.append(weight, weight[0])
     phase = np.concatenate([[0.0], np.cumsum(0.5 * (weight[1:] + weight[:-1]))])
@@ -204,9 +195,6 @@ def letter_path(
         bend_radius: the pen slows down where the radius of curvature falls below this, m.
         ramp_length: what one start and one stop cost, as a way at full speed, m.
 
-    Returns:
-        Duration in s and position in m.
-
     Raises:
         InputError: the character has no outline, or a number is not finite or not positive.
     """
@@ -236,13 +224,7 @@ def letter_path(
     duration = float(way.sum() / mean_speed)
     costs = way + ramp_length
     shares = costs / costs.sum()
-    timed = _TimedStrokes(
-        duration=jnp.asarray(duration),
-        starts=jnp.asarray(np.cumsum(shares) - shares),
-        shares=jnp.asarray(shares),
-        ramps=jnp.asarray(np.minimum(ramp_length / costs, 0.5)),
-        cosines=jnp.asarray(np.stack([stroke.cosines for stroke in strokes])),
-        sines=jnp.asarray(np.stack([stroke.sines for stroke in strokes])),
-        displacements=jnp.asarray(np.stack([stroke.displacement for stroke in strokes])),
-    )
+    times = duration, np.cumsum(shares) - shares, shares, np.minimum(ramp_length / costs, 0.5)
+    cosines, sines, displacements, _ = map(np.stack, zip(*strokes, strict=True))
+    timed = _TimedStrokes(*map(jnp.asarray, (*times, cosines, sines, displacements)))
     return LetterPath(duration, Partial(_position, timed))

@@ -10,7 +10,6 @@ and smooth between and in q. The frame shows 1.6 m x 1.6 m, with the pivot in th
 Published frames are gym's own pictures; these need no window and have a derivative.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -133,6 +132,6 @@ def choose(data: Frames, indices: np.ndarray) -> Frames:
     return data._replace(q=data.q[indices], qd=data.qd[indices], frames=data.frames[indices])
 
 
-@functools.partial(jax.jit)
+@jax.jit
 def _pictures(q: Vector) -> Float[Array, "d pixels"]:
     return jax.lax.map(lambda angle: render(angle).ravel(), q, batch_size=256).astype(jnp.float32)

@@ -20,10 +20,8 @@ from dln_jax.types import Dissipation, Hamiltonian, InputError, Vector, require_
 class Field(NamedTuple):
     """Time derivatives of states."""
 
-    qd: np.ndarray
-    """[N, d]."""
-    pd: np.ndarray
-    """[N, d]."""
+    qd: Float[np.ndarray, "N d"]
+    pd: Float[np.ndarray, "N d"]
 
 
 class Part(NamedTuple):
@@ -134,13 +132,10 @@ def reference_motion(
 # Compiled once for each Hamiltonian, so that further seeds start at once.
 @functools.partial(jax.jit, static_argnames=("H", "dissipation", "tolerance"))
 def _solve(H: Hamiltonian, dissipation: Dissipation | None, tolerance: float, q, p, t):
-    def motion(q, p):
-        def rate(t, state):
-            return _field(H, dissipation, *state)
+    def rate(t, state):
+        return _field(H, dissipation, *state)
 
-        return adaptive_rollout(rate, (q, p), t, tolerance=tolerance)
-
-    return jax.vmap(motion)(q, p)
+    return jax.vmap(lambda q, p: adaptive_rollout(rate, (q, p), t, tolerance=tolerance))(q, p)
 
 
 @functools.partial(jax.jit, static_argnames=("H", "dissipation"))
@@ -155,8 +150,4 @@ def _field(H: Hamiltonian, dissipation: Dissipation | None, q: Vector, p: Vector
 @functools.partial(jax.jit, static_argnames=("H",))
 def _accelerations(H: Hamiltonian, q, p, qd, pd):
     """qdd = d/dt dH/dp along the motion."""
-
-    def of_one(q, p, qd, pd):
-        return jax.jvp(jax.grad(H, argnums=1), (q, p), (qd, pd))[1]
-
-    return jax.vmap(of_one)(q, p, qd, pd)
+    return jax.vmap(lambda *state: jax.jvp(jax.grad(H, argnums=1), state[:2], state[2:])[1])(q, p, qd, pd)

@@ -37,13 +37,5 @@ def cart_pole(
     def tip(q: Vector) -> Vector:
         return jnp.array([q[0] + length * jnp.sin(q[1]), length * jnp.cos(q[1])])
 
-    return Scene(
-        name="cart-pole",
-        needs=Needs(joints=("prismatic", "revolute"), friction=friction != 0, actuation=((1.0,), (0.0,))),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential,
-        gravity=gravity,
-        dissipation=viscous_dissipation(friction),
-        tip=tip,
-    )
+    needs = Needs(joints=("prismatic", "revolute"), friction=friction != 0, actuation=((1.0,), (0.0,)))
+    return Scene("cart-pole", needs, mass_matrix, coriolis, potential, gravity, viscous_dissipation(friction), tip)

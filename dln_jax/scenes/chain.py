@@ -44,16 +44,8 @@ def chain(
         angles = jnp.cumsum(q)
         return length * jnp.array([jnp.sum(jnp.sin(angles)), -jnp.sum(jnp.cos(angles))])
 
-    return Scene(
-        name=f"chain-{d}",
-        needs=Needs(joints=("revolute",) * d, friction=friction != 0),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential,
-        gravity=gravity,
-        dissipation=viscous_dissipation(friction),
-        tip=tip,
-    )
+    needs = Needs(joints=("revolute",) * d, friction=friction != 0)
+    return Scene(f"chain-{d}", needs, mass_matrix, coriolis, potential, gravity, viscous_dissipation(friction), tip)
 
 
 def _sum_outwards(forces):

@@ -38,13 +38,7 @@ def double_pendulum(
         rods = jnp.array(lengths)
         return jnp.array([rods @ jnp.sin(q), -rods @ jnp.cos(q)])
 
+    needs = Needs(joints=("revolute", "revolute"), friction=friction != 0)
     return Scene(
-        name="double-pendulum",
-        needs=Needs(joints=("revolute", "revolute"), friction=friction != 0),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential,
-        gravity=gravity,
-        dissipation=viscous_dissipation(friction),
-        tip=tip,
+        "double-pendulum", needs, mass_matrix, coriolis, potential, gravity, viscous_dissipation(friction), tip
     )

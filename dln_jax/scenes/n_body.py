@@ -9,7 +9,7 @@ q holds the positions one body after the other, [n * dimension]. The softening l
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.scene import Scene, no_coriolis
 from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
 
 
@@ -56,9 +56,6 @@ def n_body(
     def mass_matrix(q: Vector) -> Matrix:
         return jnp.diag(jnp.repeat(jnp.asarray(each, q.dtype), dimension))
 
-    def coriolis(q: Vector, qd: Vector) -> Vector:
-        return jnp.zeros_like(q)
-
     def potential(q: Vector) -> Scalar:
         _, _, distance, strength = pairs(q)
         return -jnp.sum(strength / distance)
@@ -68,12 +65,8 @@ def n_body(
         pull = (strength / distance**3)[:, None] * separation
         return jnp.matmul(matrix.T, pull, precision="highest").ravel()
 
+    needs = Needs(joints=("prismatic",) * (n * dimension), gravity=G != 0)
+    attraction = (potential, gravity) if G else (None, None)
     return Scene(
-        name=f"{n}-body",
-        needs=Needs(joints=("prismatic",) * (n * dimension), gravity=G != 0),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential if G else None,
-        gravity=gravity if G else None,
-        tip=(lambda q: q[-2:]) if dimension == 2 else None,
+        f"{n}-body", needs, mass_matrix, no_coriolis, *attraction, tip=(lambda q: q[-2:]) if dimension == 2 else None
     )

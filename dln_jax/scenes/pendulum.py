@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from dln_jax.scenes.scene import Scene, viscous_dissipation
+from dln_jax.scenes.scene import Scene, no_coriolis, viscous_dissipation
 from dln_jax.types import Matrix, Needs, Scalar, Vector
 
 
@@ -13,9 +13,6 @@ def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.
     def mass_matrix(q: Vector) -> Matrix:
         return jnp.full((1, 1), mass * length**2, q.dtype)
 
-    def coriolis(q: Vector, qd: Vector) -> Vector:
-        return jnp.zeros_like(q)
-
     def potential(q: Vector) -> Scalar:
         return weight * (1 - jnp.cos(q[0]))
 
@@ -25,13 +22,6 @@ def pendulum(*, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.
     def tip(q: Vector) -> Vector:
         return length * jnp.array([jnp.sin(q[0]), -jnp.cos(q[0])])
 
-    return Scene(
-        name="pendulum",
-        needs=Needs(joints=("revolute",), gravity=weight != 0, friction=friction != 0),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential if weight else None,
-        gravity=gravity if weight else None,
-        dissipation=viscous_dissipation(friction),
-        tip=tip,
-    )
+    needs = Needs(joints=("revolute",), gravity=weight != 0, friction=friction != 0)
+    attraction = (potential, gravity) if weight else (None, None)
+    return Scene("pendulum", needs, mass_matrix, no_coriolis, *attraction, viscous_dissipation(friction), tip)

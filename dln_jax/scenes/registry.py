@@ -5,9 +5,8 @@ from collections.abc import Callable
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
-from dln_jax.scenes.henon_heiles import henon_heiles
-from dln_jax.scenes.mass_spring import mass_spring
 from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm

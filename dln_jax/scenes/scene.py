@@ -7,9 +7,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.mechanics.dynamics import Decomposition, friction_force
+from dln_jax.mechanics import closed_form
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.lagrangian import LagrangianSystem
-from dln_jax.types import Dissipation, Lagrangian, Needs, Potential, Scalar, Vector
+from dln_jax.types import Dissipation, Lagrangian, Needs, Potential, Vector
 
 
 class Scene(NamedTuple):
@@ -35,9 +37,16 @@ class Scene(NamedTuple):
     """q -> position [2] of the last body in m, for figures; y points up."""
 
     @property
+    def closed_form(self) -> ClosedForm:
+        """The energies with the forces that are written out, for the functions of `mechanics.closed_form`."""
+        D = self.dissipation
+        friction = None if D is None else functools.partial(friction_force, D)
+        return ClosedForm(self.mass_matrix, self.coriolis, self.potential, self.gravity, D, friction)
+
+    @property
     def lagrangian(self) -> Lagrangian:
         """The textbook L(q, qd) = ½ qdᵀ M(q) qd - V(q)."""
-        return functools.partial(_lagrangian, self)
+        return closed_form.lagrangian(self.closed_form)
 
     @property
     def energies(self) -> LagrangianSystem:
@@ -45,27 +54,15 @@ class Scene(NamedTuple):
         return LagrangianSystem(self.lagrangian, self.dissipation)
 
 
-def closed_form_decomposition(scene: Scene, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial, Coriolis and gravity force, each [d], by the textbook formulas."""
-    return Decomposition(
-        inertial=scene.mass_matrix(q) @ qdd,
-        coriolis=scene.coriolis(q, qd),
-        gravity=jnp.zeros_like(q) if scene.gravity is None else scene.gravity(q),
-    )
-
-
-def closed_form_inverse_dynamics(scene: Scene, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] by the textbook formulas, friction included."""
-    tau = sum(closed_form_decomposition(scene, q, qd, qdd), jnp.zeros_like(q))
-    if scene.dissipation is None:
-        return tau
-    return tau + friction_force(scene.dissipation, q, qd)
-
-
 def closed_form_forward_dynamics(scene: Scene, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] by the textbook formulas."""
-    bias = closed_form_inverse_dynamics(scene, q, qd, jnp.zeros_like(qd))
+    """Acceleration qdd [d] by the textbook formulas, and by LAPACK, to whose last digits data sets are generated."""
+    bias = closed_form.inverse_dynamics(scene.closed_form, q, qd, jnp.zeros_like(qd))
     return jnp.linalg.solve(scene.mass_matrix(q), tau - bias)
+
+
+def no_coriolis(q: Vector, qd: Vector) -> Vector:
+    """Of a mass matrix that is constant."""
+    return jnp.zeros_like(q)
 
 
 def actuation_matrix(needs: Needs) -> Float[Array, "d u"]:
@@ -80,8 +77,3 @@ def viscous_dissipation(coefficient: float) -> Dissipation | None:
     if coefficient == 0.0:
         return None
     return lambda q, qd: 0.5 * coefficient * jnp.sum(qd**2)
-
-
-def _lagrangian(scene: Scene, q: Vector, qd: Vector) -> Scalar:
-    kinetic = 0.5 * qd @ scene.mass_matrix(q) @ qd
-    return kinetic if scene.potential is None else kinetic - scene.potential(q)

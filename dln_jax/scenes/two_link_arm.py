@@ -54,15 +54,9 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
     def _slope(angle: Scalar) -> Scalar:
         return jnp.cos(angle) if zero == "horizontal" else jnp.sin(angle)
 
-    return Scene(
-        name="two-link-arm" if zero == "horizontal" else "two-link-arm-hanging",
-        needs=Needs(joints=("revolute", "revolute")),
-        mass_matrix=mass_matrix,
-        coriolis=coriolis,
-        potential=potential,
-        gravity=gravity,
-        tip=tip,
-    )
+    name = "two-link-arm" if zero == "horizontal" else "two-link-arm-hanging"
+    needs = Needs(joints=("revolute", "revolute"))
+    return Scene(name, needs, mass_matrix, coriolis, potential, gravity, tip=tip)
 
 
 def joint_angles(tip: Vector) -> Vector:

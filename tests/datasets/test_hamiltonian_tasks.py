@@ -12,12 +12,10 @@ from dln_jax.data import schema
 from dln_jax.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.datasets.phase_samples import reference_motion
-from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.henon_heiles import henon_heiles
-from dln_jax.scenes.mass_spring import mass_spring
 from dln_jax.scenes.n_body import n_body
-from dln_jax.scenes.scene import closed_form_inverse_dynamics
+from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.types import InputError
 
 SCENES = [
@@ -44,7 +42,7 @@ def test_scenes_in_closed_form_equal_the_generic_mechanics(scene):
         system = dynamics(scene.energies)
         return (
             (jax.grad(scene.potential)(q), scene.gravity(q)),
-            (system.inverse_dynamics(q, qd, third), closed_form_inverse_dynamics(scene, q, qd, third)),
+            (system.inverse_dynamics(q, qd, third), closed_form.inverse_dynamics(scene.closed_form, q, qd, third)),
         )
 
     for got, expected in ask():

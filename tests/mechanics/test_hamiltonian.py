@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import hamiltonian
+from dln_jax.mechanics import closed_form, hamiltonian
 from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, conjugate, legendre
 from dln_jax.mechanics.natural import NaturalSystem
@@ -123,9 +123,9 @@ def test_natural_dynamics_equals_the_textbook(scene):
     @jax.vmap
     def expect(q, qd, third):
         energy = qd @ scene.mass_matrix(q) @ qd - scene.lagrangian(q, qd)
-        tau = textbook.closed_form_inverse_dynamics(scene, q, qd, third)
+        tau = closed_form.inverse_dynamics(scene.closed_form, q, qd, third)
         acceleration = textbook.closed_form_forward_dynamics(scene, q, qd, third)
-        parts = textbook.closed_form_decomposition(scene, q, qd, third)
+        parts = closed_form.decompose(scene.closed_form, q, qd, third)
         return tau, acceleration, energy, scene.mass_matrix(q), parts, energy, energy
 
     jax.tree.map(assert_equal, ask(q, qd, third), expect(q, qd, third))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dln_jax.mechanics import lagrangian, natural
+from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -18,12 +18,7 @@ from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.scene import (
-    Scene,
-    closed_form_decomposition,
-    closed_form_forward_dynamics,
-    closed_form_inverse_dynamics,
-)
+from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 
 SCENES = [
@@ -89,7 +84,7 @@ def relative_error(got, expected):
 
 def test_generic_mechanics_equals_the_textbook(answers):
     scene, (q, qd, qdd, tau), generic, _ = answers
-    expected = jax.vmap(lambda *state: closed_form_inverse_dynamics(scene, *state))(q, qd, qdd)
+    expected = jax.vmap(lambda *state: closed_form.inverse_dynamics(scene.closed_form, *state))(q, qd, qdd)
     assert relative_error(generic.tau, expected) < 1e-12
     expected = jax.vmap(lambda *state: closed_form_forward_dynamics(scene, *state))(q, qd, tau)
     # An ill-conditioned M amplifies rounding in any method.
@@ -100,7 +95,7 @@ def test_generic_mechanics_equals_the_textbook(answers):
 
 def test_decomposition_equals_the_textbook_and_sums_to_the_total(answers):
     scene, (q, qd, qdd, _), generic, structured = answers
-    expected = jax.vmap(lambda *state: closed_form_decomposition(scene, *state))(q, qd, qdd)
+    expected = jax.vmap(lambda *state: closed_form.decompose(scene.closed_form, *state))(q, qd, qdd)
     scale = float(jnp.max(jnp.abs(generic.tau)))
     friction = jnp.zeros_like(q)
     if scene.dissipation is not None:

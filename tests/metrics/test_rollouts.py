@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.splits import select
-from dln_jax.datasets import published
+from dln_jax.datasets import generators
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -161,10 +161,10 @@ def test_recordings_that_cannot_be_followed_are_refused():
 
 
 def test_published_swings_are_the_symplectic_euler_map_of_the_arm():
-    data = published.uniform_tests()
+    data = generators.uniform_tests()
     assert data.q.shape == (1200, 2) and data.t[399] == pytest.approx(7.98)
     np.testing.assert_array_equal(data.tau, 0.0)
-    np.testing.assert_array_equal(data.q[::400], published.STARTS)
+    np.testing.assert_array_equal(data.q[::400], generators.STARTS)
     # The published formulas of the plant, whose angle zero is horizontal, by plain numpy.
     q, qd = data.q[[0, 400, 800]].T, np.zeros((2, 3))
     for step in range(200):

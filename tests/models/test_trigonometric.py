@@ -13,7 +13,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, split
 from dln_jax.datasets.generators import uniform
 from dln_jax.learning.linear import LinearFit, choose_degrees, fit_linear, linearised
-from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -22,7 +22,7 @@ from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.scene import Scene, closed_form_inverse_dynamics
+from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.solvers.least_squares import solve, solve_chunks
 from dln_jax.types import InputError, Needs
@@ -184,7 +184,7 @@ def test_absent_terms_cost_nothing():
 def test_undetermined_combinations_are_reported_and_harmless():
     """An elbow that never moves: its inertia and its angle's basis functions cannot be told apart."""
     q, qd, qdd = 2 * np.random.default_rng(3).normal(size=(3, 400, 2)) * np.array([1.0, 0.0])
-    tau = np.asarray(jax.jit(jax.vmap(functools.partial(closed_form_inverse_dynamics, ARM)))(q, qd, qdd))
+    tau = np.asarray(jax.jit(jax.vmap(functools.partial(closed_form.inverse_dynamics, ARM.closed_form)))(q, qd, qdd))
     data = sampled(ARM)[0]._replace(q=q[:200], qd=qd[:200], qdd=qdd[:200], tau=tau[:200])
     fit = fit_linear(make_trigonometric(ARM.needs), data)
     assert fit.rank < fit.parameter_count == 35
@@ -332,5 +332,5 @@ def test_validation_gives_each_joint_the_degree_that_it_needs(noise):
     fitted = chosen.outcome
     tau = dynamics(make_trigonometric(scene.needs, degree=(0, 2)).energies(fitted.parameters))
     q, qd, qdd = jnp.array([[0.4, 1.1], [0.5, -0.7], [1.0, 2.0]])
-    expected = closed_form_inverse_dynamics(scene, q, qd, qdd)
+    expected = closed_form.inverse_dynamics(scene.closed_form, q, qd, qdd)
     np.testing.assert_allclose(tau.inverse_dynamics(q, qd, qdd), expected, atol=1e-9 if not noise else 0.1)

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.scenes.scene import actuation_matrix, closed_form_inverse_dynamics
+from dln_jax.scenes.scene import actuation_matrix
 from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
 from dln_jax.types import InputError
 
@@ -81,7 +81,7 @@ def test_the_arm_is_a_chain_of_two_with_other_constants():
     first += -0.5 * s * (2 * 0.7 * 1.9 + 1.9**2) + 2.625 * np.cos(0.3) + 1.5 * np.cos(0.3 - 1.1)
     second = (0.5176145833333333 + 0.5 * c) * -2.0 + 0.5176145833333333 * 0.4
     second += 0.5 * s * 0.7**2 + 1.5 * np.cos(0.3 - 1.1)
-    got = closed_form_inverse_dynamics(two_link_arm(), q, qd, qdd)
+    got = closed_form.inverse_dynamics(two_link_arm().closed_form, q, qd, qdd)
     np.testing.assert_allclose(got, [first, second], rtol=1e-13)
 
 
@@ -90,8 +90,8 @@ def test_both_gravity_conventions_are_one_arm_turned_by_a_quarter():
     q, qd, qdd = jax.random.normal(jax.random.key(1), (3, 2))
     horizontal, hanging = two_link_arm(), two_link_arm(zero="hanging")
     np.testing.assert_allclose(
-        closed_form_inverse_dynamics(hanging, q, qd, qdd),
-        closed_form_inverse_dynamics(horizontal, q - turned, qd, qdd),
+        closed_form.inverse_dynamics(hanging.closed_form, q, qd, qdd),
+        closed_form.inverse_dynamics(horizontal.closed_form, q - turned, qd, qdd),
         rtol=1e-12,
     )
     np.testing.assert_allclose(hanging.tip(q), horizontal.tip(q - turned), rtol=1e-12)

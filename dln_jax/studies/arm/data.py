@@ -9,7 +9,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, select, split
 from dln_jax.datasets import generators
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
-from dln_jax.datasets.published import uniform_tests
+from dln_jax.datasets.generators import uniform_tests
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
 

@@ -15,10 +15,11 @@ from dln_jax.data.splits import Split
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
+from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics, closed_form_inverse_dynamics
+from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.models import described
 from dln_jax.studies.arm.table import ARM_UNITS
@@ -83,13 +84,13 @@ def textbook(scene: Scene, *, states: int = 1000) -> Findings:
     q, qd, qdd, tau = np.random.default_rng(0).uniform(-np.pi, np.pi, (4, states, scene.needs.degrees_of_freedom))
     generic = dynamics(scene.energies)
     pairs = {
-        "inverse": (generic.inverse_dynamics, closed_form_inverse_dynamics, qdd),
-        "forward": (generic.forward_dynamics, closed_form_forward_dynamics, tau),
+        "inverse": (generic.inverse_dynamics, partial(closed_form.inverse_dynamics, scene.closed_form), qdd),
+        "forward": (generic.forward_dynamics, partial(closed_form_forward_dynamics, scene), tau),
     }
     rows = []
-    for name, (derived, closed_form, last) in pairs.items():
+    for name, (derived, textbook_formula, last) in pairs.items():
         got = jax.jit(jax.vmap(derived))(q, qd, last)
-        expected = jax.jit(jax.vmap(lambda *state, closed_form=closed_form: closed_form(scene, *state)))(q, qd, last)
+        expected = jax.jit(jax.vmap(textbook_formula))(q, qd, last)
         error = float(jnp.max(jnp.abs(got - expected)) / jnp.max(jnp.abs(expected)))
         rows.append(Row(f"textbook/{scene.name}", f"{name}_relative_error", error, "1", 0.0, 1e-12))
     return Findings(rows)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.mechanics import lagrangian, natural
+from dln_jax.mechanics import closed_form, lagrangian, natural
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -23,7 +23,6 @@ from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.black_box import make_black_box_lagrangian
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
-from dln_jax.scenes.scene import closed_form_decomposition
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, expect, largest
 from dln_jax.studies.stability.random_models import random_states, untrained
@@ -86,7 +85,7 @@ def sizes() -> Findings:
         found, accelerations = _there_and_back(dynamics(scene.energies), q, qd, qdd)
         parts, mass = jax.jit(
             lambda *states, scene=scene: jax.lax.map(
-                lambda state: (closed_form_decomposition(scene, *state), scene.mass_matrix(state[0])), states
+                lambda state: (closed_form.decompose(scene.closed_form, *state), scene.mass_matrix(state[0])), states
             )
         )(q, qd, qdd)
         angle, rate = abs(np.cumsum(q, axis=1)).max(axis=1), abs(np.cumsum(qd, axis=1)).max(axis=1)
