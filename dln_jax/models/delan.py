@@ -8,7 +8,9 @@ What the scene lacks is not built: no potential network without gravity, no diss
 sin for prismatic joints.
 """
 
-import functools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import haiku as hk
 import jax
@@ -19,7 +21,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.features import joint_features
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, model_of
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Matrix, Needs, Scalar, Vector
 
@@ -38,30 +40,16 @@ def make_delan(
     """The (init, apply) pair of a structured DeLaN.
 
     Args:
-        needs: what the scene needs; decides features and terms.
-        width: hidden units per layer, of both networks.
-        depth: hidden layers, of both networks.
-        activation: of the hidden layers; it must be smooth, since forces are second derivatives of the energy.
         diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; bounds M's eigenvalues
             away from zero.
         shared_trunk: whether factor and potential are outputs of one network instead of two.
-        dtype: of the parameters.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    networks = structured_networks(
-        needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
+    terms = partial(
+        structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
-    q = jnp.zeros(needs.degrees_of_freedom, dtype)
-
-    def energies(parameters: Parameters) -> NaturalSystem:
-        cholesky, potential, dissipation = networks.apply
-        return NaturalSystem(
-            cholesky=functools.partial(cholesky, parameters),
-            potential=potential and functools.partial(potential, parameters),
-            dissipation=dissipation and functools.partial(dissipation, parameters),
-        )
-
-    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
+    return model_of(NaturalSystem, terms, np.zeros(needs.degrees_of_freedom), dtype)
 
 
 def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
@@ -85,36 +73,28 @@ def structured_networks(
     floor: float,
     *,
     shared_trunk: bool = False,
-) -> hk.MultiTransformed:
-    """Init of all networks, and apply of each: triangular factor, potential, dissipation (`None` where absent)."""
+    factor: str = "cholesky",
+) -> dict[str, Callable[..., Any] | None]:
+    """By the name of the factor, L(q); and potential and dissipation."""
     d = needs.degrees_of_freedom
-
-    def network(name: str, outputs: int, q: Vector):
-        layers = hk.nets.MLP([width] * depth + [outputs], activation=activation.value, name=name)
-        return layers(joint_features(needs, q))
-
     entries = d * (d + 1) // 2
     shared = shared_trunk and needs.gravity
 
+    def network(name: str, outputs: int):
+        layers = hk.nets.MLP([width] * depth + [outputs], activation=activation.value, name=name)
+        return lambda q: layers(joint_features(needs, q))
+
+    first = network("energies", entries + 1) if shared else network("cholesky", entries)
+    second = first if shared else network("potential", 1)
+
     def cholesky(q: Vector) -> Matrix:
-        outputs = network("energies", entries + 1, q)[:-1] if shared else network("cholesky", entries, q)
-        return cholesky_factor(outputs, d, shift=shift, floor=floor)
+        return cholesky_factor(first(q)[:entries], d, shift=shift, floor=floor)
 
     def potential(q: Vector) -> Scalar:
-        return network("energies", entries + 1, q)[-1] if shared else network("potential", 1, q)[0]
+        return second(q)[-1]
 
-    def build():
-        def initialise(q: Vector, qd: Vector) -> None:
-            cholesky(q)
-            if needs.gravity and not shared:
-                potential(q)
-            if needs.friction:
-                viscous_dissipation(q, qd)
-
-        return initialise, (
-            cholesky,
-            potential if needs.gravity else None,
-            viscous_dissipation if needs.friction else None,
-        )
-
-    return hk.without_apply_rng(hk.multi_transform(build))
+    return {
+        factor: cholesky,
+        "potential": potential if needs.gravity else None,
+        "dissipation": viscous_dissipation if needs.friction else None,
+    }

@@ -31,11 +31,8 @@ def make_dissipative(
     Args:
         model: conserves its energy: made for needs without friction.
         needs: what the scene needs; without friction nothing is added.
-        width: hidden units per layer of the network for c.
-        depth: hidden layers of it.
-        activation: of the hidden layers; it must be smooth.
         initial_friction: c to start from, about, in N m s or N s/m.
-        dtype: of the parameters.
+        width, depth, activation, dtype: of the network for c; as for all, in `models.model`.
 
     Raises:
         InputError: a width, depth or friction that is not positive.

@@ -6,16 +6,17 @@
 The two networks are separate, so that one need not invert the other. There is no energy and no mass matrix.
 """
 
-import functools
+from functools import partial
 
 import haiku as hk
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.plain import InverseForward
 from dln_jax.models.black_box import Scale, per_coordinate
 from dln_jax.models.features import joint_features, unsaturated
-from dln_jax.models.model import Model
+from dln_jax.models.model import Model, model_of
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Needs, Vector, require_positive
 
@@ -31,21 +32,13 @@ def make_feed_forward(
     tau_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of the two networks.
+    """The (init, apply) pair of the two networks; forces are not told apart, so that an absent one leaves nothing out.
 
     Args:
-        needs: what the scene needs; decides features. Forces are not told apart, so that an absent one leaves
-            nothing out.
-        width: hidden units per layer, of both networks.
-        depth: hidden layers, of both networks.
-        activation: of the hidden layers.
         rate_scale: typical size of qd.
         acceleration_scale: typical size of qdd.
         tau_scale: typical size of tau.
-        dtype: of the parameters.
-
-    Raises:
-        InputError: a width, depth or scale that is not positive, or scales that are not one per coordinate.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_positive(width=width, depth=depth)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
@@ -57,19 +50,8 @@ def make_feed_forward(
         layers = hk.nets.MLP([width] * depth + [len(output)], activation=activation.value, name=name)
         return jnp.asarray(output, qd.dtype) * layers(jnp.concatenate([joint_features(needs, q), *scaled]))
 
-    def build():
-        inverse = functools.partial(network, "inverse", accelerations, forces)
-        forward = functools.partial(network, "forward", forces, accelerations)
+    def terms():
+        inverse = partial(network, "inverse", accelerations, forces)
+        return {"inverse_dynamics": inverse, "forward_dynamics": partial(network, "forward", forces, accelerations)}
 
-        def initialise(q: Vector) -> None:
-            inverse(q, q, q)
-            forward(q, q, q)
-
-        return initialise, (inverse, forward)
-
-    networks = hk.without_apply_rng(hk.multi_transform(build))
-
-    return Model(
-        init=lambda key: networks.init(key, jnp.zeros(needs.degrees_of_freedom, dtype)),
-        energies=lambda parameters: InverseForward(*(functools.partial(each, parameters) for each in networks.apply)),
-    )
+    return model_of(InverseForward, terms, np.zeros(needs.degrees_of_freedom), dtype)

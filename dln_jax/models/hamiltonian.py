@@ -7,16 +7,17 @@ Networks"; the structured one as in Lutter and Peters 2021, who let a network gi
 `mechanics.equations.flow` turns both into Hamilton's equations, and `dynamics` into those in velocities.
 """
 
-import functools
+from functools import partial
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.models.black_box import Scale, energy_networks
+from dln_jax.models.black_box import Scale, one_network, per_coordinate
 from dln_jax.models.delan import structured_networks
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, model_of
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Needs, require_positive
 
@@ -34,30 +35,15 @@ def make_structured_hamiltonian(
     """The (init, apply) pair of a structured Hamiltonian network.
 
     Args:
-        needs: what the scene needs; decides features and terms.
-        width: hidden units per layer, of both networks.
-        depth: hidden layers, of both networks.
-        activation: of the hidden layers; it must be smooth.
         diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
-        dtype: of the parameters.
-
-    Raises:
-        InputError: a width or depth that is not positive.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_positive(width=width, depth=depth)
-    networks = structured_networks(needs, width, depth, activation, diagonal_shift, diagonal_floor)
-    q = jnp.zeros(needs.degrees_of_freedom, dtype)
-
-    def energies(parameters: Parameters) -> NaturalHamiltonian:
-        factor, potential, dissipation = networks.apply
-        return NaturalHamiltonian(
-            inverse_factor=functools.partial(factor, parameters),
-            potential=potential and functools.partial(potential, parameters),
-            dissipation=dissipation and functools.partial(dissipation, parameters),
-        )
-
-    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
+    terms = partial(
+        structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
+    )
+    return model_of(NaturalHamiltonian, terms, np.zeros(needs.degrees_of_freedom), dtype)
 
 
 def make_black_box_hamiltonian(
@@ -74,35 +60,17 @@ def make_black_box_hamiltonian(
     """The (init, apply) pair of a black-box Hamiltonian network.
 
     Hamilton's equations need no momentum solve and hold for any parameters. The functions of (q, qd) need one, which
-    an untrained network may not have.
+    an untrained network may not have, and an activation with curvature in p, since M⁻¹ is that curvature. Absent
+    gravity leaves nothing out.
 
     Args:
-        needs: what the scene needs; decides features and friction. One network is the whole Hamiltonian, so that
-            absent gravity leaves nothing out.
-        width: hidden units per layer.
-        depth: hidden layers.
-        activation: of the hidden layers; it must be smooth, and have curvature in p, since M⁻¹ is that curvature.
         momentum_scale: typical size of p, which enters the network divided by it.
         iterations: Newton steps to p(q, qd), as in `mechanics.hamiltonian.conjugate`.
         initial_guess: (q, qd) -> p [d] where they start; zero by default.
-        dtype: of the parameters.
-
-    Raises:
-        InputError: a width, depth, scale or iterations not positive, or scales that are not one per coordinate.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(iterations=iterations)
-    networks = energy_networks(
-        needs, "hamiltonian", width=width, depth=depth, activation=activation, scale={"momentum_scale": momentum_scale}
-    )
-    q = jnp.zeros(needs.degrees_of_freedom, dtype)
-
-    def energies(parameters: Parameters) -> HamiltonianSystem:
-        energy, dissipation = networks.apply
-        return HamiltonianSystem(
-            functools.partial(energy, parameters),
-            dissipation and functools.partial(dissipation, parameters),
-            iterations,
-            initial_guess,
-        )
-
-    return Model(init=lambda key: networks.init(key, q, q), energies=energies)
+    require_positive(iterations=iterations, width=width, depth=depth)
+    momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
+    terms = partial(one_network, needs, "hamiltonian", width, depth, activation, momenta)
+    record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
+    return model_of(record, terms, np.zeros(needs.degrees_of_freedom), dtype)

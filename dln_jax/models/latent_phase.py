@@ -82,11 +82,8 @@ def latent_field(
 
     Args:
         name: black-box-hnn or phase-network.
-        width: hidden units per layer.
-        depth: hidden layers.
-        activation: of the hidden layers; it must be smooth.
         momentum_scale: typical size of z_p where z_q has one of 1: 0.2 where motions take 30 frames a turn.
-        dtype: of the parameters.
+        width, depth, activation, dtype: as for all, in `models.model`.
 
     Raises:
         InputError: another name, or a size that is not positive.
@@ -141,9 +138,7 @@ def make_latent_phase(
         framewise: each frame by itself, in place of the published two at once.
         scale: typical difference of a pixel from its mean.
         width: hidden units per layer of both networks.
-        activation: of the hidden layers.
         momentum_scale: typical size of z_p where z_q has one of 1; framewise it follows from z_q.
-        dtype: of the parameters.
 
     Raises:
         InputError: a width or scale that is not positive, or no two frames.

@@ -12,8 +12,6 @@ a bounded activation does; the network learns the rest. To assume none of these 
 At r = 0 the energy (with 1/r or log r) and its slope are not finite: nothing is softened.
 """
 
-import functools
-
 import haiku as hk
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.models.model import Model, Parameters
+from dln_jax.models.model import Model, model_of
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
@@ -49,10 +47,7 @@ def make_pairwise_hamiltonian(
         alike: whether all bodies share one mass and all pairs one energy; otherwise each has its own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m, by which distances are divided.
-        width: hidden units per layer.
-        depth: hidden layers.
-        activation: of the hidden layers; it must be smooth.
-        dtype: of the parameters.
+        width, depth, activation, dtype: as for all, in `models.model`.
 
     Raises:
         InputError: fewer than two bodies, numbers that are not positive, or unknown, repeated or no features.
@@ -82,19 +77,7 @@ def make_pairwise_hamiltonian(
         logarithm = hk.get_parameter("log_mass", (1 if alike else bodies,), q.dtype, hk.initializers.Constant(0.0))
         return jnp.diag(jnp.repeat(jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,))), dimension))
 
-    def build():
-        def initialise(q: Vector) -> None:
-            potential(q)
-            inverse_factor(q)
-
-        return initialise, (inverse_factor, potential)
-
-    networks = hk.without_apply_rng(hk.multi_transform(build))
-
-    def energies(parameters: Parameters) -> NaturalHamiltonian:
-        factor, potential = (functools.partial(function, parameters) for function in networks.apply)
-        return NaturalHamiltonian(factor, potential)
-
     # Where the parameters are made all bodies stand apart, so that no feature is infinite.
     start = np.arange(bodies * dimension)
-    return Model(init=lambda key: networks.init(key, jnp.asarray(start, dtype)), energies=energies)
+    terms = {"potential": potential, "inverse_factor": inverse_factor}
+    return model_of(NaturalHamiltonian, lambda: terms, start, dtype)

@@ -40,7 +40,6 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     Args:
         needs: what the scene needs; the kinds of its joints. Friction would not be linear beside H.
         degree: the largest total degree of a term.
-        dtype: of the parameters.
 
     Raises:
         InputError: a scene with friction, a degree below 2, or more than `MOST_TERMS` terms.

@@ -12,10 +12,8 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.delan import structured_networks
 from dln_jax.models.feed_forward import make_feed_forward
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
-from dln_jax.nn.activations import tanh
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.run import compiled
 
@@ -32,14 +30,13 @@ def test_structured_hamiltonian_holds_for_random_parameters():
     d = 3
     needs = Needs(("revolute",) * d, friction=True)
     model = make_structured_hamiltonian(needs, **SMALL)
-    factor = structured_networks(needs, 5, 1, tanh, 0.0, 0.1).apply[0]
     q, qd, tau, p = jax.random.normal(jax.random.key(d), (4, d))
 
     @jax.jit
     def evaluate(key):
         parameters = model.init(key)
         system, H = dynamics(model.energies(parameters)), flow(model.energies(parameters)).energy
-        L = factor(parameters, q)
+        L = model.energies(parameters).inverse_factor(q)
         mass = system.mass_matrix(q)
         qdd = system.forward_dynamics(q, qd, tau)
         rate = jax.jvp(system.energy, (q, qd), (qd, qdd))[1]
