@@ -57,25 +57,19 @@ class PlainDynamics(NamedTuple):
 
 
 def make_dynamics(
-    *,
     inverse_dynamics: Callable[..., Array],
     forward_dynamics: Callable[..., Array],
+    decompose: Callable[..., Decomposition],
     energy: Callable[..., Array],
     mass_matrix: Callable[..., Array],
-    decompose: Callable[..., Decomposition],
+    *,
     dissipation: Dissipation | None = None,
     degrees_of_freedom: int | None = None,
 ) -> Dynamics:
-    """Dynamics whose functions convert their arguments or refuse them, from functions of vectors [d] of one type.
+    """`Dynamics` whose functions convert their arguments or refuse them, from functions of vectors [d] of one type.
 
-    Args:
-        inverse_dynamics: as in `Dynamics`, and so are the others.
-        forward_dynamics: (q, qd, tau) -> qdd.
-        energy: (q, qd) -> scalar.
-        mass_matrix: (q, qd) -> M, called with qd = 0 where the caller gives none.
-        decompose: (q, qd, qdd) -> parts.
-        dissipation: (q, qd) -> Rayleigh function; `None` without friction.
-        degrees_of_freedom: d; without it the arguments of a call need to agree with one another only.
+    Without `degrees_of_freedom` the arguments of a call need to agree with one another only; `mass_matrix` is called
+    with both q and qd.
     """
     d = degrees_of_freedom
 
@@ -89,14 +83,8 @@ def make_dynamics(
         q, qd = vectors(d, q=q, qd=qd)
         return jnp.zeros_like(qd) if dissipation is None else friction_force(dissipation, q, qd)
 
-    plain = make_plain_dynamics(
-        inverse_dynamics=inverse_dynamics,
-        forward_dynamics=forward_dynamics,
-        decompose=decompose,
-        degrees_of_freedom=d,
-    )
     return Dynamics(
-        **plain._asdict(),
+        **make_plain_dynamics(inverse_dynamics, forward_dynamics, decompose, degrees_of_freedom=d)._asdict(),
         energy=lambda q, qd: energy(*vectors(d, q=q, qd=qd)),
         mass_matrix=mass_matrix_or_at_rest,
         friction=friction,
@@ -104,18 +92,18 @@ def make_dynamics(
 
 
 def make_plain_dynamics(
-    *,
     inverse_dynamics: Callable[..., Array],
     forward_dynamics: Callable[..., Array],
     decompose: Callable[..., Decomposition],
+    *,
     degrees_of_freedom: int | None = None,
 ) -> PlainDynamics:
     """Dynamics without an energy; arguments as those of `make_dynamics`."""
     d = degrees_of_freedom
     return PlainDynamics(
-        inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(*vectors(d, q=q, qd=qd, qdd=qdd)),
-        forward_dynamics=lambda q, qd, tau: forward_dynamics(*vectors(d, q=q, qd=qd, tau=tau)),
-        decompose=lambda q, qd, qdd: decompose(*vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, qdd: inverse_dynamics(*vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, tau: forward_dynamics(*vectors(d, q=q, qd=qd, tau=tau)),
+        lambda q, qd, qdd: decompose(*vectors(d, q=q, qd=qd, qdd=qdd)),
     )
 
 

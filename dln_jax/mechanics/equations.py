@@ -15,10 +15,13 @@ Each energy gives both; `InverseForward` has dynamics only, and `PhaseRates` a f
 
 from typing import Any, overload
 
+import jax.numpy as jnp
+
 from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain
+from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.flow import Flow, PlainFlow, make_flow, make_plain_flow
+from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
@@ -74,14 +77,21 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     Raises:
         InputError: two functions that are no flow, or no record.
     """
+    d = degrees_of_freedom
     if isinstance(system, PhaseRates):
-        return make_plain_flow(system.rates, degrees_of_freedom=degrees_of_freedom)
+        rates = system.rates
+        return PlainFlow(lambda q, p: rates(*vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
         known = [*_DYNAMICS, PhaseRates]
         known.remove(InverseForward)
         raise InputError(f"flow got a {type(system).__name__}; expected one of {_names(*known)}")
     H = hamiltonian_of(system)
-    return make_flow(H, dissipation=system.dissipation, degrees_of_freedom=degrees_of_freedom)
+
+    def hamilton(q, p):
+        q, p = vectors(d, q=q, p=p)
+        return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
+
+    return Flow(hamilton, lambda q, p: H(*vectors(d, q=q, p=p)))
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:

@@ -66,16 +66,6 @@ def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector, *, dissipation: Di
     return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
 
 
-def power(H: Hamiltonian, q: Vector, p: Vector, tau: Vector) -> Scalar:
-    """Power qd·tau that the generalised force supplies, in W."""
-    return jnp.dot(velocity(H, q, p), tau)
-
-
-def energy_rate(H: Hamiltonian, q: Vector, p: Vector, tau: Vector, *, dissipation: Dissipation | None = None) -> Scalar:
-    """dH/dt along the motion, in W: the supplied power less what friction takes."""
-    return jax.jvp(H, (q, p), time_derivative(H, q, p, tau, dissipation=dissipation))[1]
-
-
 def conjugate(
     energy: Energy, q: Vector, slope: Vector, *, iterations: int | None = None, initial_guess: Guess | None = None
 ) -> Vector:
@@ -172,12 +162,6 @@ def _require_iterations(iterations: int | None) -> None:
         require_positive(iterations=iterations)
 
 
-hamiltonian_from_lagrangian = legendre
-"""L(q, qd) -> H(q, p), solving dL/dqd = p for qd."""
-lagrangian_from_hamiltonian = legendre
-"""H(q, p) -> L(q, qd), solving dH/dp = qd for p."""
-
-
 def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """All functions of the system at once, of (q, qd); with `degrees_of_freedom` they refuse states of another size."""
     H, dissipation, iterations, initial_guess = system
@@ -204,11 +188,11 @@ def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None
         return jax.jvp(lambda *state: velocity(H, *state), (q, p), (qd, pd))[1]
 
     return make_dynamics(
-        inverse_dynamics=with_friction,
-        forward_dynamics=accelerate,
-        energy=lambda q, qd: H(q, momentum(q, qd)),
-        mass_matrix=lambda q, qd: solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype)),
-        decompose=lambda q, qd, qdd: decompose_by_differences(frictionless, q, qd, qdd),
+        with_friction,
+        accelerate,
+        functools.partial(decompose_by_differences, frictionless),
+        lambda q, qd: H(q, momentum(q, qd)),
+        lambda q, qd: solve(inverse_mass(q, momentum(q, qd)), jnp.eye(q.shape[0], dtype=q.dtype)),
         dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

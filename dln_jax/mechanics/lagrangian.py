@@ -7,13 +7,13 @@ gradient; the forward model adds the Hessian in qd alone, which is solved and ne
 A mass matrix that is singular gives non-finite accelerations rather than a regularised answer.
 """
 
-import functools
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, decompose_by_differences, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, friction_force, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
@@ -45,7 +45,7 @@ def mass_matrix(L: Lagrangian, q: Vector, qd: Vector) -> Matrix:
 
 def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vector:
     """Generalised force tau = d/dt dL/dqd - dL/dq [d] that a motion takes."""
-    _, momentum_rate = jax.jvp(functools.partial(momentum, L), (q, qd), (qd, qdd))
+    _, momentum_rate = jax.jvp(partial(momentum, L), (q, qd), (qd, qdd))
     return momentum_rate - jax.grad(L)(q, qd)
 
 
@@ -53,11 +53,6 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
     """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
     bias = inverse_dynamics(L, q, qd, jnp.zeros_like(qd))
     return solve(mass_matrix(L, q, qd), tau - bias)
-
-
-def decompose(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial, Coriolis and gravity force, each [d]; their sum is tau(q, qd, qdd) when M depends on q alone."""
-    return decompose_by_differences(functools.partial(inverse_dynamics, L), q, qd, qdd)
 
 
 def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
@@ -73,11 +68,11 @@ def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None)
         return forward_dynamics(L, q, qd, driving)
 
     return make_dynamics(
-        inverse_dynamics=with_friction,
-        forward_dynamics=accelerate,
-        energy=functools.partial(energy, L),
-        mass_matrix=functools.partial(mass_matrix, L),
-        decompose=functools.partial(decompose, L),
+        with_friction,
+        accelerate,
+        partial(decompose_by_differences, partial(inverse_dynamics, L)),
+        partial(energy, L),
+        partial(mass_matrix, L),
         dissipation=dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -6,6 +6,7 @@ The factor makes M definite by construction, gives the momentum without a deriva
 into two triangular solves. The potential is `None` where a scene has none, and is then never traced.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -45,12 +46,6 @@ def hamiltonian(system: NaturalSystem) -> Hamiltonian:
         return kinetic if system.potential is None else kinetic + system.potential(q)
 
     return total
-
-
-def momentum(system: NaturalSystem, q: Vector, qd: Vector) -> Vector:
-    """Generalised momentum p = L Lᵀ qd [d]."""
-    factor = system.cholesky(q)
-    return factor @ (factor.T @ qd)
 
 
 def energy(system: NaturalSystem, q: Vector, qd: Vector) -> Scalar:
@@ -107,11 +102,11 @@ def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Deco
 def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
     return make_dynamics(
-        inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
-        forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),
-        energy=lambda q, qd: energy(system, q, qd),
-        mass_matrix=lambda q, qd: mass_matrix(system, q, qd),
-        decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
+        partial(inverse_dynamics, system),
+        partial(forward_dynamics, system),
+        partial(decompose, system),
+        partial(energy, system),
+        partial(mass_matrix, system),
         dissipation=system.dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -6,6 +6,7 @@ In coordinates and velocities they take triangular solves with the factor, where
 (`mechanics.hamiltonian`) takes a Newton iteration for the momentum. The potential is `None` where a scene has none.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -82,11 +83,11 @@ def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = Non
         )
 
     return make_dynamics(
-        inverse_dynamics=lambda q, qd, qdd: kinetic_force(q, qd, qdd) + load(q, qd),
-        forward_dynamics=accelerate,
-        energy=energy,
-        mass_matrix=lambda q, qd: jax.vmap(lambda unit: mass_times(q, unit))(jnp.eye(q.shape[0], dtype=q.dtype)),
-        decompose=decompose,
+        lambda q, qd, qdd: kinetic_force(q, qd, qdd) + load(q, qd),
+        accelerate,
+        decompose,
+        energy,
+        lambda q, qd: jax.vmap(partial(mass_times, q))(jnp.eye(q.shape[0], dtype=q.dtype)),
         dissipation=system.dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

@@ -30,8 +30,5 @@ def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -
 
     The force decomposition is that of differences of the inverse function, so friction counts as Coriolis force.
     """
-    return make_plain_dynamics(
-        **system._asdict(),
-        decompose=functools.partial(decompose_by_differences, system.inverse_dynamics),
-        degrees_of_freedom=degrees_of_freedom,
-    )
+    decompose = functools.partial(decompose_by_differences, system.inverse_dynamics)
+    return make_plain_dynamics(*system, decompose, degrees_of_freedom=degrees_of_freedom)

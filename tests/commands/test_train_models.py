@@ -159,7 +159,7 @@ def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
     from dln_jax.learning.objectives import arrays, residuals
     from dln_jax.mechanics import hamiltonian
 
-    H = hamiltonian.hamiltonian_from_lagrangian(pendulum().lagrangian)
+    H = hamiltonian.legendre(pendulum().lagrangian)
     plant = HamiltonianSystem(H, pendulum(friction=0.2).dissipation)
     errors = residuals(CANONICAL, plant, arrays(CANONICAL, data, jnp.float64))
     assert errors.shape == (120, 2) and float(jnp.abs(errors).max()) < 1e-12

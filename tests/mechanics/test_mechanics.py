@@ -137,7 +137,7 @@ def round_trip(d):
         L = natural.lagrangian(system)
         paths = natural.dynamics(system), lagrangian.dynamics(LagrangianSystem(L))
         residuals = [path.inverse_dynamics(q, qd, path.forward_dynamics(q, qd, tau)) - tau for path in paths]
-        return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.momentum(system, q, qd)])
+        return jnp.stack([*residuals, lagrangian.momentum(L, q, qd) - natural.mass_matrix(system, q) @ qd])
 
     return residuals
 

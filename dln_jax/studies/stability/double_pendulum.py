@@ -139,7 +139,7 @@ def _factored(scene: Scene) -> NaturalSystem:
 
 def _energy_drift(scene: Scene, steps: int) -> Row:
     """Chaos costs the motion, not its energy, where the method is symplectic."""
-    H = hamiltonian.hamiltonian_from_lagrangian(scene.lagrangian)
+    H = hamiltonian.legendre(scene.lagrangian)
     step = gauss_legendre4(lambda t, state: hamiltonian.time_derivative(H, state[0], state[1], jnp.zeros(2)))
 
     @jax.jit
