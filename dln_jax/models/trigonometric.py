@@ -59,17 +59,17 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
     parameters grows as (2 degree + 1)^d d²/2.
 
     Args:
-        needs: what the scene needs; decides basis and terms.
         degree: of the basis in each joint, or one for all; >= 0. In a prismatic displacement the potential has at
             least degree 2 (a linear spring).
-        dtype: of the parameters.
 
     Raises:
         InputError: a degree that is no whole number >= 0, another number of degrees than of joints, or a basis that is
             too large to fit.
     """
     d = needs.degrees_of_freedom
-    degrees = _degrees(degree, d)
+    degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
+    if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
+        raise InputError(f"degree is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
     mass_basis = functools.partial(basis, needs.joints, degrees)
     potential_degrees = tuple(
         max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)
@@ -131,13 +131,6 @@ def _size(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> int:
     """B."""
     sizes = (2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
     return int(np.prod([*sizes]))
-
-
-def _degrees(degree: int | tuple[int, ...], d: int) -> tuple[int, ...]:
-    degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
-    if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
-        raise InputError(f"degree is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
-    return degrees
 
 
 def _closed_form(

@@ -63,22 +63,6 @@ def _logistic_slope(x: Array) -> Array:
     return decay / ((1 + decay) * (1 + decay))
 
 
-def _softplus(x: Array) -> Array:
-    return jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x)))
-
-
-def _softplus_third(x: Array) -> Array:
-    return -_logistic_slope(x) * jnp.tanh(x / 2)
-
-
-def _silu_first(x: Array) -> Array:
-    return _logistic(x) * (1 + x * _logistic(-x))
-
-
-def _silu_second(x: Array) -> Array:
-    return _logistic_slope(x) * (2 - x * jnp.tanh(x / 2))
-
-
 def _silu_third(x: Array) -> Array:
     slope, half = _logistic_slope(x), jnp.tanh(x / 2)
     return -slope * (half * (3 - x * half) + 2 * x * slope)
@@ -87,10 +71,6 @@ def _silu_third(x: Array) -> Array:
 def _tanh_first(x: Array) -> Array:
     """sech²(x) = 4 s'(2x): 1 - tanh² would be 0 in saturation."""
     return 4 * _logistic_slope(2 * x)
-
-
-def _tanh_second(x: Array) -> Array:
-    return -2 * jnp.tanh(x) * _tanh_first(x)
 
 
 def _tanh_third(x: Array) -> Array:
@@ -110,18 +90,6 @@ def _normal_distribution(x: Array) -> Array:
     return jax.lax.erfc(x * -math.sqrt(0.5)) / 2
 
 
-def _gelu_first(x: Array) -> Array:
-    return _normal_distribution(x) + x * _normal_density(x)
-
-
-def _gelu_second(x: Array) -> Array:
-    return _normal_density(x) * (2 - x * x)
-
-
-def _gelu_third(x: Array) -> Array:
-    return x * (_normal_density(x) * (x * x - 4))
-
-
 def _step(x: Array) -> Array:
     """Derivative of relu, with 0 at the kink."""
     return jnp.where(x > 0, jnp.ones_like(x), jnp.zeros_like(x))
@@ -129,14 +97,32 @@ def _step(x: Array) -> Array:
 
 relu = _make("relu", lambda x: jnp.maximum(x, 0), _step, jnp.zeros_like, jnp.zeros_like)
 """max(x, 0). Its second derivative is 0 wherever it exists, and given as 0 at the kink."""
-softplus = _make("softplus", _softplus, _logistic, _logistic_slope, _softplus_third)
+softplus = _make(
+    "softplus",
+    lambda x: jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x))),
+    _logistic,
+    _logistic_slope,
+    lambda x: -_logistic_slope(x) * jnp.tanh(x / 2),
+)
 """log(1 + e^x)."""
-tanh = _make("tanh", jnp.tanh, _tanh_first, _tanh_second, _tanh_third)
+tanh = _make("tanh", jnp.tanh, _tanh_first, lambda x: -2 * jnp.tanh(x) * _tanh_first(x), _tanh_third)
 cos = _make("cos", jnp.cos, lambda x: -jnp.sin(x), lambda x: -jnp.cos(x), jnp.sin)
 sin = _make("sin", jnp.sin, jnp.cos, lambda x: -jnp.sin(x), lambda x: -jnp.cos(x))
-silu = _make("silu", lambda x: x * _logistic(x), _silu_first, _silu_second, _silu_third)
+silu = _make(
+    "silu",
+    lambda x: x * _logistic(x),
+    lambda x: _logistic(x) * (1 + x * _logistic(-x)),
+    lambda x: _logistic_slope(x) * (2 - x * jnp.tanh(x / 2)),
+    _silu_third,
+)
 """x / (1 + e^-x), also called swish."""
-gelu = _make("gelu", lambda x: x * _normal_distribution(x), _gelu_first, _gelu_second, _gelu_third)
+gelu = _make(
+    "gelu",
+    lambda x: x * _normal_distribution(x),
+    lambda x: _normal_distribution(x) + x * _normal_density(x),
+    lambda x: _normal_density(x) * (2 - x * x),
+    lambda x: x * (_normal_density(x) * (x * x - 4)),
+)
 """x P(X <= x) for a standard normal X, by erf and not by its tanh approximation."""
 linear = _make("linear", lambda x: x, jnp.ones_like, jnp.zeros_like, jnp.zeros_like)
 quadratic = _make("quadratic", lambda x: x * x, lambda x: 2 * x, lambda x: jnp.full_like(x, 2), jnp.zeros_like)

@@ -26,17 +26,14 @@ def layers(
     twice, call once and keep the result. Schemes and dtype are those of `differential_mlp.init`.
     Raises InputError if `sizes` make no network, and ValueError (Haiku's) outside `hk.transform`.
     """
+    dtype = jnp.zeros((), dtype).dtype  # Haiku's own default is float32 whatever JAX's default float is.
+
+    def parameter(kind: str, shape: tuple[int, ...], scheme: Initializer) -> jax.Array:
+        return hk.get_parameter(kind, shape, dtype, init=lambda *wanted: scheme(hk.next_rng_key(), *wanted))
+
     result = []
     with hk.name_scope(name):
         for index, shape in enumerate(layer_shapes(sizes)):
             with hk.name_scope(f"layer_{index}"):
-                result.append(
-                    (_parameter("w", shape, weight, dtype), _parameter("b", shape[1:], bias, dtype)),
-                )
+                result.append((parameter("w", shape, weight), parameter("b", shape[1:], bias)))
     return tuple(result)
-
-
-def _parameter(name: str, shape: tuple[int, ...], scheme: Initializer, dtype: jax.typing.DTypeLike) -> jax.Array:
-    # Haiku's own default is float32 whatever JAX's default float is.
-    dtype = jnp.zeros((), dtype).dtype
-    return hk.get_parameter(name, shape, dtype, init=lambda *wanted: scheme(hk.next_rng_key(), *wanted))
