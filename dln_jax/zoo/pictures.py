@@ -57,11 +57,8 @@ def make_picture_model(
         components: of a picture.
         field_width: hidden units per layer of what moves there.
         field_depth: its hidden layers.
-        field_activation: of these.
         width: hidden units per layer of encoder and decoder.
-        activation: of these.
         momentum_scale: typical size of the momentum in the latent plane, where the coordinate has one of 1.
-        dtype: of the parameters.
 
     Raises:
         InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` in the components.
@@ -69,19 +66,14 @@ def make_picture_model(
     require_positive(pixels=pixels, components=components)
     if pixels * components > MOST_NUMBERS:
         raise InputError(f"{components} components of {pixels} pixels are more than {MOST_NUMBERS:,} numbers")
-    moving = latent_field(
-        field,
-        width=field_width,
-        depth=field_depth,
-        activation=field_activation,
-        momentum_scale=momentum_scale,
-        dtype=dtype,
-    )
+    common: dict[str, Any] = {"momentum_scale": momentum_scale, "dtype": dtype}
+    moving = latent_field(field, width=field_width, depth=field_depth, activation=field_activation, **common)
 
     def of_coefficients(scale: float) -> LatentModel:
         mean = np.zeros(2 * components)
-        size: dict[str, Any] = {"width": width, "activation": activation, "momentum_scale": momentum_scale}
-        return make_latent_phase(moving, mean, framewise=True, scale=scale, **size, dtype=dtype)
+        return make_latent_phase(
+            moving, mean, framewise=True, scale=scale, width=width, activation=activation, **common
+        )
 
     unit = of_coefficients(1.0)
 

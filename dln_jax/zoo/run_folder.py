@@ -48,9 +48,10 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Itera
             raise
 
 
-def is_free(folder: Path) -> bool:
-    """Whether a folder holds nothing of value: no files but a lock, and what a kill left half-written."""
-    return all(entry.name == LOCK or _is_partial(entry) for entry in folder.iterdir())
+def holds_only(folder: Path, *names: str) -> bool:
+    """Whether a folder has nothing but files of these names, and what a kill left half-written."""
+    every = folder.iterdir()
+    return all(each.name in names or (each.name.endswith(PARTIAL) and not each.is_dir()) for each in every)
 
 
 @contextmanager
@@ -84,10 +85,6 @@ def _naming_itself(folder: Path) -> Iterator[None]:
         raise KeyboardInterrupt(folder) from stop
 
 
-def _is_partial(entry: Path) -> bool:
-    return entry.name.endswith(PARTIAL) and not entry.is_dir()
-
-
 def _next_number(parent: Path, name: str) -> tuple[Path, list[Path]]:
     """Two processes never get one number: creating the folder takes it."""
     created = _create(parent)
@@ -117,7 +114,7 @@ def _create(folder: Path) -> list[Path]:
 
 def _require_free(folder: Path) -> None:
     try:
-        free = is_free(folder)
+        free = holds_only(folder, LOCK)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder ({error.strerror}); choose another --out") from error
     if not free:
@@ -126,7 +123,7 @@ def _require_free(folder: Path) -> None:
 
 def _withdraw(folder: Path, created: list[Path]) -> None:
     """Removes what holds nothing of value: the arguments of a run that came to nothing, and the folders made for it."""
-    if any(entry.name not in (CONFIG, LOCK) and not _is_partial(entry) for entry in folder.iterdir()):
+    if not holds_only(folder, CONFIG, LOCK):
         return
     with suppress(OSError):
         (folder / CONFIG).unlink(missing_ok=True)
