@@ -1,1 +1,34 @@
-"""The physics of any energy, for one state: no batch axis, no network."""
+"""The physics of any energy, for one state: no batch axis, no network.
+
+`equations.dynamics` and `equations.flow` turn a record of energies into functions; `integrators` step them.
+"""
+
+from dln_jax.mechanics import equations, integrators
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import hamiltonian_of
+from dln_jax.mechanics.flow import Flow, PlainFlow
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.plain import InverseForward, PhaseRates
+
+__all__ = [
+    "ClosedForm",
+    "Decomposition",
+    "Dynamics",
+    "Flow",
+    "HamiltonianSystem",
+    "InverseForward",
+    "LagrangianSystem",
+    "NaturalHamiltonian",
+    "NaturalSystem",
+    "PhaseRates",
+    "PlainDynamics",
+    "PlainFlow",
+    "equations",
+    "hamiltonian_of",
+    "integrators",
+    "legendre",
+]
