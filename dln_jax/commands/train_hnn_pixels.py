@@ -41,13 +41,5 @@ def main(given: Arguments) -> None:
     data = pixel_data(given.trajectories)
     with run_folder(given.out, "train_hnn_pixels", resume=given.resume) as folder:
         write_json(folder / CONFIG, stored_arguments(given))
-        train_into(
-            folder,
-            given.model,
-            data,
-            seed=given.seed,
-            steps=steps,
-            trajectories=given.trajectories,
-            resume=given.resume,
-            figures=given.figures,
-        )
+        options = {"seed": given.seed, "steps": steps, "resume": given.resume, "figures": given.figures}
+        train_into(folder, given.model, data, **options)

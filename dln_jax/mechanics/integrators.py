@@ -197,7 +197,7 @@ def adaptive_rollout(
         t1=t[-1],
         dt0=None,
         y0=state,
-        saveat=diffrax.SaveAt(ts=t),
+        saveat=diffrax.SaveAt(ts=jnp.asarray(t)),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
         max_steps=max_steps,
         throw=False,

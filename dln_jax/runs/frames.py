@@ -24,7 +24,6 @@ def train_into(
     *,
     seed: int,
     steps: int,
-    trajectories: int | None = None,
     resume: bool = False,
     figures: bool = True,
 ) -> None:
@@ -33,10 +32,9 @@ def train_into(
     Args:
         folder: of the run.
         kind: of what moves in the latent plane.
-        data: `pixel_data(trajectories)`.
+        data: films in three parts, as of `pixel_data`.
         seed: of the initial parameters and the shuffling.
         steps: of Adam.
-        trajectories: generated films; `None` for the published number.
         resume: continue from the folder's checkpoint.
         figures: whether they are drawn.
     """
@@ -47,9 +45,9 @@ def train_into(
     with progress(optimiser.steps) as show:
         numbers, seen = pixel_task.measure_pixels(
             kind,
+            data,
             seed=seed,
             steps=steps,
-            trajectories=trajectories,
             checkpoint=Checkpoint(folder, known, resume),
             report=lambda at: show(at.step, shown(at)),
         )

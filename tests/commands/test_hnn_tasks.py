@@ -88,7 +88,7 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_tasks, "STARTS", 2)
         patch.setattr(hnn_tasks, "POINTS", 4)
         patch.setattr(hnn_models, "DEGREES", (2, 3))
-        patch.setattr(pixel_task, "measure_pixels", lambda kind, **options: (quick_pixels(kind), None))
+        patch.setattr(pixel_task, "measure_pixels", lambda kind, data, **options: (quick_pixels(kind), None))
         patch.setattr(pixel_task, "draw_pixels", lambda seen, data, folder: None)
         patch.setattr(pixel_task, "pixel_data", lambda *options: None)
         yield folder

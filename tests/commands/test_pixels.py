@@ -286,11 +286,11 @@ def test_animations_have_every_frame(tmp_path, data):
 
 def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_metrics, "predict", quick_predict)
-    numbers, seen = pixel_task.measure_pixels("phase-network", steps=2, trajectories=6, frames=13)
+    data = pixel_task.pixel_data(6, 13)
+    numbers, seen = pixel_task.measure_pixels("phase-network", data, steps=2)
     assert all(np.isfinite(value) for key, value in numbers.items() if "standard_error" not in key)
     assert numbers["energy_mse"] > numbers["energy_floor"] and numbers["parameters"] > 1e5
     assert seen.motions.pairs.shape == (1, 12, 2 * PIXELS)
-    data = pixel_task.pixel_data(6, 13)
     (written,) = pixel_task.draw_pixels({"phase-network": seen}, data, tmp_path)
     assert written.name == "pixels.gif" and written.stat().st_size > 1000
     # The other kind has the same autoencoder, and an energy.

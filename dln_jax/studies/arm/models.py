@@ -1,12 +1,10 @@
 """One model of the arm's table: trained, measured on the test, and timed."""
 
-import time
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
@@ -14,7 +12,7 @@ from dln_jax.datasets import generators
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
-from dln_jax.learning.engine.problem import Training
+from dln_jax.learning.engine.problem import Report, Training, silent
 from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.learning.objectives import TORQUE, objective_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
@@ -22,7 +20,7 @@ from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.hamiltonian import legendre
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.metrics.errors import errors, mean_square, predictions
-from dln_jax.metrics.latency import one_step
+from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
 from dln_jax.scenes.scene import Scene
@@ -65,13 +63,15 @@ class Curve(NamedTuple):
 
 
 Measured = tuple[dict[str, float], Curve | None]
-WHOLE_CIRCLE = {"position_bound": np.pi, "rate_bound": 2.0, "acceleration_bound": 8.0}
-"""Bounds of states with any angles, in rad, 1/s and 1/s²; rates and accelerations are those of the letters."""
 
 
-def whole_circle(*, samples: int = 1_000) -> Trajectories:
-    """Random states of the arm over the whole circle, most of them far from every letter; torques in closed form."""
-    return generators.uniform(two_link_arm(), samples=samples, seed=1, **WHOLE_CIRCLE)
+def whole_circle() -> Trajectories:
+    """Random states of the arm over the whole circle, most of them far from every letter; torques in closed form.
+
+    Rates and accelerations are those of the letters, in 1/s and 1/s².
+    """
+    bounds = {"position_bound": np.pi, "rate_bound": 2.0, "acceleration_bound": 8.0}
+    return generators.uniform(two_link_arm(), samples=1_000, seed=1, **bounds)
 
 
 def described(kind: str, data: Trajectories, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
@@ -101,39 +101,36 @@ def measure_plant(scene: Scene, sets: Split) -> Measured:
     }, None
 
 
-def linear_fit(sets: Split) -> tuple[Model, LinearFit, float]:
-    """The trigonometric model of a data set, its fit, and the seconds that took."""
-    model = build(described(TRIGONOMETRIC, sets.train))
-    began = time.perf_counter()
-    fitted = fit_linear(model, sets.train)
-    return model, fitted, time.perf_counter() - began
+def linear_fit(data: Trajectories) -> tuple[LinearFit, Driven]:
+    """The fit of the trigonometric model, and its energies."""
+    model = build(described(TRIGONOMETRIC, data))
+    fitted = fit_linear(model, data)
+    return fitted, model.energies(fitted.parameters)
 
 
 def measure_trigonometric(sets: Split) -> Measured:
     """The linear fit, and the same with noise on the training torques."""
-    model, fitted, seconds = linear_fit(sets)
+    fitted, energies = linear_fit(sets.train)
     noise = TORQUE_NOISE * np.random.default_rng(0).standard_normal(sets.train.tau.shape)
-    noisy = fit_linear(model, sets.train._replace(tau=sets.train.tau + noise))
-    energies = model.energies(fitted.parameters)
+    _, noisy = linear_fit(sets.train._replace(tau=sets.train.tau + noise))
     system = compiled(dynamics(energies), jnp.float64)
     numbers = {
         **on_the_test(energies, sets),
-        "noisy_torque_mse": torque_mse(dynamics(model.energies(noisy.parameters)), sets.test),
+        "noisy_torque_mse": torque_mse(dynamics(noisy), sets.test),
         "whole_circle_torque_mse": torque_mse(system, whole_circle()),
         "rank": float(fitted.rank),
         "condition": fitted.condition,
-        "train_seconds": seconds,
+        "train_seconds": fitted.seconds,
         "parameters": float(fitted.parameter_count),
-        **latency(system, sets),
+        "one_step_p50_us": latency(system, sets).p50_us,
     }
-    return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
+    return numbers, end_of(numbers)
 
 
 def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Gauss-Newton on several seeds in one program; medians over them, and the spread of the torque error."""
     training, energies = trained(kind, sets, seeds=seeds, steps=steps)
     systems = [compiled(dynamics(each), jnp.float64) for each in energies]
-    seconds = training.compile_seconds + training.train_seconds
     of_seeds = [
         {
             **on_the_test(of_seed, sets),
@@ -142,17 +139,13 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
         }
         for of_seed, system in zip(energies, systems, strict=True)
     ]
-    medians = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
     torques = [each["torque_mse"] for each in of_seeds]
     numbers = {
-        **medians,
+        **{key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]},
         "torque_mse_mean": float(np.mean(torques)),
         "torque_mse_standard_deviation": float(np.std(torques)),
         "torque_mse_largest": float(np.max(torques)),
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": seconds / seeds,
-        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds),
-        **latency(systems[0], sets),
+        **costs(training, systems[0], sets, seeds=seeds),
     }
     return numbers, curve(kind, sets, training, numbers, seeds)
 
@@ -169,8 +162,7 @@ def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[T
 def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> Measured:
     """Test torque errors of one more split, trained as the published one: median and largest over seeds."""
     if kind == TRIGONOMETRIC:
-        model, fitted, _ = linear_fit(sets)
-        energies = [model.energies(fitted.parameters)]
+        energies = [linear_fit(sets.train)[1]]
     else:
         _, energies = trained(kind, sets, seeds=seeds, steps=steps)
     torques = [torque_mse(dynamics(each), sets.test) for each in energies]
@@ -178,19 +170,21 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 
 def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
-    """The published protocol: one seed, two layers of 64, batch 512, float32."""
-    model = build(described(kind, sets.train, precision="f32", width=64, depth=2))
-    training = fit(problem(model, sets, objective_of(kind, sets.train)), Adam(steps=steps))
-    energies = model.energies(training.parameters)
+    """One seed of the published protocol."""
+    training, energies = by_published_protocol(kind, sets, steps=steps)
     system = compiled(dynamics(energies), jnp.float32)
-    numbers = {
-        **on_the_test(energies, sets, jnp.float32),
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": training.compile_seconds + training.train_seconds,
-        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters))),
-        **latency(system, sets, jnp.float32),
-    }
+    numbers = {**on_the_test(energies, sets, jnp.float32), **costs(training, system, sets, jnp.float32)}
     return numbers, curve(kind, sets, training, numbers, 1)
+
+
+def by_published_protocol(
+    kind: str, sets: Split, *, steps: int, seed: int = 0, report: Report = silent
+) -> tuple[Training, Driven]:
+    """Two layers of 64, Adam, batch 512, float32; and the energies."""
+    model = build(described(kind, sets.train, precision="f32", width=64, depth=2))
+    task = problem(model, sets, objective_of(kind, sets.train), seeds=seed)
+    training = fit(task, Adam(steps=steps), report=report)
+    return training, model.energies(training.parameters)
 
 
 def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measured:
@@ -206,8 +200,8 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
         jax.clear_caches()
         training = fit(problem(model, sets, seeds=seed), optimiser)
         for target in TARGETS:
-            reached = [at.seconds for at in training.history if at.monitor <= target]
-            times[target].append(training.compile_seconds + reached[0] if reached else float("inf"))
+            reached = (training.compile_seconds + at.seconds for at in training.history if at.monitor <= target)
+            times[target].append(next(reached, float("inf")))
         final.append(torque_mse(dynamics(model.energies(training.parameters)), sets.test))
         singles.append(training.compile_seconds + training.train_seconds)
     jax.clear_caches()
@@ -230,10 +224,14 @@ def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Mod
 def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:
     """The path of the test error; its end alone for models that are not fitted to torques."""
     if objective_of(kind, sets.train) is not TORQUE:
-        return Curve([numbers["train_seconds"]], [numbers["torque_mse"]])
-    best: Array | np.ndarray = np.array([np.median(at.monitor) for at in training.history])
+        return end_of(numbers)
     seconds = [(training.compile_seconds + at.seconds) / seeds for at in training.history]
-    return Curve(seconds, np.minimum.accumulate(best).tolist())
+    return Curve(seconds, np.minimum.accumulate([np.median(at.monitor) for at in training.history]).tolist())
+
+
+def end_of(numbers: dict[str, float]) -> Curve:
+    """A path of which only the end is known."""
+    return Curve([numbers["train_seconds"]], [max(numbers["torque_mse"], 1e-32)])
 
 
 def definite(kind: str, system: Dynamics | PlainDynamics, sets: Split) -> dict[str, float]:
@@ -256,7 +254,19 @@ def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:
     return mean_square(np.asarray(predicted) - data.tau)
 
 
-def latency(system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64) -> dict[str, float]:
+def costs(
+    training: Training, system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64, *, seeds: int = 1
+) -> dict[str, float]:
+    """Seconds, parameters and one call, per seed."""
+    return {
+        "compile_seconds": training.compile_seconds,
+        "train_seconds": (training.compile_seconds + training.train_seconds) / seeds,
+        "parameters": float(sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds),
+        "one_step_p50_us": latency(system, sets, dtype).p50_us,
+    }
+
+
+def latency(system: Dynamics | PlainDynamics, sets: Split, dtype=jnp.float64, *, calls: int = 2000) -> Latency:
     """Of one inverse-dynamics call."""
     states = list(zip(*(jnp.asarray(a[:400], dtype) for a in sets.test[1:4]), strict=True))
-    return {"one_step_p50_us": one_step(system.inverse_dynamics, states, calls=2000).p50_us}
+    return one_step(system.inverse_dynamics, states, calls=calls)

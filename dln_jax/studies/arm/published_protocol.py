@@ -12,21 +12,16 @@ import numpy as np
 
 from dln_jax.command_line.progress import progress
 from dln_jax.data.splits import Split
-from dln_jax.learning.dynamics import problem
-from dln_jax.learning.engine.fit import fit
-from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import errors, predictions
-from dln_jax.metrics.latency import one_step
 from dln_jax.scenes.scene import Scene, closed_form_forward_dynamics
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.studies.arm.models import described
+from dln_jax.studies.arm.models import by_published_protocol, latency
 from dln_jax.studies.arm.table import ARM_UNITS
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.published import ARM, PUBLISHED_CODE, published
 from dln_jax.studies.report import Row, unit_of
-from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 
 KIND = "structured-delan"
@@ -42,32 +37,25 @@ BOUNDS = {
 
 def cases(name: str, sets: Sequence[Split], *, steps: int) -> list[Case]:
     """The textbook, and a training for each split, whose number is the seed; `name` is that of the data."""
-    found = [Case(f"textbook/{two_link_arm().name}", partial(textbook, two_link_arm()))]
-    for seed, each in enumerate(sets):
-        case = f"{KIND}/{name}/seed-{seed}"
-        found.append(Case(case, partial(trained, case, each, seed=seed, steps=steps)))
-    return found
+    names = [f"{KIND}/{name}/seed-{seed}" for seed in range(len(sets))]
+    return [
+        Case(f"textbook/{two_link_arm().name}", partial(textbook, two_link_arm())),
+        *(Case(case, partial(trained, case, sets[seed], seed=seed, steps=steps)) for seed, case in enumerate(names)),
+    ]
 
 
 def trained(case: str, sets: Split, *, seed: int, steps: int) -> Findings:
     """Trains one seed and measures everything that the published table has."""
-    model = build(described(KIND, sets.train, precision="f32", width=64, depth=2))
     with progress(steps) as show:
-        training = fit(
-            problem(model, sets, seeds=seed),
-            Adam(steps=steps),
-            report=lambda at: show(min(int(at.step), steps), f"{case}  loss {at.loss:.2e}"),
-        )
-    energies = model.energies(training.parameters)
-    system = compiled(dynamics(energies), jnp.float32)
-    states = list(zip(*(jnp.asarray(a[:400], jnp.float32) for a in sets.test[1:4]), strict=True))
-    latency = one_step(system.inverse_dynamics, states)
+        report = lambda at: show(min(int(at.step), steps), f"{case}  loss {at.loss:.2e}")  # noqa: E731
+        training, energies = by_published_protocol(KIND, sets, steps=steps, seed=seed, report=report)
+    timed = latency(compiled(dynamics(energies), jnp.float32), sets, jnp.float32, calls=5000)
     numbers = {
         **errors(predictions(energies, sets.test, jnp.float32), sets.test),
         "train_seconds": training.train_seconds,
         "compile_seconds": training.compile_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
+        "one_step_p50_us": timed.p50_us,
+        "one_step_p99_us": timed.p99_us,
     }
     return Findings([beside(Row(case, key, value)) for key, value in numbers.items()])
 

@@ -66,16 +66,11 @@ def cases(
     adam_steps: int = 20_000,
     timed_seeds: int = 5,
 ) -> list[Case]:
-    """What the table measures on data sets and further splits, both as by `data_sets`.
+    """What the table measures on data sets (default: the embedded ones) and further splits, both as by `data_sets`.
 
-    Args:
-        sets: by name (default: the embedded ones).
-        parts: further splits of the letters.
-        seeds: of each model, in one program.
-        split_seeds: of the structured Lagrangian on each part; other models have one.
-        steps: of Gauss-Newton (default: each model's own).
-        adam_steps: of Adam on the letters; 0 leaves it out.
-        timed_seeds: structured models that are trained one by one; 0 leaves them out.
+    `seeds` of each model are trained in one program; of each split, `split_seeds` of the structured Lagrangian and one
+    of the others. `timed_seeds` structured models are trained one by one. `adam_steps` are those on the letters. With
+    0, the last two are left out; by default `steps` of Gauss-Newton are each model's own.
     """
     sets = data_sets(None, None, 0)[0] if sets is None else sets
     costs = ("train_seconds", "parameters", "one_step_p50_us")
@@ -90,7 +85,8 @@ def cases(
         count = split_seeds if kind == LAGRANGIAN else 1
         for number, part in enumerate(parts):
             measure = partial(measure_split, kind, part, seeds=count, steps=steps)
-            found.append(_case(_split_case(kind, number), measure, ("torque_mse", "torque_mse_largest")))
+            name = f"{kind}/characters/split-{number + 1}"
+            found.append(_case(name, measure, ("torque_mse", "torque_mse_largest")))
     written = sets["characters"]
     if timed_seeds:
         measure = partial(measure_one_by_one, written, seeds=timed_seeds, steps=steps)
@@ -106,11 +102,6 @@ def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] 
         return Findings(rows_of(name, numbers), curve._asdict() if curve else {})
 
     return Case(name, findings, {name: quantities})
-
-
-def _split_case(kind: str, number: int) -> str:
-    """Name of a model on one of the further splits."""
-    return f"{kind}/characters/split-{number + 1}"
 
 
 def table_rows(found: Mapping[str, Findings]) -> list[Row]:

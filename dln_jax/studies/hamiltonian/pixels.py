@@ -4,7 +4,7 @@ Models: black-box-hnn (an energy in the latent plane) and phase-network (a netwo
 autoencoder, loss and budget. The data are those of seed 0; a seed is that of the parameters and of the samples' order.
 """
 
-import functools
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,8 +21,8 @@ from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.engine.problem import Progress, Report, Training, silent
-from dln_jax.learning.frames import Matching, Weights, loss, windows
+from dln_jax.learning.engine.problem import Progress, Report, silent
+from dln_jax.learning.frames import Matching, Weights
 from dln_jax.metrics.frames import FrameMotions, energy_errors, energy_floor, frame_errors, late_energy_errors, recoded
 from dln_jax.metrics.phase_space import summary
 from dln_jax.models.latent_phase import Field, LatentModel, through_components
@@ -37,8 +37,6 @@ MATCHING = Matching(weights=Weights(field=10.0))
 step at a time, the published form, in place of windows of ten steps, with which both models were alike (1e-6 J² over a
 hundred frames, their decoder's error), with numbers of test films in view."""
 STEPS = 12_000
-
-
 COMPONENTS = 32
 """Principal components of a frame, which keep all but 3e-7 of the variance; training on them takes half the time."""
 
@@ -66,26 +64,10 @@ def picture_models(description: Description, components: Components) -> tuple[La
     return inner, through_components(inner, components)
 
 
-@functools.cache
+@cache
 def pixel_data(trajectories: int | None = None, frames: int | None = None) -> FrameSplit:
     """The data set of seed 0 in its three parts."""
     return split(swinging_rod(0, trajectories=trajectories or TRAJECTORIES, frames=frames or FRAMES))
-
-
-def train_pixels(
-    model: LatentModel,
-    components: Components,
-    data: FrameSplit,
-    *,
-    seed: int,
-    steps: int | None = None,
-    checkpoint: Checkpoint | None = None,
-    report: Report = silent,
-) -> Training:
-    """The fit of a model of coefficients."""
-    fitted, held_out = (compress(components, part.frames) for part in (data.train, data.validation))
-    problem = learning_frames.problem(model, fitted, held_out, MATCHING, seed=seed)
-    return fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)
 
 
 def optimiser_of(steps: int | None = None) -> Adam:
@@ -96,23 +78,23 @@ def optimiser_of(steps: int | None = None) -> Adam:
 
 def measure_pixels(
     kind: Field,
+    data: FrameSplit,
     *,
     seed: int = 0,
     steps: int | None = None,
-    trajectories: int | None = None,
-    frames: int | None = None,
     checkpoint: Checkpoint | None = None,
     report: Report = silent,
 ) -> tuple[dict[str, float], SeenFrames]:
     """A model's errors on the test trajectories and its times, and what pictures need of it."""
-    data = pixel_data(trajectories, frames)
     components = principal_components(data.train.frames, COMPONENTS)
     inner, model = picture_models(picture_description(kind, components), components)
-    training = train_pixels(inner, components, data, seed=seed, steps=steps, checkpoint=checkpoint, report=report)
+    fitted, held_out, tested = (compress(components, part.frames) for part in data)
+    problem = learning_frames.problem(inner, fitted, held_out, MATCHING, seed=seed)
+    training = fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)
     parameters = training.parameters
     numbers, motions = frame_errors(model, parameters, data.test)
-    tested = jnp.asarray(windows(compress(components, data.test.frames), MATCHING.window + 1))
-    numbers["test_loss"] = float(jax.jit(functools.partial(loss, inner, MATCHING))(parameters, tested))
+    window = jnp.asarray(learning_frames.windows(tested, MATCHING.window + 1))
+    numbers["test_loss"] = float(jax.jit(partial(learning_frames.loss, inner, MATCHING))(parameters, window))
     numbers["autoencoder_energy_mse"] = float(np.mean(energy_errors(recoded(model, parameters, data.test), data.test)))
     numbers |= summary("late_energy_mse", late_energy_errors(model, parameters, data.test))
     numbers["energy_floor"] = energy_floor(data.test)

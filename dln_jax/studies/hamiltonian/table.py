@@ -51,27 +51,17 @@ def cases(
     real_pendulum: Path | None = None,
     folder: Path | None = None,
 ) -> list[Case]:
-    """A case for each task, with every model of it.
+    """A case for each task, with every model of it; `InputError` for a number that is not positive.
 
-    Args:
-        names: of tasks.
-        seeds: of each model: 0, 1, ...
-        steps: of each fit (default: each task's own).
-        trajectories: of generated data (default: as published).
-        real_pendulum: the file of the measured task.
-        folder: for a figure of each task, drawn while what it shows is at hand; `None` for none.
-
-    Raises:
-        InputError: a number that is not positive.
+    By default `steps` of each fit are each task's own, `trajectories` the published number, and the measured task needs
+    the file `real_pendulum`. With a `folder`, each task's figure is drawn while what it shows is at hand.
     """
     given = {"steps": steps, "trajectories": trajectories}
     require_positive(seeds=seeds, **{key: value for key, value in given.items() if value is not None})
     found = []
     for name in names:
-        if name == PIXELS:
-            kinds, task = pixels.MODELS, pixel_task
-        else:
-            kinds, task = models_of(name), partial(phase_task, name, data=real_pendulum if name == REAL else None)
+        task = pixel_task if name == PIXELS else partial(phase_task, name, data=real_pendulum if name == REAL else None)
+        kinds = pixels.MODELS if name == PIXELS else models_of(name)
         measure = partial(task, seeds=seeds, folder=folder, **given)
         found.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
     return found
@@ -82,15 +72,13 @@ def phase_task(
 ) -> Findings:
     """Every model of a task in coordinates and momenta, and its figure."""
     problem = problem_of(name, trajectories=trajectories, data=data)
+    options: dict[str, Any] = {"steps": steps, "seconds": RECIPES[name].seconds}
     rows: list[Row] = []
     seen: dict[str, Seen] = {}
     for kind in models_of(name):
         description = description_of(problem, kind)
         # Each seed pays for its own compilation, as a user does.
-        runs = [
-            measured_once(problem, train(problem, description, seed=seed, steps=steps, seconds=RECIPES[name].seconds))
-            for seed in range(seeds)
-        ]
+        runs = [measured_once(problem, train(problem, description, seed=seed, **options)) for seed in range(seeds)]
         rows += rows_of(f"{name}/{kind}", medians(runs))
         seen[kind] = runs[0][1]
     if folder is not None:
@@ -100,14 +88,15 @@ def phase_task(
 
 def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folder: Path | None) -> Findings:
     """The models of pictures, and their animation and pictures."""
+    data = pixels.pixel_data(trajectories)
     numbers, seen = {}, {}
     for kind in pixels.MODELS:
-        runs = [pixels.measure_pixels(kind, seed=seed, steps=steps, trajectories=trajectories) for seed in range(seeds)]
+        runs = [pixels.measure_pixels(kind, data, seed=seed, steps=steps) for seed in range(seeds)]
         numbers[kind], seen[kind] = medians(runs), runs[0][1]
     energetic, baseline = (numbers[kind] for kind in pixels.MODELS)
     energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
     if folder is not None:
-        pixels.draw_pixels(seen, pixels.pixel_data(trajectories), folder)
+        pixels.draw_pixels(seen, data, folder)
     return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
 
 
@@ -121,11 +110,14 @@ def medians(runs: Sequence[tuple[dict[str, float], Any]]) -> dict[str, float]:
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
     """Numbers with the published ones and the figures to reach; every Hamiltonian network beside the published one."""
-    found = []
-    for row in rows:
-        reference, bound = beside(row.case, row.quantity), BOUNDS.get(row.case, {}).get(row.quantity)
-        found.append(row._replace(unit=unit_of(row.quantity), reference=reference, bound=bound))
-    return found
+    return [
+        row._replace(
+            unit=unit_of(row.quantity),
+            reference=beside(row.case, row.quantity),
+            bound=BOUNDS.get(row.case, {}).get(row.quantity),
+        )
+        for row in rows
+    ]
 
 
 def beside(case: str, quantity: str) -> float | None:

@@ -99,12 +99,9 @@ def generated(name: str, trajectories: int | None) -> Problem:
     return Problem(name, task.scene.needs, task.train.data, task.train, task.test, (Motions(t, q, p),), *energies)
 
 
-REAL_STIFFNESS, REAL_INERTIA = 2.4, 1.0
-
-
 def real_energy(q: Array, p: Array) -> Array:
     """The published energy of the measured pendulum, in its units."""
-    return jnp.sum(REAL_STIFFNESS * (1 - jnp.cos(q)) + REAL_INERTIA * p**2)
+    return jnp.sum(2.4 * (1 - jnp.cos(q)) + p**2)
 
 
 def measured(name: str, data: Trajectories, file: str, needs: Needs | None) -> Problem:
@@ -128,15 +125,15 @@ def measured(name: str, data: Trajectories, file: str, needs: Needs | None) -> P
         require_no_copies(fitted, select(data, chosen))
         tests = [select(data, chosen[[place]]) for place in range(min(len(chosen), STARTS))]
     length = min(len(test.t) for test in tests)
-    truth = tuple(motion_of(samples_of(test, slice(0, length))) for test in tests)
+    truth = tuple(motion_of(test, length) for test in tests)
     energy = real_energy if name == REAL else None
     return Problem(name, needs, pieces(fitted, WINDOW[name]), None, None, truth, energy, energy)
 
 
-def motion_of(test: Trajectories) -> Motions:
-    """One trajectory as the motion that is to be predicted."""
+def motion_of(test: Trajectories, length: int) -> Motions:
+    """The first samples of one trajectory as the motion that is to be predicted."""
     assert test.p is not None
-    return Motions(test.t - test.t[0], test.q[None], test.p[None])
+    return Motions(test.t[:length] - test.t[0], test.q[None, :length], test.p[None, :length])
 
 
 def samples_of(data: Trajectories, chosen: slice) -> Trajectories:
@@ -147,10 +144,6 @@ def samples_of(data: Trajectories, chosen: slice) -> Trajectories:
 
 def pieces(data: Trajectories, length: int) -> Trajectories:
     """Stretches without a gap, cut to the length of two windows, as trajectories of their own: some to validate by."""
-    parts = [
-        stretch[first : first + 2 * length]
-        for stretch in stretches(data)
-        for first in range(0, len(stretch), 2 * length)
-    ]
-    index = np.concatenate([np.full(len(part), number) for number, part in enumerate(parts)])
-    return data._replace(trajectory=index, label=np.array([str(number) for number in range(len(parts))]))
+    parts = [each[at : at + 2 * length] for each in stretches(data) for at in range(0, len(each), 2 * length)]
+    index = np.arange(len(parts))
+    return data._replace(trajectory=np.repeat(index, [len(part) for part in parts]), label=index.astype(str))

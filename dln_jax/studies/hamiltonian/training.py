@@ -16,17 +16,11 @@ from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import PER_SAMPLE, hold_out
 from dln_jax.learning import motions, rates
+from dln_jax.learning.engine import problem as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
-from dln_jax.learning.engine.problem import (
-    Progress,
-    Report,
-    Training,
-    one_after_the_other,
-    require_finite_start,
-    silent,
-)
+from dln_jax.learning.engine.problem import Progress, Report, Training, silent
 from dln_jax.learning.growth import grow
 from dln_jax.learning.motions import Weights, cut_windows
 from dln_jax.learning.rates import match_linear
@@ -116,7 +110,8 @@ class Trained(NamedTuple):
     @property
     def history(self) -> list[Progress]:
         """Of all stages; their steps are counted on."""
-        return one_after_the_other(fit.history for fit in self.fits.values())
+        named = ([at._replace(stage=stage) for at in fit.history] for stage, fit in self.fits.items())
+        return engine.one_after_the_other(named)
 
 
 def models_of(task: str) -> tuple[str, ...]:
@@ -162,8 +157,8 @@ def polynomial_degree(problem: Problem) -> int:
 def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
     """The stages of a training that take steps, and how many each."""
     recipe = RECIPES[problem.name]
-    rates = {} if description["name"] == POLYNOMIAL else {RATES: steps or recipe.steps}
-    return {**rates, **({MOTIONS: steps or recipe.trajectory_steps} if recipe.trajectory_steps else {})}
+    most = {RATES: 0 if description["name"] == POLYNOMIAL else recipe.steps, MOTIONS: recipe.trajectory_steps}
+    return {stage: steps or own for stage, own in most.items() if own}
 
 
 def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
@@ -171,7 +166,7 @@ def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
     recipe = RECIPES[problem.name]
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     fitted = rates.problem(build(description), *parts, seed=seed, most_samples=recipe.samples)
-    require_finite_start(fitted, rates.samples(problem.fitted))
+    engine.require_finite_start(fitted, rates.samples(problem.fitted))
     if recipe.trajectory_steps:
         windows, validation = (cut_windows(part, recipe.window) for part in parts)
         motions.arrays(windows, validation, recipe.weights or deviations(parts[0]))
@@ -198,80 +193,52 @@ def train(
     recipe, model = RECIPES[problem.name], build(description)
     numbers = [getattr(problem.fitted, key) for key in PER_SAMPLE]
 
-    def checkpoint(name: str, optimiser: Optimiser) -> Checkpoint | None:
-        if directory is None:
-            return None
-        known = identity(optimiser, numbers, model=description, seed=seed, samples=recipe.samples)
-        return Checkpoint(directory, known, resume, f"checkpoint_{name}")
+    def fitted(stage: str, task: engine.Problem, most: int, file: str, seconds: float, **options: Any) -> Training:
+        own = optimiser._replace(steps=steps or most)
+        if isinstance(own, Adam):
+            own = own._replace(patience=own.steps, batch=WINDOWS_OF_A_STEP if stage == MOTIONS else own.batch)
+        known = identity(own, numbers, model=description, seed=seed, samples=recipe.samples)
+        kept = None if directory is None else Checkpoint(directory, known, resume, f"checkpoint_{file}")
+        staged = {"report": lambda at: report(at._replace(stage=stage)), "checkpoint": kept, "seconds": seconds}
+        return fit(task, own, **staged, **options)
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     if description["name"] == POLYNOMIAL:
         first = match_linear(model, parts[0], validation=parts[1])[0]
     else:
-        own = _with_steps(optimiser, steps or recipe.steps)
-        first = fit(
-            rates.problem(model, *parts, seed=seed, most_samples=recipe.samples),
-            own,
-            checkpoint=checkpoint("rates", own),
-            report=_of_stage(RATES, report),
-            seconds=seconds,
-        )
-    fits = {RATES: _named(RATES, first)}
+        task = rates.problem(model, *parts, seed=seed, most_samples=recipe.samples)
+        first = fitted(RATES, task, recipe.steps, "rates", seconds)
+    fits = {RATES: first}
     left = seconds - (time.perf_counter() - began)
     if not recipe.trajectory_steps or first.stop.reason == "not finite":
-        return Trained(description, fits, _ending(RATES, first), first.stop.reason == "not finite")
+        return _ended(description, fits, RATES, first)
     if first.stop.reason == "time" or left <= 0:
         return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
-    windows, validation = (cut_windows(part, recipe.window) for part in parts)
-    weights = recipe.weights or deviations(parts[0])
-    own = _with_steps(optimiser, steps or recipe.trajectory_steps)
-    own = own._replace(batch=WINDOWS_OF_A_STEP) if isinstance(own, Adam) else own
-    second = fit(
-        motions.problem(
-            model, first.parameters, windows, validation, weights=weights, substeps=recipe.substeps, seed=seed
-        ),
-        own,
-        checkpoint=checkpoint("trajectories", own),
-        report=_of_stage(MOTIONS, report),
-        seconds=left,
-        must_start=False,
-    )
+    windows = [cut_windows(part, recipe.window) for part in parts]
+    weighted = {"weights": recipe.weights or deviations(parts[0]), "substeps": recipe.substeps, "seed": seed}
+    task = motions.problem(model, first.parameters, *windows, **weighted)
+    second = fitted(MOTIONS, task, recipe.trajectory_steps, "trajectories", left, must_start=False)
     second = second._replace(parameters=second.parameters["model"])
     if second.stop.step and np.isfinite(second.validation):
-        fits[MOTIONS] = _named(MOTIONS, second)
-    return Trained(description, fits, _ending(MOTIONS, second), second.stop.reason == "not finite")
+        fits[MOTIONS] = second
+    return _ended(description, fits, MOTIONS, second)
 
 
-def _with_steps(optimiser: Optimiser, steps: int) -> Optimiser:
-    """So many steps, all of them."""
-    if isinstance(optimiser, Adam):
-        return optimiser._replace(steps=steps, patience=steps)
-    return optimiser._replace(steps=steps)
-
-
-def _of_stage(stage: str, report: Report) -> Report:
-    return lambda at: report(at._replace(stage=stage))
-
-
-def _named(stage: str, training: Training) -> Training:
-    return training._replace(history=[at._replace(stage=stage) for at in training.history])
-
-
-def _ending(stage: str, training: Training) -> str:
-    """What is to be said of how a fit ended."""
-    at = f"after step {training.stop.step} of the fit of {stage}"
-    if training.stop.reason == "time":
-        return f"out of time {at}: kept is the best so far"
-    if training.stop.reason == "not finite":
-        return f"the loss stopped being finite {at}; lower --learning-rate or look for very large numbers in the data"
-    return ""
+def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training) -> Trained:
+    """With what is to be said of how the last fit ended."""
+    at = f"after step {last.stop.step} of the fit of {stage}"
+    words = {
+        "time": f"out of time {at}: kept is the best so far",
+        "not finite": f"the loss stopped being finite {at}; lower --learning-rate or look for very large numbers in "
+        "the data",
+    }
+    return Trained(description, fits, words.get(last.stop.reason, ""), last.stop.reason == "not finite")
 
 
 def deviations(data: Trajectories) -> Weights:
     """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
     assert data.p is not None
-    sizes = [spread(name, array) for name, array in (("q", data.q), ("p", data.p))]
-    sizes = [np.where(size > 0, size, 1.0) for size in sizes]
+    of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", data.p)))
     if "qd" in data.estimated and np.array_equal(data.p, data.qd):
-        sizes[1] = ANCHOR * sizes[1]
-    return Weights(state=tuple(float(size) for size in np.concatenate(sizes)))
+        of_p = ANCHOR * of_p
+    return Weights(state=tuple(np.concatenate([of_q, of_p]).tolist()))

@@ -1,12 +1,10 @@
 """benchmark integrators: steps per second against energy drift and trajectory error."""
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import cost_panels
 from dln_jax.learning.engine.optimisers import Adam
@@ -47,8 +45,7 @@ def measure(quick: bool) -> Findings:
                     continue
                 swept = sweep(problem, H, step, dt=SCENES[scene], halvings=2 if quick else HALVINGS)
                 name = method if kind == "exact" else f"{method}, learned"
-                costs = [1e6 / rate for _, rate, _, _ in swept]
-                lines.setdefault(scene, {})[name] = (costs, [error for *_, error in swept])
+                lines.setdefault(scene, {})[name] = ([1e6 / each[1] for each in swept], [each[3] for each in swept])
                 for dt, rate, drift, error in swept:
                     case = f"{scene}/{kind}/{method}/dt-{dt:.4g}"
                     rows += [
@@ -60,9 +57,7 @@ def measure(quick: bool) -> Findings:
     return Findings(rows, lines)
 
 
-def draw(lines: dict) -> Figure:
-    """Trajectory error against what a simulated second takes, for each scene."""
-    return cost_panels(lines, x="µs per simulated second", y="trajectory error, rms")
+draw = functools.partial(cost_panels, x="µs per simulated second", y="trajectory error, rms")
 
 
 def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
@@ -83,21 +78,22 @@ def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:
         q, p = state
         return slope_p(q, p), -slope_q(q, p)
 
-    methods: dict[str, Callable[[], Step]] = {
-        "explicit-euler": lambda: integrators.explicit_euler(field),
-        "rk4": lambda: integrators.rk4(field),
-        "implicit-midpoint": lambda: integrators.implicit_midpoint(field),
-        "gauss-legendre-4": lambda: integrators.gauss_legendre4(field),
+    methods = {
+        "explicit-euler": integrators.explicit_euler,
+        "rk4": integrators.rk4,
+        "implicit-midpoint": integrators.implicit_midpoint,
+        "gauss-legendre-4": integrators.gauss_legendre4,
     }
-    if separable:
-        methods["symplectic-euler"] = lambda: integrators.symplectic_euler(
-            lambda t, q, p: slope_p(q, p), lambda t, q, p: -slope_q(q, p)
-        )
-        # Each half is evaluated where the other variable is zero, since it does not read it.
-        methods["stormer-verlet"] = lambda: integrators.stormer_verlet(
-            lambda t, p: slope_p(jnp.ones_like(p), p), lambda t, q: -slope_q(q, jnp.zeros_like(q))
-        )
-    return methods[method]() if method in methods else None
+    if method in methods:
+        return methods[method](field)
+    if not separable:
+        return None
+    if method == "symplectic-euler":
+        return integrators.symplectic_euler(lambda t, q, p: slope_p(q, p), lambda t, q, p: -slope_q(q, p))
+    # Each half is evaluated where the other variable is zero, since it does not read it.
+    return integrators.stormer_verlet(
+        lambda t, p: slope_p(jnp.ones_like(p), p), lambda t, q: -slope_q(q, jnp.zeros_like(q))
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("step",))

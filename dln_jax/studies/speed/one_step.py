@@ -4,11 +4,11 @@ import json
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from dln_jax.data.splits import Split
 from dln_jax.figures.benchmarks import EXACT, cost_points
@@ -42,40 +42,31 @@ PROCESSES = 3
 def measure(quick: bool) -> Findings:
     """Trains every model of the arm, and times single calls in processes of their own."""
     sets = published_split(letters(None))
+    names = (WIDE, TRIGONOMETRIC) if quick else (*SIZES, WIDE, TRIGONOMETRIC)
     with tempfile.TemporaryDirectory() as place:
-        folders = [train_into(Path(place), name, sets, quick=quick) for name in names(quick)]
-        test_errors = {folder.name: torque_mse(folder, sets) for folder in folders}
+        folders = [train_into(Path(place), name, sets, quick=quick) for name in names]
+        predicted = [predictions(load(folder).energies, sets.test, jnp.float64) for folder in folders]
         turns = [
             timed(folders, dispatch, calls=CALLS // 20 if quick else CALLS)
             for _ in range(1 if quick else PROCESSES)
             for dispatch in ("default", "low-latency")
         ]
-    times = {name: over_processes([turn[name] for turn in turns]) for name in test_errors}
     rows, places = [], {}
-    for name, paths in times.items():
-        rows.append(Row(name, "torque_mse", test_errors[name], "N^2 m^2"))
-        for path, functions in paths.items():
+    for name, answers in zip(names, predicted, strict=True):
+        error = errors(answers, sets.test)["torque_mse"]
+        rows.append(Row(name, "torque_mse", error, "N^2 m^2"))
+        for path, functions in over_processes([turn[name] for turn in turns]).items():
             rows += rows_of(f"{name}/{path}", functions)
             if "p50_us" in functions["inverse"]:
-                places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], test_errors[name])
+                places[f"{name}, {path}"] = (functions["inverse"]["p50_us"], error)
     return Findings(rows, places)
 
 
-def draw(places: dict) -> Figure:
-    """Error against the time of a call, for each model and call path."""
-    return cost_points(
-        places,
-        x="one inverse-dynamics call, median, µs",
-        y="test torque MSE, (N m)²",
-        title="two-link arm, single calls",
-        front=True,
-        exact=EXACT,
-    )
-
-
-def names(quick: bool) -> tuple[str, ...]:
-    """Of the models; the wide one is trained by the published protocol."""
-    return (WIDE, TRIGONOMETRIC) if quick else (*SIZES, WIDE, TRIGONOMETRIC)
+draw = partial(
+    cost_points,
+    **{"x": "one inverse-dynamics call, median, µs", "y": "test torque MSE, (N m)²"},
+    **{"title": "two-link arm, single calls", "front": True, "exact": EXACT},
+)
 
 
 def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
@@ -94,11 +85,6 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
         parameters = fit(problem(model, sets, objective_of(kind, sets.train)), optimiser).parameters
     save(folder, description, parameters)
     return folder
-
-
-def torque_mse(folder: Path, sets: Split) -> float:
-    """On the test, as the stored model gives it."""
-    return errors(predictions(load(folder).energies, sets.test, jnp.float64), sets.test)["torque_mse"]
 
 
 def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
@@ -124,9 +110,6 @@ def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
     return found
 
 
-SHOWN = ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
-
-
 def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
     """Quantiles of each function."""
     rows = []
@@ -135,7 +118,8 @@ def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
             rate, bound = latency["calls_per_second"], LOOP_BOUNDS.get(case)
             rows.append(Row(case, f"{name}_calls_per_second", rate, "1/s", bound=bound, at_least=True))
             continue
-        numbers = {f"{name}_{key}": latency[key] for key in SHOWN}
+        shown = ("p50_us", "p99_us", "p999_us", "worst_us", "p50_spread_us")
+        numbers = {f"{name}_{key}": latency[key] for key in shown}
         numbers[f"{name}_p99_over_p50"] = latency["p99_us"] / latency["p50_us"]
         rows += [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in numbers.items()]
     return rows

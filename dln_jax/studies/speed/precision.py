@@ -1,16 +1,15 @@
 """benchmark precision: float32 against float64, error and time, for every kind of model with the same parameters."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
-from dln_jax.data.schema import Trajectories
 from dln_jax.figures.benchmarks import cost_points
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.models.model import Model, Parameters
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import TRIGONOMETRIC, described
 from dln_jax.studies.case import Findings
@@ -19,32 +18,33 @@ from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 
 BATCH = 1_000
+INPUTS = {"inverse": ("q", "qd", "qdd"), "forward": ("q", "qd", "tau")}
 MEASURED = ("structured-delan", "black-box-delan", "structured-hnn", "feed-forward", TRIGONOMETRIC)
 """Not black-box-hnn: parameters are random, and a random energy need not have a momentum for each velocity."""
 
 
 def measure(quick: bool) -> Findings:
     """Largest difference of float32 from float64, relative to the largest value, and batches of 1,000 in both."""
-    sets = published_split(letters(None))
-    data = sets.train
-    states = tuple(array[:BATCH] for array in (data.q, data.qd, data.qdd, data.tau))
+    data = published_split(letters(None)).train
     rows, shown = [], {}
     for kind in ("structured-delan",) if quick else MEASURED:
         answers, seconds = {}, {}
         model = {p: build(described(kind, data, precision=p, width=64, depth=2)) for p in ("f32", "f64")}
+        # A linear model starts at zero, which has no motion, and gets its fit instead.
+        linear = kind == TRIGONOMETRIC
+        start = fit_linear(model["f32"], data).parameters if linear else jax.jit(model["f32"].init)(jax.random.key(0))
         # Parameters of float32 are exact in float64, so that arithmetic is all that differs.
-        narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), initial(model["f32"], kind, data))
-        wide = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), narrow)
-        for precision, parameters, dtype in (("f32", narrow, jnp.float32), ("f64", wide, jnp.float64)):
+        narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), start)
+        for precision, dtype in (("f32", jnp.float32), ("f64", jnp.float64)):
+            parameters = jax.tree.map(lambda leaf, dtype=dtype: leaf.astype(dtype), narrow)
             system = compiled(dynamics(model[precision].energies(parameters)), dtype)
-            programs = {name: jax.jit(jax.vmap(getattr(system, f"{name}_dynamics"))) for name in ("inverse", "forward")}
-            inputs = {"inverse": states[:3], "forward": (*states[:2], states[3])}
-            for name, program in programs.items():
-                arguments = tuple(jnp.asarray(array, dtype) for array in inputs[name])
+            for name, chosen in INPUTS.items():
+                program = jax.jit(jax.vmap(getattr(system, f"{name}_dynamics")))
+                arguments = tuple(jnp.asarray(getattr(data, key)[:BATCH], dtype) for key in chosen)
                 answers[precision, name] = np.asarray(program(*arguments), np.float64)
                 found = medians_in_turns({name: program}, arguments, repetitions=10 if quick else 40)
                 seconds[precision, name] = found[name]
-        for name in ("inverse", "forward"):
+        for name in INPUTS:
             exact = answers["f64", name]
             error = float(np.max(np.abs(answers["f32", name] - exact)) / np.max(np.abs(exact)))
             speed = seconds["f64", name] / seconds["f32", name]
@@ -57,14 +57,5 @@ def measure(quick: bool) -> Findings:
     return Findings(rows, shown)
 
 
-def draw(shown: dict) -> Figure:
-    """What float32 gains in time against what it loses in accuracy."""
-    labels = "time of float64 over time of float32, batch 1,000", "largest relative error of float32"
-    return cost_points(shown, x=labels[0], y=labels[1], title="float32 against float64, 64x64, d = 2")
-
-
-def initial(model: Model, kind: str, data: Trajectories) -> Parameters:
-    """Random parameters; the linear model starts at zero, which has no motion, and gets its fit instead."""
-    if kind != TRIGONOMETRIC:
-        return jax.jit(model.init)(jax.random.key(0))
-    return fit_linear(model, data).parameters
+labels = {"x": "time of float64 over time of float32, batch 1,000", "y": "largest relative error of float32"}
+draw = partial(cost_points, **labels, title="float32 against float64, 64x64, d = 2")

@@ -6,19 +6,40 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.speed import integrators, one_step, precision, scaling, soft_bodies, throughput, training
+from dln_jax.figures.benchmarks import cost_curves, error_against_time
+from dln_jax.studies import soft_bodies
+from dln_jax.studies.case import Case, Findings, named
+from dln_jax.studies.soft_bodies.figures import speed_against_error
+from dln_jax.studies.soft_bodies.speed import LANES
+from dln_jax.studies.speed import integrators, one_step, precision, scaling, throughput, training
 
 __all__ = ["SUBJECTS", "cases"]
+
+
+def measure_soft_bodies(quick: bool) -> Findings:
+    """The speeds of `softbody_report`; the table of linear solvers is left to that."""
+    names = ("creature",) if quick else ("creature", "beams", "backward", "speed-against-error")
+    found = [case.measure() for case in named(soft_bodies.cases(quick=quick), *(f"speed/{name}" for name in names))]
+    rows = [row._replace(case=row.case.removeprefix("speed/"), expected="") for each in found for row in each.rows]
+    rates = [row.value for row in rows if row.quantity.endswith("steps_per_second")]
+    return Findings(rows, {"crawler": ([1, LANES], rates)} if quick else found[-1].curves)
+
+
+def draw_soft_bodies(lines: dict[str, Any]) -> Figure:
+    """Speed against error, or if quick against the number of lanes."""
+    if "crawler" in lines:
+        return cost_curves(lines, x="lanes", y="steps per second", title="28 vertices, float64")
+    return speed_against_error(lines)
+
 
 SUBJECTS: dict[str, tuple[Callable[[bool], Findings], Callable[[dict[str, Any]], Figure]]] = {
     "one-step": (one_step.measure, one_step.draw),
     "throughput": (throughput.measure, throughput.draw),
     "scaling": (scaling.measure, scaling.draw),
-    "training": (training.measure, training.draw),
+    "training": (training.measure, error_against_time),
     "integrators": (integrators.measure, integrators.draw),
     "precision": (precision.measure, precision.draw),
-    "softbody": (soft_bodies.measure, soft_bodies.draw),
+    "softbody": (measure_soft_bodies, draw_soft_bodies),
 }
 """What measures each, by quick, and what draws it."""
 

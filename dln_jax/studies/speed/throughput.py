@@ -1,9 +1,10 @@
 """benchmark throughput: batched states per second of a structured DeLaN, and against the full-Hessian way."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
-from matplotlib.figure import Figure
 
 from dln_jax.figures.benchmarks import cost_curves
 from dln_jax.mechanics.equations import dynamics
@@ -19,14 +20,15 @@ BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
 QUICK = (1, 1_000)
 SIZES = (2, 4, 7, 12)
 HESSIAN_BATCH = 512
+NAMES = ("inverse", "forward")
 
 
 def measure(quick: bool) -> Findings:
     """Inverse and forward dynamics for growing batches; at one batch, the full-Hessian way for growing d."""
     repetitions = 10 if quick else 40
+    batches = QUICK if quick else BATCHES
     rows: list[Row] = []
-    speeds: dict[str, tuple[list[float], list[float]]] = {}
-    for batch in QUICK if quick else BATCHES:
+    for batch in batches:
         energies, states = structured(2, batch)
         model = dynamics(energies)
         programs = {
@@ -35,21 +37,16 @@ def measure(quick: bool) -> Findings:
             "forward": jax.jit(jax.vmap(model.forward_dynamics)),
         }
         seconds = medians_in_turns(programs, states, repetitions=repetitions)
-        for name in ("inverse", "forward"):
-            rate = batch / seconds[name]
-            rows.append(Row(f"structured-delan/batch-{batch}", f"{name}_states_per_second", rate, "1/s"))
-            speeds.setdefault(name, ([], []))[0].append(batch)
-            speeds[name][1].append(rate)
-        noise = abs(seconds["inverse_again"] / seconds["inverse"] - 1)
-        rows.append(Row(f"structured-delan/batch-{batch}", "noise_of_repetition", noise, "1"))
-    for d in SIZES[:1] if quick else SIZES:
-        rows.append(hessian_row(d, repetitions))
-    return Findings(rows, speeds)
+        case, noise = f"structured-delan/batch-{batch}", abs(seconds["inverse_again"] / seconds["inverse"] - 1)
+        rows += [Row(case, f"{name}_states_per_second", batch / seconds[name], "1/s") for name in NAMES]
+        rows.append(Row(case, "noise_of_repetition", noise, "1"))
+    rates = {name: [row.value for row in rows if row.quantity.startswith(name)] for name in NAMES}
+    rows += [hessian_row(d, repetitions) for d in (SIZES[:1] if quick else SIZES)]
+    return Findings(rows, {name: (list(batches), each) for name, each in rates.items()})
 
 
-def draw(speeds: dict) -> Figure:
-    """States per second against the batch."""
-    return cost_curves(speeds, x="batch", y="states per second", title="structured DeLaN, d = 2, 64x64, float32")
+titles = {"x": "batch", "y": "states per second", "title": "structured DeLaN, d = 2, 64x64, float32"}
+draw = partial(cost_curves, **titles)
 
 
 def hessian_row(d: int, repetitions: int) -> Row:

@@ -3,20 +3,17 @@
 from collections.abc import Callable
 from functools import partial
 
-from matplotlib.figure import Figure
-
 from dln_jax.data.splits import Split
-from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import (
     SIZES,
-    Curve,
     Measured,
     Size,
     curve,
+    end_of,
     linear_fit,
     measure_adam,
     measure_seeds,
@@ -29,6 +26,7 @@ from dln_jax.studies.report import Row
 
 ADAM_STEPS = 20_000
 QUICK = "structured-delan"
+UNITS = {"torque_mse": "N^2 m^2", "train_seconds": "s"}
 
 
 def measure(quick: bool) -> Findings:
@@ -44,33 +42,23 @@ def measure(quick: bool) -> Findings:
     rows, lines = [], {}
     for case, job in jobs.items():
         numbers, path = job()
-        rows.append(Row(case, "torque_mse", numbers["torque_mse"], "N^2 m^2"))
-        rows.append(Row(case, "train_seconds", numbers["train_seconds"], "s"))
+        rows += [Row(case, name, numbers[name], unit) for name, unit in UNITS.items()]
         if path is not None:
             lines[case] = (path.seconds, path.errors)
     return Findings(rows, lines)
 
 
-def draw(lines: dict) -> Figure:
-    """Error against seconds of training."""
-    return error_against_time(lines)
-
-
 def linear_alone(sets: Split) -> Measured:
     """The linear fit, without the rollouts and latencies that the arm's table has beside it: they take far longer."""
-    model, fitted, seconds = linear_fit(sets)
-    numbers = {
-        "torque_mse": torque_mse(dynamics(model.energies(fitted.parameters)), sets.test),
-        "train_seconds": seconds,
-    }
-    return numbers, Curve([seconds], [max(numbers["torque_mse"], 1e-32)])
+    fitted, energies = linear_fit(sets.train)
+    numbers = {"torque_mse": torque_mse(dynamics(energies), sets.test), "train_seconds": fitted.seconds}
+    return numbers, end_of(numbers)
 
 
 def gauss_newton_alone(sets: Split, *, steps: int) -> Measured:
     """A few steps of a small network, likewise."""
     model, optimiser = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
     training = fit(problem(model, sets), optimiser)
-    seconds = training.compile_seconds + training.train_seconds
-    trained = dynamics(model.energies(training.parameters))
-    numbers = {"torque_mse": torque_mse(trained, sets.test), "train_seconds": seconds}
+    error = torque_mse(dynamics(model.energies(training.parameters)), sets.test)
+    numbers = {"torque_mse": error, "train_seconds": training.compile_seconds + training.train_seconds}
     return numbers, curve(QUICK, sets, training, numbers, 1)
