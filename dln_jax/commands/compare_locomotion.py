@@ -19,7 +19,7 @@ from dln_jax.locomotion import comparison
 from dln_jax.locomotion.methods import METHODS, settings_of
 from dln_jax.locomotion.task import FALLEN, Task
 from dln_jax.runs.locomotion import GOAL, Options, announce, learned, prepare, write_run
-from dln_jax.studies.locomotion.methods import comparison_rows
+from dln_jax.studies.locomotion import comparison_rows
 from dln_jax.studies.report import conditions, print_report, write_report
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 

@@ -53,13 +53,10 @@ def measure(
     folder: Path | None = None,
     stored: Mapping[str, Findings] | None = None,
 ) -> dict[str, Findings]:
-    """Measures the cases one after the other, and tells `report` of each; findings by name, in the order of the cases.
+    """Measures the cases one after the other, and tells `report` of each, also of one that was `stored` before.
 
-    Args:
-        cases: what to measure.
-        report: is called for each case, also for one that was measured before.
-        folder: whose jobs.json keeps what is there after each case; of rows that is case, quantity and value.
-        stored: what was measured before, as by `stored_findings`.
+    Returns the findings by name, in the order of the cases. The jobs.json of a `folder` keeps what is there after each
+    case; of rows that is case, quantity and value.
     """
     found = dict(stored or {})
     for number, case in enumerate(cases, start=1):
@@ -67,7 +64,10 @@ def measure(
         if case.name not in found:
             found[case.name] = case.measure()
             if folder:
-                write_json(folder / JOBS, {name: _as_json(each) for name, each in found.items()})
+                kept = {
+                    name: {"rows": [row[:3] for row in rows], "curves": each} for name, (rows, each) in found.items()
+                }
+                write_json(folder / JOBS, kept)
         place = f"{number:{len(str(len(cases)))}d}/{len(cases)}"
         report(Done(place, case, found[case.name], time.perf_counter() - began))
     return {case.name: found[case.name] for case in cases}
@@ -145,10 +145,6 @@ def stored_findings(folder: Path, cases: Sequence[Case]) -> dict[str, Findings]:
     return found
 
 
-def _as_json(findings: Findings) -> dict[str, Any]:
-    return {"rows": [row[:3] for row in findings.rows], "curves": findings.curves}
-
-
 def _from_json(place: str, values: Any) -> Findings:
     rows, curves = (values.get(key) for key in ("rows", "curves")) if isinstance(values, dict) else (None, None)
     if not _lists(rows) or not all(len(row) == 3 and all(map(matches, row, (str, str, float | None))) for row in rows):
@@ -157,15 +153,10 @@ def _from_json(place: str, values: Any) -> Findings:
         raise InputError(f"{place} has no curves; {REMEDY}")
     if not all(matches(x, float | None) for each in points for x in each):
         raise InputError(f"{place} has a curve that is none; {REMEDY}")
-    return Findings(
-        [Row(case, quantity, _number(value)) for case, quantity, value in rows],
-        {name: [_number(x) for x in each] for name, each in curves.items()},
-    )
+    number = lambda value: math.nan if value is None else float(value)  # noqa: E731
+    curves = {name: list(map(number, each)) for name, each in curves.items()}
+    return Findings([Row(case, quantity, number(value)) for case, quantity, value in rows], curves)
 
 
 def _lists(values: Any) -> TypeGuard[list[list[Any]]]:
     return isinstance(values, list) and all(isinstance(each, list) for each in values)
-
-
-def _number(value: float | int | None) -> float:
-    return math.nan if value is None else float(value)

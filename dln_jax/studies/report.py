@@ -91,8 +91,7 @@ def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> N
 
     What is expected of rows in words is part of the conditions.
     """
-    names = ("case", "quantity", "value", "unit", "reference", "bound")
-    listed = [{**{name: getattr(row, name) for name in names}, "pass": row.passed} for row in rows]
+    listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
     write_json(path, {"conditions": {**facts, **({"expected": words} if words else {})}, "rows": listed})
 
@@ -127,22 +126,18 @@ def print_report(rows: Sequence[Row], facts: Mapping[str, Any], *others: Table |
 def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
     """One line per row, without the columns that would be empty; the caption states the conditions."""
     passed = {True: "yes", False: "[bold red]no[/]", None: ""}
+    to_reach = ["" if row.bound is None else f"{'≥' if row.at_least else '≤'} {row.bound:.3g}" for row in rows]
     columns = {
-        "case": [row.case for row in rows],
-        "quantity": [row.quantity for row in rows],
-        "expected": [row.expected for row in rows],
-        "value": [_number(row.value) for row in rows],
+        **{name: [getattr(row, name) for row in rows] for name in ("case", "quantity", "expected")},
+        "value": [f"{row.value:.3g}" for row in rows],
         "unit": [row.unit for row in rows],
-        "reference": [_number(row.reference) for row in rows],
-        "to reach": [
-            f"{'≥' if row.at_least else '≤'} {row.bound:.3g}" if row.bound is not None else "" for row in rows
-        ],
+        "reference": ["" if row.reference is None else f"{row.reference:.3g}" for row in rows],
+        "to reach": to_reach,
         "pass": [passed[row.passed] for row in rows],
     }
     columns = {name: cells for name, cells in columns.items() if any(cells)}
-    table = Table(
-        *columns, caption=f"{facts['machine']}; {facts['dtype']}; {facts['threads']} threads; {facts['command']}"
-    )
+    caption = "; ".join((facts["machine"], facts["dtype"], f"{facts['threads']} threads", facts["command"]))
+    table = Table(*columns, caption=caption)
     for cells in zip(*columns.values(), strict=True):
         table.add_row(*cells)
     return table
@@ -154,18 +149,13 @@ def markdown(rows: Sequence[Row]) -> str:
     columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
     titles = [quantity.replace("_", " ") + (f", {unit}" if unit != "1" else "") for quantity, unit in columns]
-    return markdown_table(
-        ["case", *titles], [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
-    )
+    lines = [[case, *(values.get((case, *column), "") for column in columns)] for case in cases]
+    return markdown_table(["case", *titles], lines)
 
 
 def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """Cells as Markdown."""
     return "".join(f"| {' | '.join(line)} |\n" for line in [titles, ["---"] * len(titles), *lines])
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 def _processor() -> str:

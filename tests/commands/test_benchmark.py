@@ -22,7 +22,6 @@ from dln_jax.studies.arm.models import described
 from dln_jax.studies.case import Findings
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.studies.report import Row, markdown
-from dln_jax.studies.speed import calls as benchmark_calls
 from dln_jax.studies.speed import integrators as benchmark_integrators
 from dln_jax.studies.speed import low_latency_calls
 from dln_jax.studies.speed import one_step as benchmark_one_step
@@ -146,9 +145,9 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, m
 
 
 def test_call_paths_are_timed(small_run, capsys, monkeypatch):
-    monkeypatch.setattr(benchmark_calls, "enable_low_latency", lambda: None)  # a process of its own would be needed
+    monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
     for dispatch in ("default", "low-latency"):
-        command(benchmark_calls, "--runs", str(small_run), "--dispatch", dispatch, "--calls", "10")
+        command(benchmark_one_step, "--runs", str(small_run), "--dispatch", dispatch, "--calls", "10")
     first, second = (json.loads(line)["structured-delan"] for line in capsys.readouterr().out.splitlines())
     assert set(first) == {"default-jit"}
     assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)

@@ -65,8 +65,8 @@ def measure_into(folder: Path, chosen: Sequence[Case], given: Extent, *, resume:
         selection="widths and stopping by validation; best of a row over losses and activations, as published",
         samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
     )
-    by_optimizer = {optimizer: facts[optimizer.replace("-", "_")] for optimizer in OPTIMIZERS}
-    tables = [comparison(by_case(rows), optimizer, recipe) for optimizer, recipe in by_optimizer.items()]
+    numbers = by_case(rows)
+    tables = [comparison(numbers, optimizer, facts[optimizer.replace("-", "_")]) for optimizer in OPTIMIZERS]
     publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
     print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
     print(facts["samples"])
@@ -84,7 +84,11 @@ def cases(given: Extent = Extent()) -> list[Case]:  # noqa: B008  a tuple
             continue
         data, test = problems[function]
         sets = functions.split(data, seed=given.seed)
-        network, optimiser = network_of(given, function, loss, name, optimizer), optimiser_of(given, sets, optimizer)
+        network = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=given.seed)
+        optimiser = published_adam(len(sets.train.x), epochs=given.epochs)
+        if optimizer == "gauss-newton":
+            network = network._replace(width=WIDTHS[0], precision="f64")
+            optimiser = GAUSS_NEWTON._replace(steps=given.steps, coarse_steps=given.coarse_steps)
         targets(data, network)
         optimisers.check(optimiser)
         case = f"{function}/{loss}/{name}/{optimizer}"
@@ -94,29 +98,15 @@ def cases(given: Extent = Extent()) -> list[Case]:  # noqa: B008  a tuple
 
 
 def findings(case: str, sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> Findings:
-    """The numbers of one network."""
+    """The numbers of one network, the published one or for Gauss-Newton one that starts small."""
     return Findings(rows_of(case, trained(sets, test, network, optimiser)))
-
-
-def network_of(given: Extent, function: str, loss: str, name: str, optimizer: str) -> Network:
-    """The published network, or for Gauss-Newton a small one of as many layers."""
-    published = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=given.seed)
-    return published if optimizer == "adam" else published._replace(width=WIDTHS[0], precision="f64")
-
-
-def optimiser_of(given: Extent, sets: SampleSplit, optimizer: str) -> Optimiser:
-    """The published recipe, or Gauss-Newton."""
-    if optimizer == "adam":
-        return published_adam(len(sets.train.x), epochs=given.epochs)
-    return GAUSS_NEWTON._replace(steps=given.steps, coarse_steps=given.coarse_steps)
 
 
 def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> dict[str, float]:
     """Trains one network, at the width that validation chooses or the published one, and measures it on the grid."""
     began = time.perf_counter()
     if isinstance(optimiser, Adam):
-        training = train(sets, network, optimiser)
-        every = [training]
+        every = [training := train(sets, network, optimiser)]
     else:
         chosen, trials = grow_width(sets, network, lambda candidate: train(sets, candidate, optimiser))
         network, training, every = chosen.candidate, chosen.outcome, [trial.outcome for trial in trials]
@@ -124,18 +114,17 @@ def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimise
     return {
         **errors(predicted.mean, test),
         "width": network.width,
-        "train_seconds": sum(each.train_seconds for each in every),
-        "compile_seconds": sum(each.compile_seconds for each in every),
+        **{name: sum(getattr(each, name) for each in every) for name in ("train_seconds", "compile_seconds")},
         "job_seconds": time.perf_counter() - began,
     }
 
 
 def table_rows(rows: Sequence[Row]) -> list[Row]:
     """Every number beside the published one, the best of each published row, and the time of all."""
-    found = [
-        row._replace(unit=unit_of(row.quantity), reference=published(TABLE, _recipe(row.case), row.quantity))
-        for row in rows
-    ]
+    found = []
+    for row in rows:
+        theirs = published(TABLE, row.case.rpartition("/")[0], row.quantity)  # without the optimiser
+        found.append(row._replace(unit=unit_of(row.quantity), reference=theirs))
     for function, factor in FACTORS.items():
         for quantity in QUANTITIES:
             ours = [row.value for row in rows if row.case.startswith(f"{function}/") and row.quantity == quantity]
@@ -143,11 +132,6 @@ def table_rows(rows: Sequence[Row]) -> list[Row]:
             found.append(Row(f"{function}/best", quantity, min(ours), "1", theirs, theirs / factor))
     seconds = sum(row.value for row in rows if row.quantity == "job_seconds")
     return [*found, Row("table/all", "table_seconds", seconds, "s", bound=900.0)]
-
-
-def _recipe(case: str) -> str:
-    """The published table has no optimisers."""
-    return case.rpartition("/")[0]
 
 
 def comparison(found: Mapping[str, Mapping[str, float]], optimizer: str, recipe: str) -> Table:

@@ -29,12 +29,8 @@ BATCHES = {1: "single-call", 512: "training-step-batch-512"}
 def cases(*, width: int = 64, repetitions: int = 40) -> list[Case]:
     """A case for each number of joints and each batch; `InputError` for numbers that are not positive."""
     require_positive(repetitions=repetitions, width=width)
-    return [
-        Case(name, partial(compared, name, d, batch, width, repetitions))
-        for d in SIZES
-        for batch, kind in BATCHES.items()
-        for name in [f"d-{d}/{kind}"]
-    ]
+    chosen = {f"d-{d}/{kind}": (d, batch) for d in SIZES for batch, kind in BATCHES.items()}
+    return [Case(name, partial(compared, name, *sizes, width, repetitions)) for name, sizes in chosen.items()]
 
 
 def compared(case: str, d: int, batch: int, width: int, repetitions: int) -> Findings:
@@ -57,7 +53,8 @@ def compared(case: str, d: int, batch: int, width: int, repetitions: int) -> Fin
         return jax.jit(lambda states: jax.grad(loss)(layers, states))
 
     programs = {"jvp_vjp_us": program(by_jvp_and_vjp), "one_pass_us": program(by_one_pass)}
-    require_agreement(list(programs.values()), states)
+    for one, other in zip(*(jax.tree.leaves(each(states)) for each in programs.values()), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3 * float(jnp.max(jnp.abs(one))))
     medians = medians_in_turns(programs, (states,), repetitions=repetitions)
     rows = [Row(case, name, 1e6 * value, "us") for name, value in medians.items()]
     return Findings([*rows, Row(case, "one_pass_over_jvp_vjp", medians["one_pass_us"] / medians["jvp_vjp_us"])])
@@ -92,10 +89,3 @@ def by_one_pass(layers: tuple, q: Array, qd: Array, qdd: Array) -> Array:
 def features(q: Array) -> Array:
     """cos and sin of revolute joints."""
     return jnp.concatenate([jnp.cos(q), jnp.sin(q)])
-
-
-def require_agreement(programs: list[Callable], states: Array) -> None:
-    """Both ways give one answer."""
-    answers = [jax.tree.leaves(program(states)) for program in programs]
-    for one, other in zip(*answers, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-2, atol=1e-3 * float(jnp.max(jnp.abs(one))))

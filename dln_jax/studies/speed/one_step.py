@@ -1,16 +1,28 @@
-"""benchmark one-step: microseconds of single calls against test error, for every model and call path."""
+"""benchmark one-step: microseconds of single calls against test error, for every model and call path.
+
+How JAX dispatches is settled when it starts: each way is timed in a process of its own, whose main this module has.
+"""
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.command_line.running import run
 from dln_jax.data.splits import Split
+from dln_jax.deploy.c.load import FLAGS, WARNINGS, CDynamics, compile_c, load_c
+from dln_jax.deploy.c.source import export_run
+from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.figures.benchmarks import EXACT, cost_points
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
@@ -18,6 +30,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.latency import one_step
 from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import SIZES, TRIGONOMETRIC, described
 from dln_jax.studies.case import Findings
@@ -35,6 +48,8 @@ BOUNDS = {
 }
 LOOP_BOUNDS = {f"{WIDE}/c-loop": 200_000.0, f"{SMALL}/c-loop": 1_500_000.0}
 CALLS = 20_000
+STATES = 512
+EXPORTED = "model"
 PROCESSES = 3
 """Of each way to dispatch, in turns; their medians count, and their spread shows the machine's noise."""
 
@@ -47,7 +62,7 @@ def measure(quick: bool) -> Findings:
         folders = [train_into(Path(place), name, sets, quick=quick) for name in names]
         predicted = [predictions(load(folder).energies, sets.test, jnp.float64) for folder in folders]
         turns = [
-            timed(folders, dispatch, calls=CALLS // 20 if quick else CALLS)
+            time_in_a_process(folders, dispatch, calls=CALLS // 20 if quick else CALLS)
             for _ in range(1 if quick else PROCESSES)
             for dispatch in ("default", "low-latency")
         ]
@@ -87,9 +102,9 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     return folder
 
 
-def timed(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
-    """What `dln_jax.studies.speed.calls` measures, by run."""
-    command = [sys.executable, "-m", "dln_jax.studies.speed.calls", "--dispatch", dispatch, "--calls", str(calls)]
+def time_in_a_process(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
+    """What `main` measures, by run."""
+    command = [sys.executable, "-m", "dln_jax.studies.speed.one_step", "--dispatch", dispatch, "--calls", str(calls)]
     done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True, text=True)
     if done.returncode:
         raise InputError(f"timing in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
@@ -123,3 +138,68 @@ def rows_of(case: str, functions: dict[str, dict[str, float]]) -> list[Row]:
         numbers[f"{name}_p99_over_p50"] = latency["p99_us"] / latency["p50_us"]
         rows += [Row(case, key, value, unit_of(key), bound=BOUNDS.get((case, key))) for key, value in numbers.items()]
     return rows
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to time."""
+
+    runs: tuple[Path, ...]
+    """Folders of trained runs of the two-link arm."""
+    dispatch: Literal["default", "low-latency"] = "default"
+    """default: jitted functions as they are; low-latency: without a change of threads, with NumPy in and out, and C."""
+    calls: int = 20_000
+    """Calls that are timed, of each."""
+
+
+def main(given: Arguments) -> None:
+    """Times, and prints JSON: microseconds by run, call path and function."""
+    if given.dispatch == "low-latency":
+        enable_low_latency()
+    test = published_split(letters(None)).test
+    states = {
+        "inverse": tuple(array[:STATES] for array in (test.q, test.qd, test.qdd)),
+        "forward": tuple(array[:STATES] for array in (test.q, test.qd, test.tau)),
+    }
+    print(json.dumps({folder.name: times_of(folder, states, given) for folder in given.runs}))
+
+
+def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arguments) -> dict[str, Any]:
+    """Of one run, by call path and function."""
+    precision = json.loads((folder / "model.json").read_text())["model"]["precision"]
+    dtype = {"f32": np.float32, "f64": np.float64}[precision]
+    system = load(folder).dynamics
+    jitted = {"inverse": jax.jit(system.inverse_dynamics), "forward": jax.jit(system.forward_dynamics)}
+    host = {name: list(zip(*(array.astype(dtype) for array in states[name]), strict=True)) for name in jitted}
+    device = {name: [tuple(map(jnp.asarray, state)) for state in host[name]] for name in jitted}
+
+    def timed(functions: dict[str, Callable], states: dict[str, list[tuple]]) -> dict[str, dict[str, float]]:
+        return {name: one_step(each, states[name], calls=given.calls)._asdict() for name, each in functions.items()}
+
+    if given.dispatch == "default":
+        return {"default-jit": timed(jitted, device)}
+    packed = {name: low_latency(function, *host[name][0], numpy=True) for name, function in jitted.items()}
+    found = {"low-latency-jit": timed(jitted, device), "low-latency-numpy": timed(packed, host)}
+    with tempfile.TemporaryDirectory() as place:
+        try:
+            export_run(folder, Path(place), name=EXPORTED)
+        except InputError:
+            return found  # a kind that is not exported
+        exported = load_c(place, name=EXPORTED)
+        assert isinstance(exported, CDynamics)
+        functions = {"inverse": exported.inverse_dynamics, "forward": exported.forward_dynamics}
+        found["c-from-python"] = timed(functions, host)
+        found["c-loop"] = {"inverse": {"calls_per_second": calls_in_c(Path(place), 20 * given.calls)}}
+    return found
+
+
+def calls_in_c(place: Path, calls: int) -> float:
+    """Inverse-dynamics calls per second of the exported demo's own loop; the best of three runs."""
+    demo = place / "demo"
+    compile_c([*FLAGS, *WARNINGS, *map(str, place.glob("*.c")), "-lm", "-o", str(demo)])
+    printed = [subprocess.run([demo, str(calls)], capture_output=True, text=True, check=True).stdout for _ in range(3)]
+    return max(float(rate) for each in printed for rate in re.findall(r"(\d+) calls/s", each))
+
+
+if __name__ == "__main__":
+    run(main, Arguments, prog="python -m dln_jax.studies.speed.one_step")

@@ -1,1 +1,0 @@
-"""Ways of learning to move, compared."""
