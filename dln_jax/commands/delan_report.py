@@ -13,8 +13,8 @@ from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Folder
 from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import CHARACTERS_TEST
-from dln_jax.studies.arm.data import letters
 from dln_jax.studies.arm.published_protocol import cases
+from dln_jax.studies.arm.table import letters
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.report import conditions, publish
 from dln_jax.types import require_positive

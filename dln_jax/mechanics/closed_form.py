@@ -43,37 +43,43 @@ def lagrangian(system: ClosedForm) -> Lagrangian:
     return difference
 
 
+def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
+    """Inertial, Coriolis and gravity force, each [d]."""
+    return Decomposition(
+        inertial=system.mass_matrix(q) @ qdd,
+        coriolis=system.coriolis(q, qd),
+        gravity=jnp.zeros_like(q) if system.gravity is None else system.gravity(q),
+    )
+
+
+def inverse_dynamics(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] that a motion takes, friction included."""
+    tau = system.mass_matrix(q) @ qdd + system.coriolis(q, qd)
+    if system.gravity is not None:
+        tau += system.gravity(q)
+    return tau if system.friction is None else tau + system.friction(q, qd)
+
+
+def forward_dynamics(system: ClosedForm, q: Vector, qd: Vector, tau: Vector) -> Vector:
+    """Acceleration qdd [d] under a generalised force: solves M qdd = tau - tau(q, qd, 0)."""
+    bias = inverse_dynamics(system, q, qd, jnp.zeros_like(qd))
+    return elimination.solve(system.mass_matrix(q), tau - bias)
+
+
+def energy(system: ClosedForm, q: Vector, qd: Vector) -> Scalar:
+    """Energy T + V."""
+    kinetic = 0.5 * qd @ system.mass_matrix(q) @ qd
+    return kinetic if system.potential is None else kinetic + system.potential(q)
+
+
 def dynamics(system: ClosedForm, *, degrees_of_freedom: int | None = None) -> Dynamics:
     """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
-    mass_matrix, coriolis, potential, gravity, dissipation, friction = system
-
-    def inverse_dynamics(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        tau = mass_matrix(q) @ qdd + coriolis(q, qd)
-        if gravity is not None:
-            tau += gravity(q)
-        return tau if friction is None else tau + friction(q, qd)
-
-    def forward_dynamics(q: Vector, qd: Vector, tau: Vector) -> Vector:
-        bias = inverse_dynamics(q, qd, jnp.zeros_like(qd))
-        return elimination.solve(mass_matrix(q), tau - bias)
-
-    def energy(q: Vector, qd: Vector) -> Scalar:
-        kinetic = 0.5 * qd @ mass_matrix(q) @ qd
-        return kinetic if potential is None else kinetic + potential(q)
-
-    def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-        return Decomposition(
-            inertial=mass_matrix(q) @ qdd,
-            coriolis=coriolis(q, qd),
-            gravity=jnp.zeros_like(q) if gravity is None else gravity(q),
-        )
-
     return make_dynamics(
-        inverse_dynamics,
-        forward_dynamics,
-        decompose,
-        energy,
-        lambda q, qd: mass_matrix(q),
-        dissipation=dissipation,
+        inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
+        forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),
+        energy=lambda q, qd: energy(system, q, qd),
+        mass_matrix=lambda q, qd: system.mass_matrix(q),
+        decompose=lambda q, qd, qdd: decompose(system, q, qd, qdd),
+        dissipation=system.dissipation,
         degrees_of_freedom=degrees_of_freedom,
     )

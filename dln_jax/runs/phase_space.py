@@ -17,7 +17,7 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.phase_space_task import PhaseTask
-from dln_jax.studies.hamiltonian.measures import Seen, figure_of, measured_once, units_of
+from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
 from dln_jax.studies.hamiltonian.training import MOTIONS, RATES, Trained, stages_of, train
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics

@@ -13,7 +13,7 @@ from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm import models as arm_models
 from dln_jax.studies.arm import table
-from dln_jax.studies.arm.data import states
+from dln_jax.studies.arm.table import states
 from dln_jax.studies.published import ARM
 from dln_jax.zoo.catalogue import CATALOGUE
 

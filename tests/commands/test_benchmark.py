@@ -17,15 +17,15 @@ from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.models.delan import make_delan
 from dln_jax.scenes.chain import chain
-from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import described
+from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.studies.report import Row, markdown
+from dln_jax.studies.speed import costs as benchmark_costs
 from dln_jax.studies.speed import integrators as benchmark_integrators
 from dln_jax.studies.speed import low_latency_calls
 from dln_jax.studies.speed import one_step as benchmark_one_step
-from dln_jax.studies.speed import throughput as benchmark_throughput
 from dln_jax.studies.speed.subjects import SUBJECTS
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build
@@ -37,7 +37,7 @@ def test_the_full_hessian_way_gives_the_same_torques(d=2):
     energies = model.energies(model.init(jax.random.key(0)))
     system = dynamics(energies)
     state = tuple(jnp.asarray(row) for row in np.random.default_rng(0).standard_normal((3, d)))
-    reference = benchmark_throughput.by_full_hessian(lagrangian(energies))
+    reference = benchmark_costs.by_full_hessian(lagrangian(energies))
     np.testing.assert_allclose(jax.jit(reference)(*state), system.inverse_dynamics(*state), rtol=1e-11, atol=1e-12)
 
 

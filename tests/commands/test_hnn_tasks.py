@@ -17,7 +17,6 @@ from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.mechanics.flow import Flow
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.studies.case import Findings, rows_of
-from dln_jax.studies.hamiltonian import measures as hnn_measures
 from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.studies.hamiltonian import table
 from dln_jax.studies.hamiltonian import tasks as hnn_tasks
@@ -81,7 +80,7 @@ def workplace(tmp_path_factory):
         patch.setattr(hnn_tasks, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
         patch.setattr(table, "models_of", MEASURED.get)
-        patch.setattr(hnn_measures, "predict", quick_prediction)
+        patch.setattr(table, "predict", quick_prediction)
         patch.setattr(table, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
             patch.setattr(module, "reference_motion", quick_motion)

@@ -31,8 +31,8 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import SIZES, TRIGONOMETRIC, described
+from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, unit_of
 from dln_jax.types import InputError

@@ -10,8 +10,8 @@ from dln_jax.figures.benchmarks import cost_points
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import TRIGONOMETRIC, described
+from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
 from dln_jax.zoo.descriptions import build

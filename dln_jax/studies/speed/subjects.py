@@ -11,7 +11,7 @@ from dln_jax.studies import soft_bodies
 from dln_jax.studies.case import Case, Findings, named
 from dln_jax.studies.soft_bodies.figures import speed_against_error
 from dln_jax.studies.soft_bodies.speed import LANES
-from dln_jax.studies.speed import integrators, one_step, precision, scaling, throughput, training
+from dln_jax.studies.speed import costs, integrators, one_step, precision, training
 
 __all__ = ["SUBJECTS", "cases"]
 
@@ -34,8 +34,8 @@ def draw_soft_bodies(lines: dict[str, Any]) -> Figure:
 
 SUBJECTS: dict[str, tuple[Callable[[bool], Findings], Callable[[dict[str, Any]], Figure]]] = {
     "one-step": (one_step.measure, one_step.draw),
-    "throughput": (throughput.measure, throughput.draw),
-    "scaling": (scaling.measure, scaling.draw),
+    "throughput": (costs.measure_throughput, costs.draw_throughput),
+    "scaling": (costs.measure_scaling, costs.draw_scaling),
     "training": (training.measure, error_against_time),
     "integrators": (integrators.measure, integrators.draw),
     "precision": (precision.measure, precision.draw),

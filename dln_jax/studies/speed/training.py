@@ -7,7 +7,6 @@ from dln_jax.data.splits import Split
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.studies.arm.data import letters, published_split
 from dln_jax.studies.arm.models import (
     SIZES,
     Measured,
@@ -21,6 +20,7 @@ from dln_jax.studies.arm.models import (
     prepared,
     torque_mse,
 )
+from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row
 
