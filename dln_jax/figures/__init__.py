@@ -3,16 +3,13 @@
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.benchmarks import cost_curves, cost_panels, cost_points, error_against_time
 from dln_jax.figures.dynamics import force_decomposition, tip_paths
-from dln_jax.figures.ensembles import ensemble
-from dln_jax.figures.frames import Injection, inject_energy, injection_figure
-from dln_jax.figures.functions import function_curves, heat_maps, parity, surfaces
-from dln_jax.figures.phase_space import motion_figure
+from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
+from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.figures.training import training_curve
 
 __all__ = [
-    "Injection",
     "Moments",
     "cost_curves",
     "cost_panels",
@@ -23,7 +20,6 @@ __all__ = [
     "force_decomposition",
     "function_curves",
     "heat_maps",
-    "inject_energy",
     "injection_figure",
     "moments_figure",
     "motion_figure",

@@ -60,18 +60,17 @@ def write_frame_gif(
 ) -> None:
     """Writes square pictures of systems, each over the truth's where "truth" is among them: what both have is white.
 
-    Args:
-        path: of the GIF.
-        frames: of each system, intensities in [0, 1], row by row; what lies outside is drawn as the nearest.
-        t: time of each frame in s.
-        frames_per_second: with which they are shown.
+    Pictures are intensities in [0, 1], row by row; what lies outside is drawn as the nearest. Times are in s.
 
     Raises:
         InputError: no system, or pictures that are not square or not as many as times.
     """
     require_positive(frames_per_second=frames_per_second)
     _require_common_length(t, {name: pictures.shape[0] for name, pictures in frames.items()})
-    side = _side(next(iter(frames.values())).shape[1])
+    pixels = next(iter(frames.values())).shape[1]
+    side = round(np.sqrt(pixels))
+    if side * side != pixels:
+        raise InputError(f"pictures have {pixels} pixels; expected a square, row by row")
     models = [name for name in frames if name != TRUTH] or [TRUTH]
     over = TRUTH in frames and models != [TRUTH]
     figure, axes = style.figure(1, len(models), width=2.4 * len(models), height=2.9 + 0.3 * over, dpi=DPI)
@@ -107,14 +106,8 @@ def write_motion_gif(
 
     With one coordinate a panel is the phase plane; with 2 n coordinates it shows n bodies in a plane.
 
-    Args:
-        path: of the GIF.
-        motions: by name, at common times.
-        shown: which motion.
-        tail: samples that a body leaves behind it.
-        stride: samples between two frames of the GIF.
-        units: of q and of p, of one coordinate; empty where they have none.
-        frames_per_second: with which they are shown.
+    `tail` are the samples that a body leaves behind it, `stride` those between two frames of the GIF; `units` are those
+    of q and of p, of one coordinate, empty where they have none.
 
     Raises:
         InputError: no motion, or motions of several lengths.
@@ -134,11 +127,10 @@ def write_motion_gif(
     lines: list[tuple[Artist, Artist, tuple[np.ndarray, np.ndarray]]] = []
     for axis, name in zip(axes[0], models, strict=True):
         axis.set(xlim=(-corners[0], corners[0]), ylim=(-corners[1], corners[1]), box_aspect=1)
-        style.title(
-            axis, f"{name}, over the truth" if TRUTH in motions and name != TRUTH else name, color=style.colour(name)
-        )
+        over = TRUTH in motions and name != TRUTH
+        style.title(axis, f"{name}, over the truth" if over else name, color=style.colour(name))
         axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
-        for of in dict.fromkeys((TRUTH, name)) if TRUTH in motions else (name,):
+        for of in (TRUTH, name) if over else (name,):
             thick, size = (3.0, 8) if of == TRUTH else (1.4, 5)
             for curve in curves[of]:
                 (line,) = axis.plot([], [], color=style.colour(of), linewidth=thick)
@@ -161,10 +153,3 @@ def _require_common_length(t: np.ndarray, lengths: dict[str, int]) -> None:
     for name, length in lengths.items():
         if length != len(t):
             raise InputError(f"{name} has {length} samples for {len(t)} times; expected one for each")
-
-
-def _side(pixels: int) -> int:
-    side = round(np.sqrt(pixels))
-    if side * side != pixels:
-        raise InputError(f"pictures have {pixels} pixels; expected a square, row by row")
-    return side

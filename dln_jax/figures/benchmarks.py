@@ -44,10 +44,10 @@ def cost_panels(lines: Mapping[str, Mapping[str, Line]], *, x: str, y: str | Seq
     figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.8)
     every = list(dict.fromkeys(name for each in lines.values() for name in each))
     names = list(dict.fromkeys(name.split(", ")[0] for name in every))
-    variants = any(", " in name for name in every)
+    looks = {name: _look(name, names) for name in names}
     for number, (axis, (title, each)) in enumerate(zip(axes.flat, lines.items(), strict=False)):
         for name, line in each.items():
-            colour, marker = _look(name.split(", ")[0], names)
+            colour, marker = looks[name.split(", ")[0]]
             dash = "--" if ", " in name else "-"
             axis.plot(*line, dash, color=colour, marker=marker, markersize=3.5, linewidth=1.2)
         _scale(axis, each.values())
@@ -60,13 +60,14 @@ def cost_panels(lines: Mapping[str, Mapping[str, Line]], *, x: str, y: str | Seq
             axis.set_ylabel(y)
     for axis in list(axes.flat)[len(lines) :]:
         axis.axis("off")
-    handles = []
-    for name in names if len(names) > 1 else ():
-        colour, marker = _look(name, names)
-        handles.append(Line2D([], [], color=colour, marker=marker, markersize=4, label=name))
-    if variants:
-        handles += [Line2D([], [], color="0.4", label="exact energy")]
-        handles += [Line2D([], [], linestyle="--", color="0.4", label="learned energy")]
+    handles = [
+        Line2D([], [], color=colour, marker=marker, markersize=4, label=name)
+        for name, (colour, marker) in looks.items()
+        if len(looks) > 1
+    ]
+    if any(", " in name for name in every):
+        handles.append(Line2D([], [], color="0.4", label="exact energy"))
+        handles.append(Line2D([], [], linestyle="--", color="0.4", label="learned energy"))
     if handles:
         style.legend(figure, handles=handles, loc="outside lower center", ncols=4)
     return figure

@@ -28,12 +28,7 @@ def force_decomposition(
 
     All errors have one scale. Motions follow each other in time; single states are compared point by point.
 
-    Args:
-        data: the test.
-        predicted: by the keys of `PARTS`, [N, d].
-        model: name, of which the colour is taken.
-        most_joints: that are shown.
-        most_trajectories: that are shown.
+    `data` are the test's, `predicted` [N, d] by the keys of `PARTS`; the colour is that of the model's name.
     """
     shown = np.unique(data.trajectory)[:most_trajectories]
     samples = np.flatnonzero(np.isin(data.trajectory, shown))
@@ -83,10 +78,8 @@ def force_decomposition(
 
 def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Time of motions that follow each other at the spacing of their samples."""
-    steps = np.r_[0.0, np.diff(t)]
-    inside = np.ones(len(t), bool)
-    inside[starts] = False
-    steps[starts[1:]] = np.median(steps[inside])
+    steps = np.diff(t, prepend=t[0])
+    steps[starts[1:]] = np.median(np.delete(steps, starts))
     return np.cumsum(steps)
 
 
@@ -109,11 +102,11 @@ def tip_paths(
     """The paths that an arm's tip draws, a panel each: the test's first, and over them the model's own.
 
     Args:
-        data: all trajectories, by whose labels the test's are known.
+        data: all trajectories, of which those of `test` the model was not fitted to.
         tip: q -> position [2] in m.
-        test: trajectories that the model was not fitted to.
-        motions: of the model from the test's first states under its torques, as `recorded_motions`; a path ends where
-            the prediction is no longer valid. None where there are no motions.
+        test: as in `data`, with the same indices.
+        motions: of the model from the test's first states under its torques, as `recorded_motions`, or none; a path
+            ends where the prediction is no longer valid.
         model: name, of which the colour is taken.
         most_trajectories: that are shown.
     """

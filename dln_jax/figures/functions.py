@@ -1,11 +1,10 @@
-"""Figures of learned functions: value, gradient and Hessian, truth beside model and error."""
-
-from collections.abc import Iterator
+"""Figures of learned functions: value, gradient and Hessian, truth beside model and error, or an ensemble's spread."""
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.figures import style
@@ -17,11 +16,15 @@ SIGNED, POSITIVE = "RdBu_r", "viridis"
 TITLES = {"y": "value", "dy": "gradient", "d2y": "Hessian"}
 
 
+def _keys(data: FunctionSamples) -> list[str]:
+    return [key for key in TITLES if getattr(data, key) is not None]
+
+
 def function_curves(truth: FunctionSamples, predicted: FunctionSamples, *, most_outputs: int = 4) -> Figure:
     """A function of one input: a column each for value, slope and curvature; below each output, its error."""
     order = np.argsort(truth.x[:, 0])
     x = truth.x[order, 0]
-    keys = [key for key in TITLES if getattr(truth, key) is not None]
+    keys = _keys(truth)
     outputs = min(truth.outputs, most_outputs)
     figure, axes = style.figure(
         2 * outputs, len(keys), height=0.6 + 2.7 * outputs, sharex=True, height_ratios=(2, 1) * outputs
@@ -46,13 +49,15 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples, *, most_
 
 def heat_maps(truth: FunctionSamples, predicted: FunctionSamples, *, output: int = 0) -> Figure:
     """A function of two inputs on a square grid: a column per component; below each other truth, model and error."""
-    components = list(_components(truth))
+    places = range(truth.inputs)  # a component of the Hessian and its mirror image are one
+    indices = {"y": [()], "dy": [(i,) for i in places], "d2y": [(i, j) for i in places for j in places[i:]]}
+    components = [(key, index) for key in _keys(truth) for index in indices[key]]
     figure, axes = style.figure(
         3, len(components), height=0.9 + 3.6 * min(1.0, 6 / len(components)), sharex=True, sharey=True
     )
-    grid = [square(truth.x[:, axis]) for axis in range(2)]
+    grid = [_square(truth.x[:, axis]) for axis in range(2)]
     for column, (key, index) in zip(axes.T, components, strict=True):
-        wanted, found = (square(getattr(data, key)[(slice(None), output, *index)]) for data in (truth, predicted))
+        wanted, found = (_square(getattr(data, key)[(slice(None), output, *index)]) for data in (truth, predicted))
         factor, power = _power_of_ten(found - wanted)
         sizes = (abs(wanted).max(), abs(found).max(), 1e-300), (abs(found - wanted).max() / factor, 1e-300)
         scale, narrow = (Normalize(-max(each), max(each)) for each in sizes)
@@ -75,12 +80,13 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples, *, output: int
 
 def surfaces(truth: FunctionSamples, predicted: FunctionSamples, *, output: int = 0) -> Figure:
     """The same as surfaces: rows for value, length of the gradient and trace of the Hessian."""
-    keys = [key for key in TITLES if getattr(truth, key) is not None]
+    keys = _keys(truth)
     names = {"y": "$f$", "dy": r"$|\nabla f|$", "d2y": r"trace $\nabla^2 f$"}
+    scalars = {"y": np.asarray, "dy": lambda dy: np.linalg.norm(dy, axis=1), "d2y": lambda d2y: d2y.trace(0, 1, 2)}
     figure = style.blank(height=0.2 + 2.3 * len(keys))
-    grid = [square(truth.x[:, axis]) for axis in range(2)]
+    grid = [_square(truth.x[:, axis]) for axis in range(2)]
     for row, key in enumerate(keys):
-        wanted, found = (square(_scalar(key, getattr(data, key)[:, output])) for data in (truth, predicted))
+        wanted, found = (_square(scalars[key](getattr(data, key)[:, output])) for data in (truth, predicted))
         limits = min(wanted.min(), found.min()), max(wanted.max(), found.max())
         factor, power = _power_of_ten(found - wanted)
         error, colours = abs(found - wanted) / factor, POSITIVE if key == "dy" else SIGNED
@@ -104,7 +110,7 @@ def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
     Give both in standard units, in which components are of comparable size.
     """
-    keys = [key for key in TITLES if getattr(truth, key) is not None]
+    keys = _keys(truth)
     figure, axes = style.figure(1, len(keys), height=7.0 / max(len(keys), 2) + 0.3)
     for axis, key in zip(axes[0], keys, strict=True):
         wanted, found = (getattr(data, key).ravel() for data in (truth, predicted))
@@ -117,13 +123,65 @@ def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     return figure
 
 
-def _components(data: FunctionSamples) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Key and index of every component that differs from the others."""
-    yield "y", ()
-    if data.dy is not None:
-        yield from (("dy", (i,)) for i in range(data.inputs))
-    if data.d2y is not None:
-        yield from (("d2y", (i, j)) for i in range(data.inputs) for j in range(i, data.inputs))
+def ensemble(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
+    """An ensemble of functions of one or two inputs, inside and outside the data in [-bound, bound]."""
+    if truth.inputs == 1:
+        return _ensemble_curves(truth, mean, spread, bound=bound)
+    return _ensemble_maps(spread, bound=bound)
+
+
+def _ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
+    """Mean and twice the spread of an ensemble over one input, inside and outside the data in [-bound, bound].
+
+    Below, logarithmic, the spread beside the error: of a well-trained ensemble the band above is a line.
+    """
+    figure, axes = style.figure(2, 3, height=4.4, sharex=True, height_ratios=(3, 2))
+    x = truth.x[:, 0]
+    for (upper, lower), (key, text) in zip(axes.T, TITLES.items(), strict=True):
+        wanted, centre, width = (getattr(data, key).ravel() for data in (truth, mean, spread))
+        upper.axvspan(-bound, bound, color="0.94", zorder=0, label="training data")
+        upper.plot(x, wanted, **HALO, label="truth")
+        band = {"color": MODEL, "alpha": 0.3, "linewidth": 0, "label": "± 2 sd"}
+        upper.fill_between(x, centre - 2 * width, centre + 2 * width, **band)
+        upper.plot(x, centre, color=MODEL, linewidth=1.2, label="ensemble mean")
+        room = 0.6 * np.ptp(wanted)
+        upper.set(xlim=(x.min(), x.max()), ylim=(wanted.min() - room, wanted.max() + room))
+        style.title(upper, text)
+        lower.axvspan(-bound, bound, color="0.94", zorder=0)
+        sizes = 2 * width, np.abs(centre - wanted)
+        lower.plot(x, sizes[0], "--", color=MODEL, linewidth=1.2, label="2 sd")
+        lower.plot(x, sizes[1], color="black", linewidth=0.9, label="|mean - truth|")
+        lower.set_yscale(style.scale_of(np.concatenate(sizes)))
+        lower.set_xlabel("$x$")
+    axes[0, 0].set_ylabel("function")
+    axes[1, 0].set_ylabel("size")
+    labelled = [axis.get_legend_handles_labels() for axis in axes[:, 0]]
+    handles, labels = (upper + lower for upper, lower in zip(*labelled, strict=True))
+    style.legend(figure, handles, labels, loc="outside lower center", ncols=6)
+    return figure
+
+
+def _ensemble_maps(spread: FunctionSamples, *, bound: float) -> Figure:
+    """Spread of value, gradient and Hessian (root of the sum over components) over two inputs.
+
+    Logarithmic where it spans a decade. The frame is the box of the training data, [-bound, bound]².
+    """
+    figure, axes = style.figure(1, 3, height=3.4, sharey=True)
+    grid = [_square(spread.x[:, axis]) for axis in range(2)]
+    for axis, (key, text) in zip(axes[0], TITLES.items(), strict=True):
+        array = getattr(spread, key)
+        sizes = _square(np.sqrt((array.reshape(len(array), -1) ** 2).sum(axis=1)))
+        low, high = max(float(np.quantile(sizes, 0.02)), 1e-6 * sizes.max()), float(sizes.max())
+        scale = (LogNorm if style.scale_of([low, high]) == "log" else Normalize)(low, high or 1.0)
+        axis.pcolormesh(*grid, sizes, norm=scale, cmap=POSITIVE, rasterized=True)
+        axis.add_patch(Rectangle((-bound, -bound), 2 * bound, 2 * bound, fill=False, edgecolor="white", linewidth=1.5))
+        bar = figure.colorbar(ScalarMappable(scale, POSITIVE), ax=axis, location="bottom", pad=0.03)
+        bar.ax.tick_params(which="both", labelsize=style.SMALL)
+        style.title(axis, f"spread of the {text}")
+        axis.set(xlabel="$x_1$", aspect="equal")
+        axis.grid(False)
+    axes[0, 0].set_ylabel("$x_2$")
+    return figure
 
 
 def _symbol(key: str, index: tuple[int, ...], data: FunctionSamples) -> str:
@@ -134,13 +192,7 @@ def _symbol(key: str, index: tuple[int, ...], data: FunctionSamples) -> str:
     return rf"$\partial{power} f / {below}$" if index else "$f$"
 
 
-def _scalar(key: str, array: np.ndarray) -> np.ndarray:
-    if key == "y":
-        return array
-    return np.linalg.norm(array, axis=1) if key == "dy" else np.trace(array, axis1=1, axis2=2)
-
-
-def square(column: np.ndarray) -> np.ndarray:
+def _square(column: np.ndarray) -> np.ndarray:
     """The values of a square grid [N²] as [N, N]."""
     side = round(len(column) ** 0.5)
     return column.reshape(side, side)

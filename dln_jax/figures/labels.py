@@ -1,6 +1,6 @@
 """Names written into a picture, beside what they name: at the ends of curves, and beside points where there is room."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -84,25 +84,25 @@ def label_points(
     obstacles: np.ndarray,
     first: tuple[int, int] = (1, 0),
     size: float = SMALL,
-    colour: str = "0.25",
 ) -> None:
     """Writes (text, (x, y)) beside each point, where it covers least: no obstacle, no label, no edge of the axes.
 
     Call it when the figure is complete, since the labels take the free places of the picture that is there.
 
     Args:
-        axis: of the points.
-        points: in data units.
-        obstacles: points [n, 2] in data units that labels should not cover.
+        axis: of the points, which are in data units.
+        points: texts and places.
+        obstacles: points [n, 2] that labels should not cover.
         first: direction from a point in which its label stands if there is room.
         size: of the text in points.
-        colour: of the text.
     """
+    colour = "0.25"
     drawn = axis.get_figure(root=True)
     assert drawn is not None
     drawn.draw_without_rendering()
     pixels = drawn.dpi / 72
     covered, frame, taken = axis.transData.transform(obstacles), axis.get_window_extent(), []
+    places = [Place(*way, distance) for distance in (NEAR, *FAR) for way in dict.fromkeys((first, *BESIDE))]
     for text, point in points:
         label = axis.annotate(text, point, (0, 0), textcoords="offset points", fontsize=size, color=colour, zorder=100)
         # Labels move nothing: their places are found in the picture without them.
@@ -115,18 +115,13 @@ def label_points(
             crowded = sum(_common(box, other) for other in taken) + box.width * box.height - _common(box, frame)
             return box.padded(1.0).count_contains(covered) + 0.05 * crowded + 0.02 * place.distance
 
-        best = min(_places(first), key=cost)
+        best = min(places, key=cost)
         taken.append(best.box(at, extent.width, extent.height, pixels).padded(2.0))
         label.set(ha=("center", "left", "right")[best.x], va=("center", "bottom", "top")[best.y])
         label.set_position((best.distance * best.x, best.distance * best.y))
         if best.distance > NEAR:
             away = label.xyann
             axis.annotate("", point, away, textcoords="offset points", arrowprops={**LINE, "color": colour}, zorder=99)
-
-
-def _places(first: tuple[int, int]) -> Iterator[Place]:
-    for distance in (NEAR, *FAR):
-        yield from (Place(x, y, distance) for x, y in dict.fromkeys((first, *BESIDE)))
 
 
 def _common(one: BboxBase, other: BboxBase) -> float:

@@ -7,9 +7,12 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dln_jax.datasets.pendulum_frames import FRAME_TIME
 from dln_jax.figures import style
 from dln_jax.figures.style import TRUTH
+from dln_jax.metrics.frames import Injection
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.types import require_positive
 
 Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(q [N, 1], p [N, 1]) -> (qd, pd)."""
@@ -33,13 +36,8 @@ def motion_figure(
     With one coordinate a panel is the phase plane, with arrows where `fields` give the rates; with 2 n coordinates it
     shows the orbits of n bodies in a plane. The quantity stands beside its error relative to the largest true value.
 
-    Args:
-        motions: by name; "truth" is drawn behind each of the others.
-        energies: the true energy, or the other quantity, along them.
-        fields: rates of the systems, one coordinate only.
-        quantity: what `energies` are.
-        units: of q, of p and of the quantity; empty where they have none.
-        shown: which motion.
+    Of the motions by name, "truth" is drawn behind each of the others. `energies` are the `quantity` along them;
+    `units` are those of q, of p and of the quantity, empty where they have none.
     """
     models = [name for name in motions if name != TRUTH]
     truth, plane = plane_paths(motions[TRUTH], shown), motions[TRUTH].q.shape[2] == 1
@@ -60,13 +58,11 @@ def motion_figure(
         axis.set_xlabel(style.with_unit("q", units[0]) if plane else "x, m")
     panels[0].set_ylabel(style.with_unit("p", units[1]) if plane else "y, m")
     of_shown = {name: np.where(np.isfinite(each[shown]), each[shown], np.nan) for name, each in energies.items()}
-    values, errors = below.subplots(1, 2)
-    style.prepare(values)
-    style.prepare(errors)
-    _over_time(values, motions[TRUTH].t, of_shown)
-    values.set_ylabel(style.with_unit(quantity, units[2]))
-    _relative_errors(errors, motions[TRUTH].t, of_shown)
-    errors.set_ylabel("error / largest true value")
+    labels = style.with_unit(quantity, units[2]), "error / largest true value"
+    for axis, draw, label in zip(below.subplots(1, 2), (_over_time, _relative_errors), labels, strict=True):
+        style.prepare(axis)
+        draw(axis, motions[TRUTH].t, of_shown)
+        axis.set(xlabel="t, s", ylabel=label)
     return figure
 
 
@@ -79,10 +75,7 @@ def _over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> N
     low, high = np.nanquantile(every, [0.03, 0.97])
     room = ROOM * float(np.abs(truth).max())
     axis.set_ylim(min(low, truth.min()) - room, max(high, truth.max()) + room)
-    axis.set_xlabel("t, s")
-    lines = axis.get_lines()
-    truths = [line for line in lines if line.get_label() == TRUTH]
-    style.legend(axis, handles=truths, loc="best")
+    style.legend(axis, handles=[line for line in axis.get_lines() if line.get_label() == TRUTH], loc="best")
 
 
 def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
@@ -97,7 +90,6 @@ def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]
     high = np.ceil(np.log10(np.quantile(every, 0.99))) if len(every) else 0.0
     low = np.floor(np.log10(np.quantile(every, 0.02))) if len(every) else -1.0
     axis.set_ylim(10.0 ** min(low, high - 2), 10.0**high * 2)
-    axis.set_xlabel("t, s")
 
 
 def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -114,3 +106,45 @@ def _arrows(axis: Axes, field: Field, corner: float) -> None:
     q, p = (each.reshape(-1, 1) for each in np.meshgrid(grid, grid))
     qd, pd = field(q, p)
     axis.quiver(q, p, qd, pd, color="0.7", zorder=0, width=4e-3)
+
+
+def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
+    """Decoded frames before and after, the latent path, and the energies against time."""
+    require_positive(shown=shown)
+    total = len(injection.level)
+    half = total // 2
+    side = round(np.sqrt(injection.pairs.shape[1] // 2))
+    figure = style.blank(height=5.0)
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.05])[:, 0]
+    colours = style.BLUE, style.VERMILLION
+    rows = upper.subplots(2, shown, squeeze=False)
+    for row, first, colour, name in zip(rows, (0, half), colours, ("before", "after"), strict=True):
+        for axis, index in zip(row, np.linspace(first, first + half - 1, shown).astype(int), strict=True):
+            axis.imshow(injection.pairs[index, : side * side].reshape(side, side), cmap="gray", vmin=0, vmax=1)
+            axis.set(xticks=[], yticks=[])
+            time = f"{FRAME_TIME * injection.latent.t[index]:.2f} s"
+            style.title(axis, time, fontsize=style.SMALL, color=colour)
+        row[0].set_ylabel(name, color=colour, fontsize=style.TEXT)
+    plane, levels = lower.subplots(1, 2, width_ratios=[1.0, 1.6])
+    joules = levels.twinx()
+    for axis in (plane, levels, joules):
+        style.prepare(axis)
+    q, p = injection.latent.q[0, :, 0], injection.latent.p[0, :, 0]
+    t = FRAME_TIME * injection.latent.t
+    for part, colour in zip((slice(0, half), slice(half, total)), colours, strict=True):
+        plane.plot(q[part], p[part], color=colour, linewidth=1.5)
+        levels.plot(t[part], injection.level[part], color=colour, linewidth=5.0, alpha=0.4)
+        joules.plot(t[part], injection.physical[part], ":", color="black", linewidth=1.6)
+    plane.annotate("", (q[half], p[half]), (q[half - 1], p[half - 1]), arrowprops={"arrowstyle": "->", "lw": 1.6})
+    plane.set(xlabel="latent q, 1", ylabel="latent p, 1 per frame")
+    style.title(plane, "path in the latent plane")
+    levels.set(xlabel="t, s", ylabel="latent H / H at the start, 1")
+    style.title(levels, "energy: latent (band), of the frames (dots)")
+    joules.set_ylabel("energy of the frames, J")
+    joules.grid(False)
+    joules.spines["right"].set_visible(True)
+    start = injection.physical[:half].mean()
+    top = 1.25 * max(float(injection.level.max()), float(injection.physical.max() / start))
+    levels.set_ylim(0.0, top)
+    joules.set_ylim(0.0, top * start)
+    return figure

@@ -90,7 +90,8 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
     # Every row is as high as its highest panel needs.
     rows = [range(i, min(i + columns, len(pictures))) for i in range(0, len(pictures), columns)]
     each = width / columns
-    shapes = [max(_aspect(pictures[i][1]) * len(row) / columns for i in row) for row in rows]
+    aspects = [np.divide(*np.diff(extent, axis=0)[0, ::-1]) for _, extent in pictures]
+    shapes = [max(aspects[i] * len(row) / columns for i in row) for row in rows]
     if columns == 1:
         each = width = min(width, _HIGHEST / shapes[0] + 0.6)
     heights = [np.clip(each * shape, 1.2, _HIGHEST) + 0.55 for shape in shapes]
@@ -165,12 +166,11 @@ def _draw(axis: Axes, panel: Moments, shapes: list[_Shape], extent: np.ndarray) 
             axis.plot(ends, line, color=GROUND_LINE, linewidth=1.2, zorder=1)
     for number, shape in enumerate(shapes):
         above = 2 + 3 * number
-        colours: list = list(shape.colours)
-        body = PolyCollection(list(shape.polygons), facecolors=colours, edgecolors=[tuple(shape.edges)], linewidths=0.4)
-        body.set_zorder(above)
-        axis.add_collection(body)
-        outline = LineCollection(list(shape.skin), colors=[tuple(shape.outline)], linewidths=1.0, zorder=above + 1)
-        axis.add_collection(outline)
+        faces: list = list(shape.colours)
+        looks = {"facecolors": faces, "edgecolors": [tuple(shape.edges)], "linewidths": 0.4, "zorder": above}
+        axis.add_collection(PolyCollection(list(shape.polygons), **looks))
+        looks = {"colors": [tuple(shape.outline)], "linewidths": 1.0, "zorder": above + 1}
+        axis.add_collection(LineCollection(list(shape.skin), **looks))
     style.prepare(axis)
     axis.grid(False)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
@@ -195,24 +195,15 @@ def _label_times(axis: Axes, panel: Moments, shapes: list[_Shape]) -> None:
     if panel.labelled is None and not panel.stacked and panel.mesh.dimension == 2 and len(shapes) > 1:
         for number, shape in enumerate(shapes):
             others = np.concatenate([ground, *filled[:number], *filled[number + 1 :]])
-            corners[number] = _freest(shape.skin.reshape(-1, 2), others)
+            skin = shape.skin.reshape(-1, 2)
+            # Where a label has most room: the point farthest from the others.
+            corners[number] = skin[np.linalg.norm(skin[:, None] - others, axis=-1).min(axis=1).argmax()]
     points = [(shape.label, (float(x), float(y))) for shape, (x, y) in zip(shapes, corners, strict=True)]
     first = (1, 0) if panel.labelled is not None else (0, 1)
     label_points(axis, points, obstacles=np.concatenate([ground, *filled]), size=7.5, first=first)
-
-
-def _freest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The point farthest from the others, where a label has most room."""
-    distances = np.linalg.norm(points[:, None] - others[None], axis=-1).min(axis=1)
-    return points[int(np.argmax(distances))]
 
 
 def _inside(triangles: np.ndarray) -> np.ndarray:
     """Points all over the triangles."""
     weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
     return np.einsum("kci,wc->kwi", triangles, weights).reshape(-1, 2)
-
-
-def _aspect(extent: np.ndarray) -> float:
-    width, height = extent[1] - extent[0]
-    return height / width

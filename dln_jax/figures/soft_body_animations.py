@@ -45,10 +45,10 @@ def write_soft_body_gif(
         t: time of each frame in s.
         muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
         actuation: of the muscles in each frame, relative to their rest length: red is short.
-        ground: height of the ground in m; `None` draws none.
-        title: text above the picture.
+        ground: its height in m; `None` draws none.
+        title: above the picture.
         stride: frames of the motion between two of the GIF.
-        frames_per_second: with which they are shown.
+        frames_per_second: of the GIF.
 
     Raises:
         InputError: times, vertices or muscles that do not fit the positions, or no frame.

@@ -2,6 +2,7 @@
 
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.frames import Injection, inject_energy
 from dln_jax.metrics.latency import Latency, medians_in_turns, one_step
 from dln_jax.metrics.misfit import Misfit, velocity_misfit
 from dln_jax.metrics.phase_space import Motions, field_errors, motion_errors, predict, summary
@@ -19,6 +20,7 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 
 __all__ = [
     "Definiteness",
+    "Injection",
     "Latency",
     "Misfit",
     "Motion",
@@ -28,6 +30,7 @@ __all__ = [
     "errors",
     "field_errors",
     "follow",
+    "inject_energy",
     "mean_square",
     "medians_in_turns",
     "motion_energies",

@@ -49,8 +49,4 @@ def definiteness(
     definite = eigenvalues.min(axis=1) > rounding * largest
     regular = smallest > rounding * largest
     conditions = np.divide(largest, smallest, out=np.full_like(largest, np.inf), where=regular)
-    return Definiteness(
-        smallest_eigenvalue=float(eigenvalues.min()),
-        share_not_definite=float(np.mean(~definite)),
-        largest_condition_number=float(conditions.max()),
-    )
+    return Definiteness(float(eigenvalues.min()), float(np.mean(~definite)), float(conditions.max()))

@@ -16,14 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, render, rod
-from dln_jax.mechanics.integrators import advance, rk4, second_order
+from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, pictures, render, rod
+from dln_jax.mechanics.equations import flow
+from dln_jax.mechanics.flow import Flow
+from dln_jax.mechanics.integrators import advance, rk4, rollout, second_order
 from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, summary
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
 from dln_jax.precision import in_float64, with_float64
 from dln_jax.scenes.scene import closed_form_forward_dynamics
-from dln_jax.types import Scalar
+from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
 GRID = 180
 """Angles of the full circle at which the search starts; a step of Gauss-Newton is at most their distance."""
@@ -49,11 +51,8 @@ def fitted_angle(frame: Float[Array, " pixels"], grid: Float[Array, " G"], drawn
     """q of a frame, in rad, from the best of a grid's angles and their frames."""
     spacing = 2 * jnp.pi / GRID
 
-    def picture(q: Scalar) -> Array:
-        return render(q).ravel()
-
     def iteration(_, q: Scalar) -> Scalar:
-        image, slope = jax.jvp(picture, (q,), (jnp.ones_like(q),))
+        image, slope = jax.jvp(lambda q: render(q).ravel(), (q,), (jnp.ones_like(q),))
         return q + jnp.clip(slope @ (frame - image) / (slope @ slope), -spacing, spacing)
 
     start = grid[jnp.argmin(jnp.sum(drawn**2, axis=1) - 2 * drawn @ frame)]
@@ -86,8 +85,7 @@ def physical_energy(q: Float[np.ndarray, "*shape"], qd: Float[np.ndarray, "*shap
 def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarray, np.ndarray]:
     """(q, qd) at the first of two frames, in rad and rad/s, each of the shape before the pixels."""
     q, qd = _states(jnp.asarray(pairs, float).reshape(-1, 2, PIXELS))
-    shape = pairs.shape[:-1]
-    return np.asarray(q).reshape(shape), np.asarray(qd).reshape(shape)
+    return np.asarray(q).reshape(pairs.shape[:-1]), np.asarray(qd).reshape(pairs.shape[:-1])
 
 
 @in_float64
@@ -128,9 +126,8 @@ def recoded(model: LatentModel, parameters: Parameters, truth: Frames) -> Float[
 def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float[np.ndarray, " K"]:
     """Mean over times of (H - H_true)² for each motion, in J²; infinite for one that is not finite."""
     q, qd = physical_states(pairs)
-    times = q.shape[1]
-    errors = physical_energy(q, qd) - physical_energy(truth.q[:, :times], truth.qd[:, :times])
-    return finite_or_infinite(np.mean(errors**2, axis=1))
+    true = physical_energy(truth.q, truth.qd)[:, : q.shape[1]]
+    return finite_or_infinite(np.mean((physical_energy(q, qd) - true) ** 2, axis=1))
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
@@ -159,6 +156,84 @@ def late_energy_errors(
 def energy_floor(test: Frames) -> float:
     """The estimator's own mean square error of the energy, in J², on true frames."""
     return float(np.mean(energy_errors(test.pairs, test)))
+
+
+_CLIMB, _CORRECTIONS = 20, 3
+
+
+class Injection(NamedTuple):
+    """A motion of `times` frames before the energy is raised, and as many after, all in one."""
+
+    latent: Motions
+    """One motion [1, 2 times, 1], by frame number; both states of the moment of injection are in it."""
+    pairs: Float[np.ndarray, "T input"]
+    """Decoded."""
+    level: Float[np.ndarray, " T"]
+    """Latent H above rest, relative to that at the start."""
+    physical: Float[np.ndarray, " T"]
+    """Energy read from the frames, in J."""
+
+
+def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[Vector, Vector]:
+    """The state with H = wanted on the shortest way from (q, p): along dz/ds = grad H / |grad H|², which adds s to H.
+
+    The gradient must not vanish on the way.
+    """
+
+    def direction(state: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        slopes = jax.grad(H, argnums=(0, 1))(*state)
+        square = sum(jnp.sum(slope**2) for slope in slopes)
+        return slopes[0] / square, slopes[1] / square
+
+    levels = jnp.linspace(0.0, 1.0, _CLIMB + 1) * (wanted - H(q, p))
+    climbed = rollout(rk4(lambda s, state: direction(state)), (q, p), levels)
+    state = climbed[0][-1], climbed[1][-1]
+    for _ in range(_CORRECTIONS):
+        slopes, missing = direction(state), wanted - H(*state)
+        state = state[0] + missing * slopes[0], state[1] + missing * slopes[1]
+    return state
+
+
+@in_float64
+def inject_energy(
+    model: LatentModel,
+    parameters: Parameters,
+    pair: Float[np.ndarray, " input"],
+    *,
+    factor: float = 2.0,
+    times: int = 50,
+) -> Injection:
+    """The motion from two frames, with `factor` times the energy from the frame number `times` on.
+
+    H is counted from the rod at rest, whose latent state is where the encoder puts two frames of it hanging still.
+
+    Raises:
+        InputError: a model without an energy, or a factor or times that are not positive.
+    """
+    require_positive(factor=factor, times=times)
+    parameters = with_float64(parameters)
+    field = flow(model.field.energies(parameters["field"]))
+    if not isinstance(field, Flow):
+        raise InputError("the model has no energy to raise; give one whose latent field is a black-box-hnn")
+    H = field.energy
+    still = np.tile(pictures(np.zeros(1))[0], 2)
+    q, p = encoded(model, parameters, np.stack([pair, still]))
+    ground = H(jnp.asarray(q[1]), jnp.asarray(p[1]))
+    start = H(jnp.asarray(q[0]), jnp.asarray(p[0])) - ground
+    t = np.arange(float(times))
+
+    def move(q: np.ndarray, p: np.ndarray) -> Motions:
+        return predict(model.field, parameters["field"], q[None], p[None], t)
+
+    before = move(q[0], p[0])
+    climb = jax.jit(functools.partial(raise_energy, H))
+    kicked = climb(jnp.asarray(before.q[0, -1]), jnp.asarray(before.p[0, -1]), ground + factor * start)
+    after = move(*map(np.asarray, kicked))
+    q, p = (np.concatenate(halves, axis=1) for halves in ((before.q, after.q), (before.p, after.p)))
+    latent = Motions(np.concatenate([t, t[-1] + t]), q, p)
+    pairs = decoded(model, parameters, latent)[0]
+    levels = jax.vmap(H)(jnp.asarray(latent.q[0]), jnp.asarray(latent.p[0]))
+    return Injection(latent, pairs, np.asarray((levels - ground) / start), physical_energy(*physical_states(pairs)))
 
 
 @jax.jit

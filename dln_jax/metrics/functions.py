@@ -1,5 +1,6 @@
 """What differential networks say of a function and its derivatives, and how wrong they are."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -28,9 +29,7 @@ class Prediction(NamedTuple):
 def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Prediction:
     """Answers at x [N, n]; `layers` have the members of an ensemble on their leading axis, also when there is one."""
     members, dtype = layers[0][0].shape[0], layers[0][0].dtype
-
-    def network(layers: Layers, x: jax.Array):
-        return differential_mlp.value_jacobian_and_hessian(layers, x, activation=activation)
+    network = functools.partial(differential_mlp.value_jacobian_and_hessian, activation=activation)
 
     def answer(x: jax.Array):
         if members == 1:

@@ -22,11 +22,8 @@ class Latency(NamedTuple):
 def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, warm_up: int = 200) -> Latency:
     """Times calls of a compiled function, one state at a time, going round the given states.
 
-    Args:
-        function: a jitted function, or one of NumPy arrays; called as `function(*state)`.
-        states: argument tuples of one shape; varied, so that nothing is answered from a cache.
-        calls: calls that are timed.
-        warm_up: calls before them.
+    The function is jitted, or one of NumPy arrays, and called as `function(*state)`; states have one shape, and are
+    varied, so that nothing is answered from a cache.
     """
     start = time.perf_counter()
     jax.block_until_ready(function(*states[0]))

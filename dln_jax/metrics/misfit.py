@@ -47,8 +47,8 @@ def velocity_misfit(
     by velocity, which is what `least_share` is for.
 
     Args:
-        qd: velocities [N, d].
-        residual: tau - tau_hat [N, d].
+        qd: velocities.
+        residual: tau - tau_hat.
         trajectory: index of each sample's trajectory, whose samples count as one; `None` for independent samples.
         least_significance: standard errors from zero at which the mean power counts.
         least_share: of the residual's mean square that velocity must explain.
@@ -67,15 +67,11 @@ def velocity_misfit(
     means = np.stack([np.bincount(groups, column) for column in power.T], axis=1) / counts
     error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
     moving, left = np.sum(qd**2, axis=0), np.sum(residual**2, axis=0)
-    nothing = np.zeros(qd.shape[1])
-    coefficient = np.divide(power.sum(axis=0), moving, out=nothing.copy(), where=moving > 0)
-    share = np.divide(coefficient**2 * moving, left, out=nothing.copy(), where=left > 0)
-    significance = np.divide(means.mean(axis=0), error, out=nothing.copy(), where=error > 0)
-    return Misfit(
-        residual_rms=np.sqrt(left / len(qd)),
-        coefficient=coefficient,
-        explained_share=share,
-        power=power.mean(axis=0),
-        significance=significance,
-        missing=(abs(significance) >= least_significance) & (share >= least_share),
-    )
+
+    def ratio(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+        return np.divide(above, below, out=np.zeros(qd.shape[1]), where=below > 0)
+
+    coefficient = ratio(power.sum(axis=0), moving)
+    share, significance = ratio(coefficient**2 * moving, left), ratio(means.mean(axis=0), error)
+    missing = (abs(significance) >= least_significance) & (share >= least_share)
+    return Misfit(np.sqrt(left / len(qd)), coefficient, share, power.mean(axis=0), significance, missing)

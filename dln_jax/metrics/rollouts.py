@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.integrators import advance, rk4
+from dln_jax.rollout import rollout
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 Torque = Literal["held", "interpolated"]
@@ -47,15 +48,8 @@ def follow(
 ) -> Motion:
     """The motion from (q0, qd0) under the torques tau at the times t, by RK4; one trajectory, `vmap` it over more.
 
-    Args:
-        dynamics: the plant or a model of it.
-        q0: coordinates at t[0].
-        qd0: rates at t[0].
-        tau: recorded torques.
-        t: their times in s, any spacing; a repeated time repeats the state.
-        substeps: RK4 steps per sample.
-        torque: "held" keeps tau[k] until t[k + 1], as published; "interpolated" is linear in between.
-
+    Times are in s, with any spacing; a repeated time repeats the state. There are `substeps` of RK4 per sample. The
+    torque "held" keeps tau[k] until t[k + 1], as published; "interpolated" is linear in between.
     Raises InputError for no substeps, or a `torque` of another name.
     """
     require_positive(substeps=substeps)
@@ -220,11 +214,10 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, 
             driving = tau + s * slope
             return qd, dynamics.forward_dynamics(q, qd, driving), _power(dynamics, q, qd, driving)
 
-        state = advance(rk4(field), jnp.zeros_like(duration), state, duration, substeps=substeps)
-        return state, state
+        return advance(rk4(field), jnp.zeros_like(duration), state, duration, substeps=substeps), None
 
     start = (q0, qd0, jnp.zeros_like(q0[0]))
-    _, later = jax.lax.scan(interval, start, (tau, slopes, durations))
+    _, later = rollout(interval, start, (tau, slopes, durations))
     return Motion(*(jnp.concatenate([first[None], rest]) for first, rest in zip(start, later, strict=True)))
 
 

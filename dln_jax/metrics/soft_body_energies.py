@@ -36,6 +36,5 @@ def motion_energies(
 
     moments = (jnp.asarray(x), jnp.asarray(v), control)
     found = jax.jit(lambda moments: jax.lax.map(of_moment, moments, batch_size=_BATCH))(moments)
-    by_name = {name: np.asarray(values) for name, values in found.items()}
-    by_name = {KINETIC: by_name[KINETIC], **{term.name: by_name[term.name] for term in scene.terms}}
+    by_name = {name: np.asarray(found[name]) for name in (KINETIC, *(term.name for term in scene.terms))}
     return {**by_name, TOTAL: np.sum(list(by_name.values()), axis=0)}

@@ -13,7 +13,6 @@ from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import CHOSEN, stored_arguments
 from dln_jax.data.functions import SampleSplit
-from dln_jax.figures import ensembles
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
@@ -160,7 +159,7 @@ def draw_figures(folder: Path, task: Task, training: Training, trials: list[Tria
     else:
         drawn["parity"] = drawing.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
     if task.bound is not None and shown.spread is not None:
-        drawn["ensemble"] = ensembles.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
+        drawn["ensemble"] = drawing.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
     for name, figure in drawn.items():
         write_figure(folder / f"{name}.png", figure)
 

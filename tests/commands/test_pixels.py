@@ -11,7 +11,7 @@ from dln_jax.commands import train_hnn_pixels
 from dln_jax.datasets import pendulum_frames
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, SIDE, energy, render, rod, split, swinging_rod
 from dln_jax.figures import animations
-from dln_jax.figures import frames as frame_figures
+from dln_jax.figures.phase_space import injection_figure
 from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
@@ -60,7 +60,7 @@ def quick_predict(model, parameters, q, p, t):
 @pytest.fixture(scope="module", autouse=True)
 def _quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frame_figures, "predict", quick_predict)
+        patch.setattr(frame_metrics, "predict", quick_predict)
         patch.setattr(pendulum_frames, "rollouts", quick_motions)
         yield
     pixel_task.pixel_data.cache_clear()
@@ -252,7 +252,7 @@ def test_latent_motions_keep_the_energy(untrained, data):
 def test_injection_raises_the_energy_to_what_was_asked():
     """Along the gradient of q² + p² / 2 from (3, 4), q = 3 e^(2u) and p = 4 e^u."""
     q, p = jax.jit(
-        lambda: frame_figures.raise_energy(
+        lambda: frame_metrics.raise_energy(
             lambda q, p: jnp.sum(q**2 + p**2 / 2), jnp.array([3.0]), jnp.array([4.0]), jnp.asarray(60.0)
         )
     )()
@@ -262,12 +262,12 @@ def test_injection_raises_the_energy_to_what_was_asked():
 
 def test_injected_motion_and_its_figure(untrained, data):
     model, parameters = untrained
-    found = frame_figures.inject_energy(model, parameters, data.pairs[0, 0], factor=2.5, times=6)
+    found = frame_metrics.inject_energy(model, parameters, data.pairs[0, 0], factor=2.5, times=6)
     np.testing.assert_allclose(found.level[:6], 1.0, rtol=1e-6)
     np.testing.assert_allclose(found.level[6:], 2.5, rtol=1e-6)
     assert found.pairs.shape == (12, 2 * PIXELS) and found.physical.shape == (12,)
     assert found.latent.t[5] == found.latent.t[6] == 5
-    assert len(frame_figures.injection_figure(found, shown=3).axes) == 9
+    assert len(injection_figure(found, shown=3).axes) == 9
 
 
 def test_animations_have_every_frame(tmp_path, data):
@@ -360,8 +360,8 @@ def test_mistakes_are_named(data, untrained, tmp_path):
         (lambda: principal_components(frames, 0), "components is 0"),
         (lambda: problem(model, frames, frames, Matching(window=1)), "window is 1"),
         (lambda: problem(model, frames, frames, Matching(window=20)), "expected at least the 21 of a window"),
-        (lambda: frame_figures.inject_energy(baseline, {"field": {}}, mean), "the model has no energy to raise"),
-        (lambda: frame_figures.inject_energy(model, parameters, mean, factor=0.0), "factor is 0"),
+        (lambda: frame_metrics.inject_energy(baseline, {"field": {}}, mean), "the model has no energy to raise"),
+        (lambda: frame_metrics.inject_energy(model, parameters, mean, factor=0.0), "factor is 0"),
         (lambda: animations.write_frame_gif(tmp_path / "a.gif", {}, np.zeros(2)), "no motion to show"),
         (
             lambda: animations.write_frame_gif(tmp_path / "a.gif", {"hnn": frames[0]}, np.zeros(2)),

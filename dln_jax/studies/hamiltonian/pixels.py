@@ -14,7 +14,7 @@ import numpy as np
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTORIES, FrameSplit, split, swinging_rod
 from dln_jax.figures.animations import write_frame_gif
-from dln_jax.figures.frames import inject_energy, injection_figure
+from dln_jax.figures.phase_space import injection_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
 from dln_jax.learning import frames as learning_frames
@@ -23,7 +23,15 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Progress, Report, silent
 from dln_jax.learning.frames import Matching, Weights
-from dln_jax.metrics.frames import FrameMotions, energy_errors, energy_floor, frame_errors, late_energy_errors, recoded
+from dln_jax.metrics.frames import (
+    FrameMotions,
+    energy_errors,
+    energy_floor,
+    frame_errors,
+    inject_energy,
+    late_energy_errors,
+    recoded,
+)
 from dln_jax.metrics.phase_space import summary
 from dln_jax.models.latent_phase import Field, LatentModel, through_components
 from dln_jax.models.model import Parameters
