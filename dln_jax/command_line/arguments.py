@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar, get_args
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 T = TypeVar("T")
 Arguments = TypeVar("Arguments")
@@ -78,6 +78,11 @@ def refuse_given(given: Any, names: Iterable[str], why: str) -> None:
     for name in names:
         if getattr(given, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} is {why}; leave it out")
+
+
+def require_positive_if_given(given: Any, names: Iterable[str]) -> None:
+    """Raises `InputError` for the first of these options that was given and is not positive."""
+    require_positive(**{name: getattr(given, name) for name in names if getattr(given, name) is not None})
 
 
 def resolved(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:

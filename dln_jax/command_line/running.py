@@ -1,11 +1,12 @@
 """What the command lines share: errors as one line, names for scenes, and the arguments that a run was started with."""
 
+import contextlib
 import dataclasses
 import math
 import os
 import reprlib
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
@@ -15,10 +16,10 @@ import tyro
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.data.schema import needs_from_text
-from dln_jax.files import is_file, matches, read_json
+from dln_jax.files import is_file, matches, read_json, write_json
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.run_folder import CONFIG
+from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
@@ -119,6 +120,19 @@ def needs_from_option(text: str) -> Needs:
         return needs_from_text(text)
     except InputError as error:
         raise InputError(f"--{error}; see --help for an example") from None
+
+
+@contextlib.contextmanager
+def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
+    """Yields the run folder of a command, with its arguments in config.json, and beside them what they came to."""
+    with run_folder(given.out, command, resume=getattr(given, "resume", False)) as folder:
+        write_config(folder, given, **chosen)
+        yield folder
+
+
+def write_config(folder: Path, given: Any, **chosen: Any) -> None:
+    """Writes the arguments of a run into its folder, and what they came to."""
+    write_json(folder / CONFIG, {**stored_arguments(given), **({CHOSEN: chosen} if chosen else {})})
 
 
 def stored_arguments(given: Any) -> dict[str, Any]:

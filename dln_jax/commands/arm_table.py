@@ -13,13 +13,12 @@ import numpy as np
 
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Resumable
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import write_bytes, write_figure, write_json
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import write_bytes, write_figure
 from dln_jax.studies.arm import table
 from dln_jax.studies.case import Case, measure, say_numbers, stored_findings
 from dln_jax.studies.report import conditions, publish
 from dln_jax.types import require_positive
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)
@@ -52,9 +51,8 @@ def main(given: Arguments) -> None:
     sets, parts = table.data_sets(given.data, given.uniform, given.splits)
     counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
     cases = table.cases(sets, parts, **counts)
-    with run_folder(given.out, "arm_table", resume=given.resume) as folder:
+    with command_folder(given, "arm_table") as folder:
         stored = stored_findings(folder, cases) if given.resume else {}
-        write_json(folder / CONFIG, stored_arguments(given))
         say = say_numbers("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
         found = measure(sorted(cases, key=_late), say, folder=folder, stored=stored)
         rows = table.table_rows({case.name: found[case.name] for case in cases})

@@ -6,22 +6,18 @@ steps and against wall time, and the model and gait of each method's best seed. 
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
-
-from rich.console import Console
 
 from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Drawn, Folder
-from dln_jax.command_line.running import stored_arguments
+from dln_jax.command_line.running import command_folder
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.methods import METHODS, settings_of
-from dln_jax.locomotion.task import FALLEN, Task
+from dln_jax.locomotion.task import FALLEN
 from dln_jax.runs.locomotion import GOAL, Options, announce, learned, prepare, write_run
 from dln_jax.studies.locomotion import comparison_rows
 from dln_jax.studies.report import conditions, print_report, write_report
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)
@@ -39,37 +35,30 @@ class Arguments(Options, Folder, Drawn):
 def main(given: Arguments) -> None:
     """Trains by all methods, prints and writes."""
     task = prepare(given, METHODS)
-    with run_folder(given.out, "compare_locomotion") as folder:
-        write_json(folder / CONFIG, stored_arguments(given))
-        compare_into(folder, task, given)
-
-
-def compare_into(folder: Path, task: Task, given: Arguments) -> None:
-    """All methods: the table, report.json, the figure, and the gait of each."""
-    console = Console(highlight=False, soft_wrap=True)
-    announce(console, task)
-    curves, numbers = {}, {}
-    for method in METHODS:
-        trained = learned(task, method, given)
-        (folder / method).mkdir()
-        found = write_run(folder / method, task, method, trained, given, figures=given.figures)
-        numbers |= {f"{method}_{name}": value for name, value in found.items()}
-        curves[method] = [of.records for of in trained.learned]
-    rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
-    facts = conditions(
-        dtype="float64; ppo's networks float32",
-        seeds=list(range(given.seed, given.seed + given.seeds)),
-        settings={method: settings_of(method, given.creature, given.window)._asdict() for method in METHODS},
-        goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
-        counted="environment steps of learning; one episode after each evaluation is apart",
-        seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",
-    )
-    write_report(folder / "report.json", rows, facts)
-    write_json(folder / "metrics.json", numbers)
-    if given.figures:
-        title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
-        write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
-    print_report(rows, facts)
-    if any(math.isinf(comparison.median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
-        console.print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")
-    console.print(f"run folder: {folder}")
+    with command_folder(given, "compare_locomotion") as folder:
+        announce(task)
+        curves, numbers = {}, {}
+        for method in METHODS:
+            trained = learned(task, method, given)
+            (folder / method).mkdir()
+            found = write_run(folder / method, task, method, trained, given, figures=given.figures)
+            numbers |= {f"{method}_{name}": value for name, value in found.items()}
+            curves[method] = [of.records for of in trained.learned]
+        rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
+        facts = conditions(
+            dtype="float64; ppo's networks float32",
+            seeds=list(range(given.seed, given.seed + given.seeds)),
+            settings={method: settings_of(method, given.creature, given.window)._asdict() for method in METHODS},
+            goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
+            counted="environment steps of learning; one episode after each evaluation is apart",
+            seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",
+        )
+        write_report(folder / "report.json", rows, facts)
+        write_json(folder / "metrics.json", numbers)
+        if given.figures:
+            title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
+            write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
+        print_report(rows, facts)
+        if any(math.isinf(comparison.median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
+            print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")
+        print(f"run folder: {folder}")

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.command_line.options import Resumable
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import write_json
+from dln_jax.command_line.running import command_folder
 from dln_jax.studies.differential_networks.table import Extent, cases, measure_into
 from dln_jax.types import require_seed
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)
@@ -39,6 +37,5 @@ def main(given: Arguments) -> None:
     require_seed(given.seed)
     extent = Extent(*(getattr(given, name) for name in Extent._fields))
     chosen = cases(extent)
-    with run_folder(given.out, "diffnet_table", resume=given.resume) as folder:
-        write_json(folder / CONFIG, stored_arguments(given))
+    with command_folder(given, "diffnet_table") as folder:
         measure_into(folder, chosen, extent, resume=given.resume)

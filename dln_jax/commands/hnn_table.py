@@ -12,15 +12,14 @@ from typing import Annotated, ClassVar
 
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.options import Drawn, Resumable
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import write_bytes, write_json
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import write_bytes
 from dln_jax.studies.case import measure, say_numbers, stored_findings
 from dln_jax.studies.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.studies.hamiltonian.training import RECIPES
 from dln_jax.studies.report import conditions, publish
 from dln_jax.types import InputError
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,9 @@ def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
     names = chosen_tasks(given)
     counts = {key: getattr(given, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
-    with run_folder(given.out, "hnn_table", resume=given.resume) as folder:
+    with command_folder(given, "hnn_table") as folder:
         chosen = cases(names, folder=folder if given.figures else None, **counts)
         stored = stored_findings(folder, chosen) if given.resume else {}
-        write_json(folder / CONFIG, stored_arguments(given))
         if REAL not in names and REAL in given.tasks.split(","):
             print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
         say = say_numbers("clean_field_mse", "energy_mse", "published_energy_mse", "train_seconds", "compile_seconds")

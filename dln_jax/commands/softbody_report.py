@@ -9,12 +9,10 @@ from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Drawn, Folder
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import write_json
+from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_draw
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.soft_bodies import SUBJECTS, cases
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,7 @@ def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     subjects = names_in("--only", given.only, SUBJECTS)
     chosen = [case for each in subjects for case in cases(quick=given.quick) if case.name.startswith(f"{each}/")]
-    with run_folder(given.out, "softbody") as folder:
-        write_json(folder / CONFIG, stored_arguments(given))
+    with command_folder(given, "softbody") as folder:
         rows = measure_and_draw(folder, chosen, figures=given.figures)
         facts = conditions(dtype="float64, and float32 where a case says so", seeds=[0], quick=given.quick)
         publish(folder, rows, facts)

@@ -10,14 +10,12 @@ from, and figures. For Hamiltonian networks see train_hnn.
 from dataclasses import dataclass
 from typing import Literal
 
-from dln_jax.command_line.options import Drawn, Resumable, SingleCalls
-from dln_jax.runs.dynamics import train_into
-from dln_jax.runs.dynamics_task import Options, prepare
-from dln_jax.zoo.run_folder import run_folder
+from dln_jax.runs.dynamics import run
+from dln_jax.runs.dynamics_task import Options
 
 
 @dataclass(frozen=True)
-class Arguments(Options, Resumable, Drawn, SingleCalls):
+class Arguments(Options):
     """What to train on, how, and where the results go."""
 
     model: Literal["structured-delan", "black-box-delan", "trigonometric", "feed-forward"] = "structured-delan"
@@ -26,7 +24,4 @@ class Arguments(Options, Resumable, Drawn, SingleCalls):
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
-    task = prepare(given)
-    wanted = {"figures": given.figures, "low_latency": given.low_latency}
-    with run_folder(given.out, "train_delan", resume=given.resume) as folder:
-        train_into(folder, task, given, resume=given.resume, **wanted)
+    run(given, "train_delan")

@@ -5,24 +5,10 @@ y [N, m] and optional dy, d2y. A run folder gets config.json, metrics.json, mode
 with dln_jax.load), and figures. For the published table of activations and losses see diffnet_table.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
-
-from dln_jax.command_line.options import Drawn, Resumable
-from dln_jax.runs.function_task import Options, prepare
-from dln_jax.runs.functions import train_into
-from dln_jax.zoo.run_folder import run_folder
-
-
-@dataclass(frozen=True)
-class Arguments(Options, Resumable, Drawn):
-    """What to train on, how, and where the results go."""
-
-    MOVED: ClassVar = {"--table": "diffnet_table"}
+from dln_jax.runs.function_task import Options as Arguments
+from dln_jax.runs.functions import run
 
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
-    task = prepare(given)
-    with run_folder(given.out, "train_diffnet", resume=given.resume) as folder:
-        train_into(folder, task, given, resume=given.resume, figures=given.figures)
+    run(given, "train_diffnet")

@@ -10,16 +10,12 @@ each other are what compare_locomotion trains.
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from rich.console import Console
-from rich.table import Table
-
 from dln_jax.command_line.arguments import refuse_given
 from dln_jax.command_line.options import Drawn, Resumable
-from dln_jax.command_line.running import stored_arguments
-from dln_jax.files import write_json
+from dln_jax.command_line.running import command_folder
 from dln_jax.runs.locomotion import Options, announce, learned, prepare, write_run
+from dln_jax.runs.results import print_numbers
 from dln_jax.types import InputError
-from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
 """Options that a method does not use."""
@@ -46,15 +42,10 @@ def main(given: Arguments) -> None:
     if given.resume and not given.continues:
         raise InputError("--resume is for gradient and evolution; train again without it")
     task = prepare(given, [given.method])
-    with run_folder(given.out, "train_locomotion", resume=given.resume) as folder:
-        write_json(folder / CONFIG, stored_arguments(given))
-        console = Console(highlight=False, soft_wrap=True)
-        announce(console, task)
+    with command_folder(given, "train_locomotion") as folder:
+        announce(task)
         trained = learned(task, given.method, given, directory=folder, resume=given.resume)
         numbers = write_run(folder, task, given.method, trained, given, figures=given.figures)
-        table = Table("quantity", "value", title=f"{given.creature}, {given.method}")
-        table.columns[1].justify = "right"
-        for name, value in numbers.items():
-            table.add_row(name.replace("_", " "), f"{value:.4g}")
-        console.print(table)
-        console.print(f"run folder: {folder}")
+        rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
+        print_numbers(rows, title=f"{given.creature}, {given.method}", columns=("quantity", "value"))
+        print(f"run folder: {folder}")

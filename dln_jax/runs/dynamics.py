@@ -2,16 +2,14 @@
 
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
 from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import stored_arguments
+from dln_jax.command_line.running import command_folder, write_config
 from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning import dynamics
@@ -23,70 +21,64 @@ from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import TORQUE
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target
-from dln_jax.runs.dynamics_results import Task, best_seed, definiteness_of, evaluate, latency_states, results_table
-from dln_jax.runs.dynamics_task import Options
+from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
+from dln_jax.runs.dynamics_task import Options, Task, prepare
+from dln_jax.runs.results import losses
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
-from dln_jax.zoo.run_folder import CONFIG
 
 
-def train_into(
-    folder: Path, task: Task, given: Options, *, resume: bool = False, figures: bool = True, low_latency: bool = True
-) -> None:
-    """Trains a task, `prepare(given, ...)`, evaluates it, and writes the files of the run into an existing folder.
+def run(given: Options, command: str) -> None:
+    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ...
 
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
-    console = Console(highlight=False, soft_wrap=True)
-    write_json(folder / CONFIG, stored_arguments(given))
-    announce(console, task)
-    if CATALOGUE[task.kind].properties.linear:
-        task, training = fit_trigonometric(task, console, grown=given.degree is None)
-    elif given.target is not None:
-        task, training = grow_to_target(task, given.target, folder, console, resume=resume)
-    else:
-        training = train(task, folder, resume=resume)
-    if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
-        raise InputError(f"no validation error is finite; {folder} holds no model; look for large numbers in the data")
-    parameters, best = best_seed(training, given.seeds)
-    save(folder, task.description, parameters)
-    metrics = evaluate(folder, task, training, seeds=given.seeds, draw=figures)
-    if low_latency:
-        metrics |= low_latency_metrics(folder, latency_states(task), console.print)
-    write_json(folder / "metrics.json", metrics)
-    write_json(folder / CONFIG, {**stored_arguments(given), "chosen": chosen(task)})
-    console.print(results_table(metrics, task))
-    if given.seeds > 1:
-        console.print(f"the run keeps seed {given.seed + best}, the best in validation")
-    console.print(f"run folder: {folder}")
-    warn(console, task, training, folder)
+    task = prepare(given)
+    with command_folder(given, command) as folder:
+        announce(task)
+        if CATALOGUE[task.kind].properties.linear:
+            task, training = fit_trigonometric(task, grown=given.degree is None)
+        elif given.target is not None:
+            task, training = grow_to_target(task, given.target, folder, resume=given.resume)
+        else:
+            training = train(task, folder, resume=given.resume)
+        if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
+            raise InputError(
+                f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
+            )
+        parameters, best = best_seed(training, given.seeds)
+        save(folder, task.description, parameters)
+        metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures)
+        if given.low_latency:
+            metrics |= low_latency_metrics(folder, latency_states(task), print)
+        write_json(folder / "metrics.json", metrics)
+        optimiser = {} if task.optimiser is None else {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
+        write_config(folder, given, **task.description, **optimiser, seeds=task.seeds)
+        print_metrics(metrics, task)
+        if given.seeds > 1:
+            print(f"the run keeps seed {given.seed + best}, the best in validation")
+        print(f"run folder: {folder}")
+        warn(task, training, folder)
 
 
-def announce(console: Console, task: Task) -> None:
+def announce(task: Task) -> None:
     """Says what is trained on what, and what was assumed."""
     counts = ", ".join(f"{len(part.t)} {role}" for role, part in task.sets._asdict().items())
     joints = "-".join(task.needs.joints)
     terms = [name for name in ("gravity", "friction") if getattr(task.needs, name)] or ["no potential, no friction"]
-    console.print(f"{task.name}: {counts} samples")
-    console.print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
+    print(f"{task.name}: {counts} samples")
+    print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
     if task.sets.train.estimated:
-        console.print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
-    properties = CATALOGUE[task.kind].properties
-    if properties.canonical and task.objective is TORQUE:
-        console.print("no momenta p in the data: the Hamiltonian is fitted to torques")
+        print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
+    if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:
+        print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.optimiser is not None:
         why = f" ({task.optimiser_reason})" if task.optimiser_reason else ""
-        console.print(f"{task.kind}, {task.precision}, {name_of(task.optimiser)}{why}")
-
-
-def chosen(task: Task) -> dict[str, Any]:
-    """What the arguments came to, for config.json."""
-    optimiser = {} if task.optimiser is None else {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
-    return {**task.description, **optimiser, "seeds": task.seeds}
+        print(f"{task.kind}, {task.precision}, {name_of(task.optimiser)}{why}")
 
 
 def train(task: Task, folder: Path, *, resume: bool) -> Training:
@@ -99,31 +91,25 @@ def train(task: Task, folder: Path, *, resume: bool) -> Training:
             task.problem,
             task.optimiser,
             checkpoint=Checkpoint(folder, identity, resume),
-            report=lambda at: show(min(int(np.max(at.step)), total), shown(at)),
+            report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
             seconds=task.seconds,
         )
 
 
-def shown(at: Progress) -> str:
-    """A line of progress; of several seeds the median."""
-    return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
-
-
-def fit_trigonometric(task: Task, console: Console, *, grown: bool) -> tuple[Task, Training]:
+def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
     """One least-squares problem, after those by which validation chooses the degrees if it is to."""
     began = time.perf_counter()
     chosen = None
     if grown:
         chosen, trials = choose_degrees(task.needs, task.sets.train, task.sets.validation)
         tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
-        console.print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
+        print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
         task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
     model, dtype = build(task.description), data_type(task.precision)
     fitted = chosen.outcome if chosen is not None else fit_linear(model, task.sets.train)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), fitted.parameters)
-    console.print(
-        f"least squares: {fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
-    )
+    size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
+    print(f"least squares: {size}")
     errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)
     at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), time.perf_counter() - began)
     return task, Training(parameters, [at], Stop("finished", 1), 1, 0.0)
@@ -133,25 +119,24 @@ def _degrees(degrees: tuple[int, ...]) -> str:
     return "-".join(map(str, degrees))
 
 
-def warn(console: Console, task: Task, training: Training, folder: Path) -> None:
+def warn(task: Task, training: Training, folder: Path) -> None:
     """Says what a user should know about how training ended, and of what came of it."""
     found = definiteness_of(load(folder).dynamics, task, merged(task.sets))
     if found is not None and found.share_not_definite > 0:
         properties = CATALOGUE[task.kind].properties
         structured = f"--model {'structured-hnn' if properties.canonical else 'structured-delan'}"
         remedy = f"another --degree, {structured}" if properties.linear else structured
-        console.print(
+        print(
             f"the mass matrix is not positive definite at {found.share_not_definite:.1%} of the states of the data: "
             f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"
         )
     if training.stop.reason == "no improvement":
-        console.print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
+        print(f"stopped early, at step {training.stop.step}: no better validation error for --patience steps")
     if training.stop.reason == "time":
-        console.print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
+        print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
     if training.stop.reason == "not finite":
-        remedy = (
-            "lower --learning-rate or use --precision f64" if isinstance(task.optimiser, Adam) else "check the data"
-        )
+        adam = isinstance(task.optimiser, Adam)
+        remedy = "lower --learning-rate or use --precision f64" if adam else "check the data"
         raise InputError(
             f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"
         )

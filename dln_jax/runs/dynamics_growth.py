@@ -1,7 +1,8 @@
 """--target: structured networks of growing size, until one is as accurate as asked; of those, the fastest."""
 
+import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,8 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
-from dln_jax.runs.dynamics_results import Task, latency_of
+from dln_jax.runs.dynamics_results import latency_of
+from dln_jax.runs.dynamics_task import Task
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 
@@ -36,30 +38,42 @@ class Candidate(NamedTuple):
     """Compilation included."""
     one_step_us: float
 
+    @property
+    def name(self) -> str:
+        """In words."""
+        return f"{self.depth} x {self.width}, {'one network' if self.networks == 1 else 'two networks'}"
 
-def grow_to_target(task: Task, target: float, folder: Path, console: Console, *, resume: bool) -> tuple[Task, Training]:
+
+def grow_to_target(task: Task, target: float, folder: Path, *, resume: bool) -> tuple[Task, Training]:
     """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
 
     Chosen is the fastest that meets it, or, if none does, the most accurate. Writes `candidates.json` and a table.
     """
     tried: list[tuple[Candidate, Task, Training]] = []
+    enough: list[tuple[Candidate, Task, Training]] = []
     for width in WIDTHS:
-        for depth in DEPTHS:
-            for shared in (True, False) if task.needs.gravity else (False,):
-                description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
-                tried.append(_try(task._replace(description=description), folder, resume=resume))
-                candidate = tried[-1][0]
-                verdict = "met" if candidate.validation_error <= target else "not met"
-                console.print(f"{_name(candidate)}: validation {candidate.validation_error:.2e}, target {verdict}")
-        if any(candidate.validation_error <= target for candidate, *_ in tried):
+        for depth, shared in itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)):
+            description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
+            tried.append(_try(task._replace(description=description), folder, resume=resume))
+            candidate = tried[-1][0]
+            met = candidate.validation_error <= target
+            enough += tried[-1:] * met
+            verdict = "met" if met else "not met"
+            print(f"{candidate.name}: validation {candidate.validation_error:.2e}, target {verdict}")
+        if enough:
             break
-    enough = [each for each in tried if each[0].validation_error <= target]
     fastest = min(enough, key=lambda each: each[0].one_step_us, default=None)
     chosen = fastest or min(tried, key=lambda each: each[0].validation_error)
     write_json(folder / "candidates.json", {"candidates": [candidate._asdict() for candidate, *_ in tried]})
-    console.print(_table([candidate for candidate, *_ in tried], chosen[0], target))
+    columns = ("network", "parameters", "validation error", "training, s", "one step, µs", "")
+    table = Table(*columns, title=f"grown until the validation error is {target:g}")
+    for each, *_ in tried:
+        numbers = f"{each.parameters:,}", f"{each.validation_error:.2e}", f"{each.train_seconds:.1f}"
+        verdict = "kept" if each == chosen[0] else "met" if each.validation_error <= target else ""
+        table.add_row(each.name, *numbers, f"{each.one_step_us:.1f}", verdict)
+    Console(highlight=False, soft_wrap=True).print(table)
     if fastest is None:
-        console.print(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
+        print(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
     return chosen[1], chosen[2]
 
 
@@ -87,23 +101,3 @@ def _try(task: Task, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Tr
         one_step_us=latency_of(system, task, calls=2000).p50_us,
     )
     return candidate, task, training
-
-
-def _name(candidate: Candidate) -> str:
-    networks = "one network" if candidate.networks == 1 else "two networks"
-    return f"{candidate.depth} x {candidate.width}, {networks}"
-
-
-def _table(candidates: list[Candidate], chosen: Candidate, target: float) -> Table:
-    columns: tuple[Any, ...] = ("network", "parameters", "validation error", "training, s", "one step, µs", "")
-    table = Table(*columns, title=f"grown until the validation error is {target:g}")
-    for each in candidates:
-        table.add_row(
-            _name(each),
-            f"{each.parameters:,}",
-            f"{each.validation_error:.2e}",
-            f"{each.train_seconds:.1f}",
-            f"{each.one_step_us:.1f}",
-            "kept" if each == chosen else "met" if each.validation_error <= target else "",
-        )
-    return table

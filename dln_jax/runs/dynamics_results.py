@@ -1,20 +1,17 @@
-"""What a training of dynamics comes to: the task, its test errors and speed, figures and tables."""
+"""What a training of dynamics comes to: its test errors and speed, figures and tables."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.table import Table
 
-from dln_jax import figures
+from dln_jax import figures as drawing
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split, merged
+from dln_jax.data.splits import merged
 from dln_jax.files import write_figure
-from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import Problem, Training
-from dln_jax.learning.objectives import Objective
+from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
@@ -22,77 +19,71 @@ from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
 from dln_jax.precision import data_type
-from dln_jax.scenes.scene import Scene
-from dln_jax.types import InputError, Needs
+from dln_jax.runs.dynamics_task import Task
+from dln_jax.runs.results import cost_metrics, print_numbers, unit_of
+from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
 
+SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
+"""Of the seeds' test errors."""
+CEILINGS = {
+    "vpt_seconds": "vpt_ceiling_seconds",
+    "vpt_interpolated_seconds": "vpt_ceiling_interpolated_seconds",
+    "normalised_state_error": "normalised_state_error_ceiling",
+    "energy_error_j": "energy_error_ceiling_j",
+}
+"""Metrics of a rollout, and the names of what the true plant gets."""
+MEANINGS = {
+    "torque_mse": "torque, mean square error",
+    "forward_mse": "acceleration, mean square error",
+    "power_mse": "power, mean square error",
+    "inertial_mse": "inertial force, mean square error",
+    "coriolis_mse": "Coriolis force, mean square error",
+    "gravity_mse": "gravity force, mean square error",
+    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
+    "share_not_definite": "states where the mass matrix is not definite",
+    "largest_condition_number": "largest condition number of the mass matrix",
+    "vpt_seconds": "valid prediction time, torque held",
+    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
+    "rollout_seconds": "duration of a test motion",
+    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "energy_error_j": "energy balance error of a rollout",
+    "one_step_p50_us": "one call of the inverse model, median",
+    "one_step_p99_us": "one call of the inverse model, 99 %",
+    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
+    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
+}
+"""Of the metrics' names; others say it themselves."""
 
-class Task(NamedTuple):
-    """What the arguments come to: the data, what they need, and the model to train."""
 
-    name: str
-    kind: str
-    sets: Split
-    scene: Scene | None
-    needs: Needs
-    needs_origin: str
-    description: dict[str, Any]
-    """Of the model, for `dln_jax.zoo.build`."""
-    objective: Objective
-    optimiser: Optimiser | None
-    """`None` for the trigonometric model, which is one least-squares problem."""
-    optimiser_reason: str
-    """Why the optimiser is the one it is; empty where the user chose."""
-    seeds: int | tuple[int, ...]
-    """One, or several in one program."""
-    problem: Problem | None
-    """What the optimiser solves."""
-    seconds: float
-    """Of training, after which to stop."""
-
-    @property
-    def precision(self) -> str:
-        """f32 or f64, of the model and its training."""
-        return self.description["precision"]
-
-
-def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, draw: bool) -> dict[str, float]:
+def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, figures: bool) -> dict[str, float | int]:
     """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
-    dtype = data_type(task.precision)
-    run = load(folder)
-    functions = run.dynamics
-    test = task.sets.test
+    dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
+    functions, model = run.dynamics, build(task.description)
     predicted = predictions(run.energies, test, dtype)
     latency = latency_of(functions, task)
-    if draw:
-        draw_figures(folder, task, training, functions, predicted)
-    every = range(seeds) if seeds > 1 else ()
-    model = build(task.description)
-    of_seeds = [
-        errors(predictions(model.energies(parameters_of(training, index)), test, dtype), test)["torque_mse"]
-        for index in every
-    ]
-    spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items() if seeds > 1}
+    if figures:
+        draw(folder, task, training, functions, predicted)
+    spread = {}
+    if seeds > 1:
+        models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
+        of_seeds = [errors(predictions(each, test, dtype), test)["torque_mse"] for each in models]
+        spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
     return {
         **errors(predicted, test),
         **spread,
         **definiteness_metrics(functions, task),
         **rollouts(functions, task),
         **({"validation_error": float(np.min(training.validation))} if training.history else {}),
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
-        "steps": training.stop.step,
-        "best_step": int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": training.train_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
+        **cost_metrics(
+            training,
+            latency,
+            parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
+            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
+        ),
     }
-
-
-SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
-"""Of the seeds' test errors."""
 
 
 def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
@@ -131,13 +122,8 @@ def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Traje
 def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
     """What the mass matrices of a model without structure are like on the test."""
     found = definiteness_of(functions, task, task.sets.test)
-    if found is None:
-        return {}
-    return {
-        "smallest_mass_eigenvalue": found.smallest_eigenvalue,
-        "share_not_definite": found.share_not_definite,
-        "largest_condition_number": found.largest_condition_number,
-    }
+    names = {"smallest_eigenvalue": "smallest_mass_eigenvalue"}
+    return {} if found is None else {names.get(key, key): value for key, value in found._asdict().items()}
 
 
 def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
@@ -160,83 +146,48 @@ def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float
     return {**found, **{ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}}
 
 
-CEILINGS = {
-    "vpt_seconds": "vpt_ceiling_seconds",
-    "vpt_interpolated_seconds": "vpt_ceiling_interpolated_seconds",
-    "normalised_state_error": "normalised_state_error_ceiling",
-    "energy_error_j": "energy_error_ceiling_j",
-}
-"""Metrics of a rollout, and the names of what the true plant gets."""
-
-
-def draw_figures(
+def draw(
     folder: Path, task: Task, training: Training, functions: Dynamics | PlainDynamics, predicted: dict[str, np.ndarray]
 ) -> None:
     """Writes what there is to draw."""
     test = task.sets.test
-    write_figure(folder / "decomposition.png", figures.force_decomposition(test, predicted, model=task.kind))
+    write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
     if training.history and not CATALOGUE[task.kind].properties.linear:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
-        write_figure(folder / "training.png", figures.training_curve(training.history, best_step=best, **units))
+        write_figure(folder / "training.png", drawing.training_curve(training.history, best_step=best, **units))
     if task.scene is not None and task.scene.tip is not None:
         moving = len(np.unique(test.trajectory)) < len(test.t)
         dtype = data_type(task.precision)
         found = recorded_motions(functions, test, torques=["interpolated"], dtype=dtype) if moving else {}
         motions, every = found.get("interpolated", []), merged(task.sets)
-        paths = figures.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
+        paths = drawing.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
         write_figure(folder / "tip_paths.png", paths)
 
 
-MEANINGS = {
-    "torque_mse": "torque, mean square error",
-    "forward_mse": "acceleration, mean square error",
-    "power_mse": "power, mean square error",
-    "inertial_mse": "inertial force, mean square error",
-    "coriolis_mse": "Coriolis force, mean square error",
-    "gravity_mse": "gravity force, mean square error",
-    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
-    "share_not_definite": "states where the mass matrix is not definite",
-    "largest_condition_number": "largest condition number of the mass matrix",
-    "vpt_seconds": "valid prediction time, torque held",
-    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
-    "rollout_seconds": "duration of a test motion",
-    "normalised_state_error": "state error of a rollout, in standard deviations",
-    "energy_error_j": "energy balance error of a rollout",
-    "one_step_p50_us": "one call of the inverse model, median",
-    "one_step_p99_us": "one call of the inverse model, 99 %",
-    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
-    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
-}
-"""Of the metrics' names; others say it themselves."""
-
-
-def results_table(metrics: dict[str, float], task: Task) -> Table:
+def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
     """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
-    units = {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
+    units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
+    units |= {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
     units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
-    columns = ("quantity", "value", *(["true plant"] if known else []), "unit")
-    table = Table(*columns, title=f"test on {task.name}, {task.precision}")
-    for column in table.columns[1:-1]:
-        column.justify = "right"
-
-    def text(key: str, value: int | float) -> str:
-        if isinstance(value, int):
-            return f"{value:,}"
-        tiny = "_mse" in key or "error" in key or "eigenvalue" in key or "condition" in key
-        return f"{value:.2e}" if tiny else f"{value:,.2f}" if key.startswith(("vpt", "share")) else f"{value:,.1f}"
-
+    rows = []
     for key, value in metrics.items():
-        if key in CEILINGS.values():
-            continue
-        unit = units.get(key, f"({force})²" if "_mse" in key else "")
-        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else unit
-        ceiling = metrics.get(CEILINGS.get(key, ""))
-        beside = [] if not known else ["" if ceiling is None else text(key, ceiling)]
-        table.add_row(MEANINGS.get(key, key.replace("_", " ")), text(key, value), *beside, unit)
+        if key not in CEILINGS.values():
+            ceiling = metrics.get(CEILINGS.get(key, ""))
+            beside = ["" if ceiling is None else number(key, ceiling)] * known
+            rows.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
     calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
-    table.add_row("calls of the inverse model", calls, *([""] if known else []), "1/s")
-    return table
+    rows.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
+    columns = ("quantity", "value", *["true plant"] * known, "unit")
+    print_numbers(rows, title=f"test on {task.name}, {task.precision}", columns=columns)
+
+
+def number(metric: str, value: int | float) -> str:
+    """As a user wants to see it."""
+    if isinstance(value, int):
+        return f"{value:,}"
+    tiny = any(word in metric for word in ("_mse", "error", "eigenvalue", "condition"))
+    return f"{value:.2e}" if tiny else f"{value:,.2f}" if metric.startswith(("vpt", "share")) else f"{value:,.1f}"

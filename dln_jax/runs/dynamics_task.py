@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
 from dln_jax.command_line.optimisers import name_of, optimiser_named
-from dln_jax.command_line.options import Limited
+from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
@@ -15,9 +15,8 @@ from dln_jax.data.splits import Split, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.optimisers import Optimiser
-from dln_jax.learning.engine.problem import require_finite_start
+from dln_jax.learning.engine.problem import Problem, require_finite_start
 from dln_jax.learning.objectives import Objective, objective_of
-from dln_jax.runs.dynamics_results import Task
 from dln_jax.scenes.registry import SCENES, scene_named
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
@@ -30,8 +29,8 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
 @dataclass(frozen=True)
-class Options(Limited):
-    """What to train on, and how."""
+class Options(Limited, Resumable, Drawn, SingleCalls):
+    """What to train on, how, and where the results go."""
 
     model: str = "structured-delan"
     """What is learned."""
@@ -76,6 +75,35 @@ class Options(Limited):
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
 
 
+class Task(NamedTuple):
+    """What the arguments come to: the data, what they need, and the model to train."""
+
+    name: str
+    kind: str
+    sets: Split
+    scene: Scene | None
+    needs: Needs
+    needs_origin: str
+    description: dict[str, Any]
+    """Of the model, for `dln_jax.zoo.build`."""
+    objective: Objective
+    optimiser: Optimiser | None
+    """`None` for the trigonometric model, which is one least-squares problem."""
+    optimiser_reason: str
+    """Why the optimiser is the one it is; empty where the user chose."""
+    seeds: int | tuple[int, ...]
+    """One, or several in one program."""
+    problem: Problem | None
+    """What the optimiser solves."""
+    seconds: float
+    """Of training, after which to stop."""
+
+    @property
+    def precision(self) -> str:
+        """f32 or f64, of the model and its training."""
+        return self.description["precision"]
+
+
 def prepare(given: Options) -> Task:
     """Reads and checks everything that the arguments name, before anything is written."""
     kind = given.model
@@ -97,16 +125,14 @@ def prepare(given: Options) -> Task:
     objective = objective_of(kind, sets.train)
     description, optimiser, reason = model_and_optimiser(given, kind, sets, needs, objective)
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
-    seconds = math.inf if given.seconds is None else given.seconds
-    require_positive(seconds=seconds)
-    model = build(description)
-    everything = dynamics.samples(model, sets, objective)
-    problem = None
+    limit = resolved(given, {"seconds": math.inf})
+    require_positive(**limit)
+    model, problem = build(description), None
     if optimiser is not None:
         problem = dynamics.problem(model, sets, objective, seeds=seeds)
-        require_finite_start(problem, everything)
+        require_finite_start(problem, dynamics.samples(model, sets, objective))
     return Task(
-        name, kind, sets, scene, needs, origin, description, objective, optimiser, reason, seeds, problem, seconds
+        name, kind, sets, scene, needs, origin, description, objective, optimiser, reason, seeds, problem, **limit
     )
 
 
@@ -130,13 +156,6 @@ def check_options(given: Options, kind: str) -> None:
         require_positive(target=given.target)
 
 
-def default_width(kind: str, optimizer: str) -> int:
-    """Hidden units per layer: structure needs fewer, and first-order training more."""
-    if optimizer == "adam":
-        return 64
-    return 8 if CATALOGUE[kind].properties.definite else 16
-
-
 def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
     """What the plant needs, and who says so: the command line, the scene, the file, or an assumption."""
     if given.needs is not None:
@@ -153,18 +172,19 @@ def model_and_optimiser(
 ) -> tuple[dict[str, Any], Optimiser | None, str]:
     """Description of the model, its optimiser, and why that one."""
     check_options(given, kind)
-    precision = given.precision or ("f32" if given.optimizer == "adam" else "f64")
-    if CATALOGUE[kind].properties.linear:
-        keywords: dict[str, Any] = {"degree": 1 if given.degree is None else given.degree}
-        description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
-        return description, None, ""
-    keywords = resolved(given, {"width": default_width(kind, given.optimizer), "depth": 2, "activation": "tanh"})
+    properties, adam = CATALOGUE[kind].properties, given.optimizer == "adam"
+    precision = given.precision or ("f32" if adam else "f64")
+    if properties.linear:
+        degree = 1 if given.degree is None else given.degree
+        return describe_for(kind, sets.train, needs, precision=precision, degree=degree), None, ""
+    # Structure needs fewer units, and first-order training more.
+    width = 64 if adam else 8 if properties.definite else 16
+    keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
     require_positive(width=keywords["width"], depth=keywords["depth"])
     description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
-    model = build(description)
     optimizer, reason = given.optimizer, ""
     if optimizer == "auto":
-        suited, reason = dynamics.suited_optimiser(model, sets, objective)
+        suited, reason = dynamics.suited_optimiser(build(description), sets, objective)
         optimizer = name_of(suited)
         precision = given.precision or ("f32" if optimizer == "adam" else "f64")
         description["precision"] = precision

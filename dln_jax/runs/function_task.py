@@ -1,12 +1,13 @@
 """From options to a differential network's task: the samples of a function, and how it is trained on them."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
 from dln_jax.command_line.optimisers import optimiser_named
+from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.learning.engine.optimisers import GaussNewton, Optimiser
@@ -28,8 +29,10 @@ SHARE_OF_DATA = 0.75
 
 
 @dataclass(frozen=True)
-class Options:
-    """What to train on, and how."""
+class Options(Resumable, Drawn):
+    """What to train on, how, and where the results go."""
+
+    MOVED: ClassVar = {"--table": "diffnet_table"}
 
     function: Annotated[str, choice((*NAMED, "FILE.npz"))] = "sin"
     """sin, cos_sin, or the path of an npz file with x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""
@@ -96,8 +99,8 @@ def prepare(given: Options) -> Task:
         generate, grid = NAMED[function]
         bound = np.pi * (SHARE_OF_DATA if several else 1)
         data = generate(**of_named(given), bound=bound, seed=given.seed)
-        test, shown = grid(bound=bound), grid()
-        bound, units = (bound, own_units(data)) if several else (None, own_units(data))
+        test, shown, units = grid(bound=bound), grid(), own_units(data)
+        bound = bound if several else None
     else:
         if not function.endswith(".npz"):
             raise InputError(f"function '{function}' is unknown; expected sin, cos_sin or an npz file's path")
@@ -107,8 +110,7 @@ def prepare(given: Options) -> Task:
             raise InputError(f"{function}: {len(everything.x)} samples; training, validation and test need 3")
         data, test = functions.split(everything, seed=given.seed)
         shown, bound, units = test, None, standard_units(data)
-    depth = given.depth if given.depth is not None else min(data.inputs, 2)
-    network = network._replace(depth=depth)
+    network = network._replace(depth=min(data.inputs, 2) if given.depth is None else given.depth)
     sets = functions.split(data, seed=given.seed)
     optimiser = optimiser_from(given, len(sets.train.x), network.precision)
     targets(to_units(data, units), network)
@@ -132,10 +134,7 @@ def network_from(given: Options) -> Network:
 def optimiser_from(given: Options, samples: int, precision: str) -> Optimiser:
     """The optimiser that the arguments name, for so many samples."""
     newton = given.optimizer == "gauss-newton"
-    if newton:
-        refuse_given(given, OF_ADAM, "for adam: add --optimizer adam")
-    else:
-        refuse_given(given, OF_NEWTON, "for gauss-newton")
+    refuse_given(given, *((OF_ADAM, "for adam: add --optimizer adam") if newton else (OF_NEWTON, "for gauss-newton")))
     stated = {name: value for name in (*OF_ADAM, *OF_NEWTON) if (value := getattr(given, name)) is not None}
     own = GAUSS_NEWTON if newton else published_adam(samples, **stated)
     return optimiser_named(given.optimizer, precision=precision, **{**own._asdict(), **stated})

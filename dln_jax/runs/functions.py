@@ -6,12 +6,10 @@ from pathlib import Path
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import CHOSEN, stored_arguments
+from dln_jax.command_line.running import command_folder, write_config
 from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
@@ -22,14 +20,13 @@ from dln_jax.learning.engine.problem import Progress, Training, one_after_the_ot
 from dln_jax.learning.functions import WIDTHS, Network, grow_width, train
 from dln_jax.learning.growth import Trial
 from dln_jax.learning.standardisation import layers_in_own_units, to_units
-from dln_jax.metrics.functions import errors, predictions, typical_spread
+from dln_jax.metrics.functions import Prediction, errors, predictions, typical_spread
 from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
-from dln_jax.nn.differential_mlp import Layers
-from dln_jax.runs.function_task import NAMED, Options, Task, of_named
-from dln_jax.zoo.descriptions import Description, describe
+from dln_jax.runs.function_task import NAMED, Options, Task, of_named, prepare
+from dln_jax.runs.results import OF_LOSSES, cost_metrics, print_numbers, unit_of
+from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load, save
-from dln_jax.zoo.run_folder import CONFIG
 
 RELU = (
     "a ReLU network is piecewise linear: its Hessian is zero almost everywhere, so its hessian_mse is that of "
@@ -37,39 +34,47 @@ RELU = (
 )
 
 
-def train_into(folder: Path, task: Task, given: Options, *, resume: bool = False, figures: bool = True) -> None:
-    """Trains a task, `prepare(given)`, evaluates it, and writes the files of the run into an existing folder."""
-    console = Console(highlight=False, soft_wrap=True)
-    write_json(folder / CONFIG, stored_arguments(given))
-    announce(console, task)
-    network, training, trials = fit(task, folder, resume=resume, console=console)
-    task = task._replace(network=network)
-    optimiser = {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
-    chosen = {**network._asdict(), **optimiser, **of_named(given)}
-    write_json(folder / CONFIG, {**stored_arguments(given), CHOSEN: chosen})
-    if training.stop.reason == "not finite":
-        console.print("the loss stopped being finite; the run keeps the best parameters before that")
-    layers = layers_in_own_units(training.parameters, task.units)
-    save(folder, description_of(layers, task.network), layers)
-    metrics = evaluate(folder, task, training)
-    if figures:
-        draw_figures(folder, task, training, trials)
-    write_json(folder / "metrics.json", metrics)
-    console.print(results_table(metrics, task))
-    if task.network.activation == "relu":
-        console.print(RELU)
-    console.print(f"run folder: {folder}")
+def run(given: Options, command: str) -> None:
+    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ..."""
+    task = prepare(given)
+    with command_folder(given, command) as folder:
+        announce(task)
+        network, training, trials = fit(task, folder, resume=given.resume)
+        task = task._replace(network=network)
+        optimiser = {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
+        write_config(folder, given, **network._asdict(), **optimiser, **of_named(given))
+        if training.stop.reason == "not finite":
+            print("the loss stopped being finite; the run keeps the best parameters before that")
+        layers = layers_in_own_units(training.parameters, task.units)
+        members, inputs, _ = layers[0][0].shape
+        stated = {"activation": network.activation, "precision": network.precision}
+        sizes = [inputs, *(weight.shape[2] for weight, _ in layers)]
+        save(folder, describe("differential-network", sizes=sizes, members=members, **stated), layers)
+        metrics = evaluate(folder, task, training, trials, figures=given.figures)
+        write_json(folder / "metrics.json", metrics)
+        numbers = ([key.replace("_", " "), number(key, value), unit_of(key, UNITS)] for key, value in metrics.items())
+        print_numbers(numbers, title=f"test on {task.name}, {network.precision}")
+        if network.activation == "relu":
+            print(RELU)
+        print(f"run folder: {folder}")
 
 
-def description_of(layers: Layers, network: Network) -> Description:
-    """Of a network, or an ensemble; `layers` have the members on their leading axis."""
-    members, inputs, _ = layers[0][0].shape
-    stated = {"activation": network.activation, "precision": network.precision}
-    sizes = [inputs, *(weight.shape[2] for weight, _ in layers)]
-    return describe("differential-network", sizes=sizes, members=members, **stated)
+def announce(task: Task) -> None:
+    """Says what is trained on what."""
+    data, network = task.sets.train, task.network
+    counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
+    terms = ["value", *(["gradient"] if network.loss == "type1" else []), *(["Hessian"] * (network.derivative == 2))]
+    width = "grown" if task.grown else str(network.width)
+    layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
+    networks = f"{network.members} networks" if network.members > 1 else "network"
+    print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
+    trained = f"{network.loss}: {', '.join(terms)}; {name_of(task.optimiser)}, {network.precision}"
+    print(f"{networks} {layers}, {network.activation}; {trained}")
+    if network.activation == "relu" and network.derivative == 2:
+        print(RELU)
 
 
-def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Network, Training, list[Trial]]:
+def fit(task: Task, folder: Path, *, resume: bool) -> tuple[Network, Training, list[Trial]]:
     """Trains at the width asked for, or at growing ones: the network chosen, its training, and all trials."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     optimiser, total = task.optimiser, task.optimiser.steps
@@ -80,78 +85,48 @@ def fit(task: Task, folder: Path, *, resume: bool, console: Console) -> tuple[Ne
         known = identity(optimiser, (array for data in standard for array in data), **network._asdict())
         checkpoint = Checkpoint(folder, known, resume, f"checkpoint_width_{network.width}")
         with progress(total) as show:
-            return train(
-                standard,
-                network,
-                optimiser,
-                checkpoint=checkpoint,
-                report=lambda at: show(min(at.step, total), shown(network, at)),
-            )
+
+            def report(at: Progress) -> None:
+                stage = f", {at.stage}" if at.stage else ""
+                losses = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
+                show(min(at.step, total), f"width {network.width}{stage}: {losses}")
+
+            return train(standard, network, optimiser, checkpoint=checkpoint, report=report)
 
     if not task.grown:
         return task.network, train_one(task.network), []
     chosen, trials = grow_width(standard, task.network, train_one, widths=WIDTHS)
     tried = ", ".join(f"{trial.candidate.width}: {trial.validation:.3e}" for trial in trials)
-    console.print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
+    print(f"validation loss by width: {tried}; chosen {chosen.candidate.width}")
     return chosen.candidate, chosen.outcome, trials
 
 
-def shown(network: Network, at: Progress) -> str:
-    """A line of progress, with what is trained on what."""
-    stage = f", {at.stage}" if at.stage else ""
-    return f"width {network.width}{stage}: loss {at.loss:.3e}  validation {at.validation:.3e}"
-
-
-def announce(console: Console, task: Task) -> None:
-    """Says what is trained on what."""
-    data, network = task.sets.train, task.network
-    counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
-    terms = ["value", *(["gradient"] if network.loss == "type1" else []), *(["Hessian"] * (network.derivative == 2))]
-    width = "grown" if task.grown else str(network.width)
-    layers = " x ".join([str(data.inputs), *[width] * network.depth, str(data.outputs)])
-    networks = f"{network.members} networks" if network.members > 1 else "network"
-    console.print(f"{task.name}: {counts}, {data.inputs} inputs, {data.outputs} outputs")
-    console.print(
-        f"{networks} {layers}, {network.activation}; {network.loss}: {', '.join(terms)}; "
-        f"{name_of(task.optimiser)}, {network.precision}"
-    )
-    if network.activation == "relu" and network.derivative == 2:
-        console.print(RELU)
-
-
-def evaluate(folder: Path, task: Task, training: Training) -> dict[str, float]:
-    """Loads the stored model as a user would, and measures it on the test samples."""
-    loaded = load(folder)
-    function = activation(task.network.activation)
+def evaluate(
+    folder: Path, task: Task, training: Training, trials: list[Trial], *, figures: bool
+) -> dict[str, float | int]:
+    """Loads the stored model as a user would, measures it on the test samples, and draws what fits its inputs."""
+    loaded, function = load(folder), activation(task.network.activation)
     tested = predictions(loaded.parameters, task.test.x, activation=function)
+    # Without a bound, what is shown is the test.
+    shown = tested if task.bound is None else predictions(loaded.parameters, task.shown.x, activation=function)
     metrics = errors(tested.mean, task.test)
-    bounded = task.bound is not None
-    spread = predictions(loaded.parameters, task.shown.x, activation=function).spread if bounded else None
-    if task.bound is not None and spread is not None:
+    if task.bound is not None and shown.spread is not None:
         inside = np.all(abs(task.shown.x) <= task.bound, axis=1)
-        metrics["spread_inside"] = typical_spread(spread, inside)
-        metrics["spread_outside"] = typical_spread(spread, ~inside)
+        metrics["spread_inside"] = typical_spread(shown.spread, inside)
+        metrics["spread_outside"] = typical_spread(shown.spread, ~inside)
     latency = one_step(loaded.derivatives, [(x,) for x in task.test.x[:512]], calls=1000)
-    return {
-        **metrics,
-        "validation_loss": float(training.validation),
-        "width": task.network.width,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(loaded.parameters)),
-        "steps": training.stop.step,
-        "best_step": training.best_step,
-        "compile_seconds": training.compile_seconds,
-        "train_seconds": training.train_seconds,
-        "one_step_p50_us": latency.p50_us,
-        "one_step_p99_us": latency.p99_us,
-    }
+    if figures:
+        for name, figure in drawings(task, shown, training, trials).items():
+            write_figure(folder / f"{name}.png", figure)
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(loaded.parameters))
+    metrics |= {"validation_loss": float(training.validation), "width": task.network.width}
+    return metrics | cost_metrics(training, latency, parameters=parameters, best_step=training.best_step)
 
 
-def draw_figures(folder: Path, task: Task, training: Training, trials: list[Trial]) -> None:
-    """Writes what fits the number of inputs."""
-    inputs, loaded = task.test.inputs, load(folder)
-    shown = predictions(loaded.parameters, task.shown.x, activation=activation(task.network.activation))
+def drawings(task: Task, shown: Prediction, training: Training, trials: list[Trial]) -> dict[str, Figure]:
+    """What fits the number of inputs, by name."""
     drawn = {"training": training_figure(training, trials)} if training.history else {}
-    if inputs == 1:
+    if task.test.inputs == 1:
         drawn["curves"] = drawing.function_curves(task.shown, shown.mean)
     elif task.name in NAMED:
         drawn["heat_maps"] = drawing.heat_maps(task.shown, shown.mean)
@@ -160,13 +135,11 @@ def draw_figures(folder: Path, task: Task, training: Training, trials: list[Tria
         drawn["parity"] = drawing.parity(*(to_units(part, task.units) for part in (task.shown, shown.mean)))
     if task.bound is not None and shown.spread is not None:
         drawn["ensemble"] = drawing.ensemble(task.shown, shown.mean, shown.spread, bound=task.bound)
-    for name, figure in drawn.items():
-        write_figure(folder / f"{name}.png", figure)
+    return drawn
 
 
 def training_figure(training: Training, trials: list[Trial]) -> Figure:
     """The losses of every width that was tried, one after the other."""
-    words = {"error": "loss", "loss": "training loss", "unit": "loss, in the units of the fit"}
     before, histories = 0, []
     for trial in trials:
         if trial.outcome is training:
@@ -174,7 +147,9 @@ def training_figure(training: Training, trials: list[Trial]) -> Figure:
         name = f"width {trial.candidate.width}"
         histories.append([at._replace(stage=name) for at in trial.outcome.history])
     joined = one_after_the_other(histories) if trials else training.history
-    return training_curve(joined, best_step=before + training.best_step, **words)
+    return training_curve(
+        joined, best_step=before + training.best_step, unit="loss, in the units of the fit", **OF_LOSSES
+    )
 
 
 UNITS = {
@@ -188,12 +163,8 @@ UNITS = {
 """Of metrics, in those of the data."""
 
 
-def results_table(metrics: dict[str, float], task: Task) -> Table:
-    """The figures that a user wants to see, with units."""
-    table = Table("quantity", "value", "unit", title=f"test on {task.name}, {task.network.precision}")
-    table.columns[1].justify = "right"
-    for key, value in metrics.items():
-        unit = "s" if key.endswith("_seconds") else "µs" if key.endswith("_us") else UNITS.get(key, "")
-        small = f"{value:.2e}" if re.search("_mse|_loss|spread", key) else f"{value:,.1f}"
-        table.add_row(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else small, unit)
-    return table
+def number(metric: str, value: int | float) -> str:
+    """As a user wants to see it."""
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.2e}" if re.search("_mse|_loss|spread", metric) else f"{value:,.1f}"

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from rich.console import Console
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.arguments import Unstated, require_positive_if_given
 from dln_jax.command_line.progress import progress
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
@@ -57,9 +56,7 @@ class Options:
 def prepare(given: Options, methods: Sequence[Method]) -> Task:
     """The task; refuses what cannot be trained by these methods, before anything is written."""
     require_positive(episode=given.episode, clock_period=given.clock_period)
-    for name in ("seeds", "steps", "until", "window", "width"):
-        if getattr(given, name) is not None:
-            require_positive(**{name: getattr(given, name)})
+    require_positive_if_given(given, ["seeds", "steps", "until", "window", "width"])
     require_seed(given.seed, given.seeds)
     if "gradient" in methods:
         gradient.check(settings_of("gradient", given.creature, given.window), given.episode)
@@ -71,10 +68,10 @@ def prepare(given: Options, methods: Sequence[Method]) -> Task:
     return make_task(creature, episode=given.episode, clock_period=given.clock_period, upright=given.upright)
 
 
-def announce(console: Console, task: Task) -> None:
+def announce(task: Task) -> None:
     """Says what is trained."""
     size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
-    console.print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
+    print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
 
 
 def learned(
@@ -103,9 +100,9 @@ def learned(
 
 
 def write_run(
-    folder: Path, task: Task, method: Method, trained: Trained, given: Options, *, figures: bool = True
+    folder: Path, task: Task, method: Method, trained: Trained, given: Options, *, figures: bool
 ) -> dict[str, float]:
-    """Model, metrics, figure and GIF of the best seed; gives the metrics."""
+    """Model, metrics, figure and GIF (at half the speed of the motion) of the best seed; gives the metrics."""
     best, creature = trained.best, task.creature.name
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
@@ -124,7 +121,17 @@ def write_run(
     if figures:
         records = [of.records for of in trained.learned]
         write_figure(folder / "learning.png", comparison.learning_figure(records, method=method))
-        write_gait(task, seen, folder / "gait.gif", f"{creature}, {method}: {best.distance:.2f} body lengths")
+        x = np.concatenate([task.creature.mesh.vertices[None], seen.x])
+        write_soft_body_gif(
+            folder / "gait.gif",
+            task.creature.mesh,
+            x,
+            TIME_STEP * np.arange(len(x)),
+            muscles=task.creature.muscles,
+            actuation=np.concatenate([seen.actuation[:1], seen.actuation]),
+            title=f"{creature}, {method}: {best.distance:.2f} body lengths",
+            frames_per_second=0.5 / TIME_STEP,
+        )
     return numbers
 
 
@@ -147,18 +154,3 @@ def metrics_of(task: Task, trained: Trained, seen: Walk) -> dict[str, float]:
         "least_height": heights.min(),
     }
     return {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
-
-
-def write_gait(task: Task, seen: Walk, path: Path, title: str) -> None:
-    """The GIF of one episode, at half the speed of the motion."""
-    x = np.concatenate([task.creature.mesh.vertices[None], seen.x])
-    write_soft_body_gif(
-        path,
-        task.creature.mesh,
-        x,
-        TIME_STEP * np.arange(len(x)),
-        muscles=task.creature.muscles,
-        actuation=np.concatenate([seen.actuation[:1], seen.actuation]),
-        title=title,
-        frames_per_second=0.5 / TIME_STEP,
-    )

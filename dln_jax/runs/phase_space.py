@@ -1,27 +1,42 @@
-"""Training a task of a phase space into a run folder: the model, its errors, its speed and its pictures."""
+"""Hamiltonian models of a phase space: from options to a run folder with the model, its errors, speed and pictures."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given, resolved
+from dln_jax.command_line.optimisers import optimiser_named
+from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import command_folder, needs_from_option
+from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH
 from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
-from dln_jax.runs.phase_space_task import PhaseTask
+from dln_jax.runs.results import OF_LOSSES, losses, one_step_metrics, print_numbers, unit_of
 from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
-from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
-from dln_jax.studies.hamiltonian.training import MOTIONS, RATES, Trained, stages_of, train
+from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, TASKS, Problem, problem_of
+from dln_jax.studies.hamiltonian.training import (
+    MOTIONS,
+    POLYNOMIAL,
+    RATES,
+    Trained,
+    check,
+    description_of,
+    stages_of,
+    train,
+)
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_seed
+from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 
 GIF_FRAMES = 80
@@ -32,36 +47,114 @@ LOSSES = {
 """What each stage makes small."""
 
 
-def train_into(
-    folder: Path, task: PhaseTask, *, resume: bool = False, figures: bool = True, low_latency: bool = True
-) -> None:
-    """Trains, evaluates, and writes the files of the run into an existing folder.
+@dataclass(frozen=True)
+class Options(Limited, Resumable, Drawn, SingleCalls):
+    """What to train on, how, and where the results go. What is not given is the task's own choice."""
+
+    task: Annotated[str, choice(TASKS)] = "spring"
+    """What moves."""
+    model: Literal[
+        "auto",
+        "separable-hnn",
+        "structured-hnn",
+        "black-box-hnn",
+        "pairwise-hnn",
+        "polynomial-hamiltonian",
+        "phase-network",
+    ] = "auto"
+    """What is learned; auto: what suits the task."""
+    data: Unstated[Path] = None
+    """Trajectories in the npz schema, for measured and real-pendulum."""
+    trajectories: Unstated[int] = None
+    """Generated trajectories, for the other tasks."""
+    needs: Unstated[str] = None
+    """measured: what the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
+    (default: what the file states, else revolute joints with a potential and friction)."""
+    optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
+    """auto: gauss-newton."""
+    width: Unstated[int] = None
+    """Hidden units per layer."""
+    depth: Unstated[int] = None
+    """Hidden layers."""
+    activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
+    """Of the hidden layers (default: tanh)."""
+    degree: Unstated[int] = None
+    """polynomial: degree (default: what validation asks for)."""
+    steps: Unstated[int] = None
+    """Iterations of gauss-newton or steps of adam, of each stage."""
+    learning_rate: Unstated[float] = None
+    """adam: peak of the warm-up and cosine schedule (default: 0.005)."""
+    seed: int = 0
+    """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
+
+
+def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
+    """The problem, the model's description, and the keywords of `train`: all is checked before anything is written."""
+    require_seed(given.seed)
+    require_positive_if_given(given, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
+    if given.optimizer != "adam":
+        refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
+    if given.model != POLYNOMIAL:
+        refuse_given(given, ["degree"], "for polynomial-hamiltonian")
+    needs = None if given.needs is None else needs_from_option(given.needs)
+    problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, needs=needs)
+    size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
+    description = description_of(problem, given.model, **size)
+    check_suited(given, problem, description)
+    name = "gauss-newton" if given.optimizer == "auto" else given.optimizer
+    optimiser = optimiser_named(name, precision=description["precision"], learning_rate=given.learning_rate)
+    check(problem, description, seed=given.seed)
+    training = {"seed": given.seed, "optimiser": optimiser, "steps": given.steps}
+    return problem, description, training | resolved(given, {"seconds": math.inf})
+
+
+def check_suited(given: Options, problem: Problem, description: dict[str, Any]) -> None:
+    """Refuses what this task or its model does not take."""
+    build(description)
+    if problem.name != MEASURED:
+        refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
+    if problem.name not in PROTOCOLS:
+        refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
+    if description["name"] == POLYNOMIAL:
+        linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
+        refuse_given(given, ["width", "depth", "activation"], linear)
+        if MOTIONS not in stages_of(problem, description):
+            refuse_given(given, ["steps", "seconds"], linear)
+        if given.optimizer == "adam":
+            raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
+
+
+def run(given: Options, command: str) -> None:
+    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ...
 
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
-    console = Console(highlight=False, soft_wrap=True)
-    problem, description, training = task
-    announce(console, problem, description)
-    with stage_progress(stages_of(problem, description, training["steps"])) as report:
-        trained = train(problem, description, **training, directory=folder, resume=resume, report=report)
-    if not np.isfinite(trained.result.validation):
-        raise InputError(f"{trained.stopped}; {folder} holds no model")
-    save(folder, description, trained.result.parameters)
-    numbers, seen = measured_once(problem, trained)
-    metrics = {**numbers, **latency_of(folder, problem), "validation_error": float(trained.result.validation)}
-    if low_latency:
-        truth = problem.truth[0]
-        metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), console.print, function="rates")
-    write_json(folder / "metrics.json", {key: value for key, value in metrics.items() if np.isfinite(value)})
-    if figures:
-        draw(folder, problem, description["name"], seen, trained)
-    console.print(results_table(metrics, problem))
-    console.print(f"run folder: {folder}")
-    if trained.diverged:
-        raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
-    if trained.stopped:
-        console.print(trained.stopped)
+    problem, description, training = prepare(given)
+    truth = problem.truth[0]
+    with command_folder(given, command, **description) as folder:
+        announce(problem, description)
+        with stage_progress(stages_of(problem, description, training["steps"])) as report:
+            trained = train(problem, description, **training, directory=folder, resume=given.resume, report=report)
+        if not np.isfinite(trained.result.validation):
+            raise InputError(f"{trained.stopped}; {folder} holds no model")
+        save(folder, description, trained.result.parameters)
+        metrics, seen = measured_once(problem, trained)
+        states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
+        metrics = {**metrics, **one_step_metrics(one_step(load(folder).flow.rates, states, calls=2000))}
+        metrics["validation_error"] = float(trained.result.validation)
+        if given.low_latency:
+            metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), print, function="rates")
+        metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
+        write_json(folder / "metrics.json", metrics)
+        if given.figures:
+            draw(folder, problem, description["name"], seen, trained)
+        print_numbers(map(line, metrics, metrics.values()), title=f"test motions of {problem.name}, f64")
+        print(f"run folder: {folder}")
+        if trained.diverged:
+            raise InputError(f"{trained.stopped}; {folder} holds the best model before that")
+        if trained.stopped:
+            print(trained.stopped)
 
 
 @contextmanager
@@ -76,32 +169,24 @@ def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None
             if show is None or at.stage != current:
                 shown.close()
                 current, show = at.stage, shown.enter_context(progress(stages[at.stage]))
-            show(at.step, f"{at.stage}: loss {at.loss:.2e}  validation {at.validation:.2e}")
+            show(at.step, f"{at.stage}: {losses(at)}")
 
         yield report
 
 
-def announce(console: Console, problem: Problem, description: dict[str, Any]) -> None:
+def announce(problem: Problem, description: dict[str, Any]) -> None:
     """Says what is trained on what, and what was assumed."""
     data = problem.fitted
     trajectories = len(np.unique(data.trajectory))
     needs = problem.needs
     terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
-    console.print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
-    console.print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
+    print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
+    print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
     missing = [key for key in data.estimated if key != "tau"]
     if missing:
-        console.print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
+        print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
     if problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
-        console.print("momenta p are taken as qd, per unit of inertia")
-
-
-def latency_of(folder: Path, problem: Problem) -> dict[str, float]:
-    """Of one call of the rates, of the stored model as a user loads it."""
-    field, truth = load(folder).flow, problem.truth[0]
-    states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
-    found = one_step(field.rates, states, calls=2000)
-    return {"one_step_p50_us": found.p50_us, "one_step_p99_us": found.p99_us}
+        print("momenta p are taken as qd, per unit of inertia")
 
 
 def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
@@ -115,8 +200,8 @@ def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained
     if len(history) > 1:
         best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
         named = [at._replace(stage=LOSSES[at.stage]) for at in history]
-        words = {"error": "loss", "loss": "training loss", "unit": "loss, of each stage in its own units"}
-        write_figure(folder / "training.png", training_curve(named, best_step=best, **words))
+        curve = training_curve(named, best_step=best, unit="loss, of each stage in its own units", **OF_LOSSES)
+        write_figure(folder / "training.png", curve)
 
 
 MEANINGS = {
@@ -131,22 +216,11 @@ MEANINGS = {
 """What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
 OF_STARTS = {"_standard_error": ": its standard error over starts", "_median": ": its median over starts"}
 """What the rest of such a name says."""
-UNITS = {
-    **dict.fromkeys(("train_seconds", "compile_seconds"), "s"),
-    **{f"one_step_{mode}{quantile}_us": "µs" for mode in ("", "low_latency_") for quantile in ("p50", "p99")},
-}
 
 
-def results_table(metrics: dict[str, float], problem: Problem) -> Table:
-    """Of numbers with their units."""
-    table = Table(title=f"test motions of {problem.name}, f64")
-    table.add_column("quantity")
-    table.add_column("value", justify="right")
-    table.add_column("unit")
-    for name, value in metrics.items():
-        if np.isfinite(value):
-            quantity = next((key for key in MEANINGS if name.startswith(key)), None)
-            meaning, unit = MEANINGS[quantity] if quantity else (name, UNITS.get(name, ""))
-            rest = name.removeprefix(quantity or name)
-            table.add_row(meaning.replace("_", " ") + OF_STARTS.get(rest, rest), f"{value:.4g}", unit)
-    return table
+def line(metric: str, value: float) -> tuple[str, str, str]:
+    """A metric in words, its value and its unit."""
+    quantity = next((key for key in MEANINGS if metric.startswith(key)), "")
+    meaning, unit = MEANINGS.get(quantity, (metric, unit_of(metric, {})))
+    rest = metric.removeprefix(quantity or metric)
+    return meaning.replace("_", " ") + OF_STARTS.get(rest, rest), f"{value:.4g}", unit
