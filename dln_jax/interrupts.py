@@ -14,10 +14,11 @@ def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackT
 
 
 def is_command() -> bool:
-    """Whether this process was started as `dln-jax` or `python -m dln_jax`, and not by a program that imports it."""
+    """Whether this process was started as `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`, by no other."""
     words = sys.orig_argv
-    module = words[words.index("-m") + 1 :][:1] if "-m" in words else []
-    return module == ["dln_jax"] or Path(sys.argv[0]).stem == "dln-jax"
+    package, _, name = words[words.index("-m") + 1 :][0].partition(".") if "-m" in words[:-1] else ("", "", "")
+    script = package == "scripts" and (Path(__file__).parent / "commands" / f"{name}.py").is_file()
+    return script or (package == "dln_jax" and not name) or Path(sys.argv[0]).stem == "dln-jax"
 
 
 if is_command():

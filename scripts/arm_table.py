@@ -1,5 +1,3 @@
-"""The command `arm_table` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("arm_table", "python -m scripts.arm_table")

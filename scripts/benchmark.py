@@ -1,5 +1,3 @@
-"""The command `benchmark` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("benchmark", "python -m scripts.benchmark")

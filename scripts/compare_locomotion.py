@@ -1,5 +1,3 @@
-"""The command `compare_locomotion` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("compare_locomotion", "python -m scripts.compare_locomotion")

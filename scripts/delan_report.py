@@ -1,5 +1,3 @@
-"""The command `delan_report` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("delan_report", "python -m scripts.delan_report")

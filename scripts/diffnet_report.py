@@ -1,5 +1,3 @@
-"""The command `diffnet_report` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("diffnet_report", "python -m scripts.diffnet_report")

@@ -1,5 +1,3 @@
-"""The command `export_c` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("export_c", "python -m scripts.export_c")

@@ -1,5 +1,3 @@
-"""The command `hnn_table` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("hnn_table", "python -m scripts.hnn_table")

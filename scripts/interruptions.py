@@ -1,5 +1,3 @@
-"""The command `interruptions` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("interruptions", "python -m scripts.interruptions")

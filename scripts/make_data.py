@@ -1,5 +1,3 @@
-"""The command `make_data` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("make_data", "python -m scripts.make_data")

@@ -1,5 +1,3 @@
-"""The command `simulate` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("simulate", "python -m scripts.simulate")

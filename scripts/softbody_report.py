@@ -1,5 +1,3 @@
-"""The command `softbody_report` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("softbody_report", "python -m scripts.softbody_report")

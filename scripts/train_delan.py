@@ -1,5 +1,3 @@
-"""The command `train_delan` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("train_delan", "python -m scripts.train_delan")

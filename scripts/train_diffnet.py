@@ -1,5 +1,3 @@
-"""The command `train_diffnet` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("train_diffnet", "python -m scripts.train_diffnet")

@@ -1,5 +1,3 @@
-"""The command `train_hnn_pixels` of dln_jax."""
-
 from dln_jax.__main__ import command
 
 command("train_hnn_pixels", "python -m scripts.train_hnn_pixels")

@@ -21,17 +21,18 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.arguments import Unstated, resolved
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import stored_arguments
 from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import write_figure, write_json
+from dln_jax.precision import data_type
 from dln_jax.rollout import rollout
-from dln_jax.runs.simulation_results import Motion, draw, results, results_table, warn
+from dln_jax.runs.results import print_numbers
+from dln_jax.runs.simulation_results import Motion, draw, line, results, warn
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.mesh.mesh import overlaps
@@ -44,12 +45,9 @@ from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 MATERIALS = {
-    "stable-neo-hookean": stable_neo_hookean,
-    "neo-hookean": neo_hookean,
-    "st-venant-kirchhoff": st_venant_kirchhoff,
-    "corotated": corotated,
+    energy.__name__.replace("_", "-"): energy
+    for energy in (stable_neo_hookean, neo_hookean, st_venant_kirchhoff, corotated)
 }
-PRECISIONS = {"f32": jnp.float32, "f64": jnp.float64}
 FACETS = {2: "edges", 3: "triangles"}
 CHUNKS = 20
 """Programs called for a motion, after each of which progress is shown."""
@@ -104,32 +102,25 @@ class Prepared(NamedTuple):
 
 
 def main(given: Arguments) -> None:
-    """Simulates, prints and writes."""
-    names = list(EXAMPLES) if given.scene == ALL else [given.scene]
-    prepared = [prepare(dataclasses.replace(given, scene=name)) for name in names]
+    """Simulates one scene into the run folder, or all, each into a folder of its own, with one picture of them."""
+    several = given.scene == ALL
+    prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
     with run_folder(given.out, "simulate") as folder:
-        simulate_into(folder, prepared)
-
-
-def simulate_into(folder: Path, prepared: list[Prepared]) -> None:
-    """Simulates one scene into the folder, or several, each into a folder of its own, with one picture of them."""
-    console = Console(highlight=False, soft_wrap=True)
-    pictures = []
-    for each in prepared:
-        own = folder if len(prepared) == 1 else folder / each.given.scene
-        own.mkdir(exist_ok=True)
-        pictures.append(simulate(each, own, console))
-    if len(prepared) > 1 and prepared[0].given.figures:
-        gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
-        write_figure(folder / "soft-bodies.png", gallery)
-    console.print(f"run folder: {folder}")
+        pictures = []
+        for each in prepared:
+            own = folder / each.given.scene if several else folder
+            own.mkdir(exist_ok=True)
+            pictures.append(simulate(each, own))
+        if several and given.figures:
+            gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
+            write_figure(folder / "soft-bodies.png", gallery)
+        print(f"run folder: {folder}")
 
 
 def prepare(given: Arguments) -> Prepared:
     """What is to be simulated; every mistake of the command line is found here, before anything is written."""
     example = example_of(given)
-    dt = example.dt if given.dt is None else given.dt
-    seconds = example.seconds if given.seconds is None else given.seconds
+    dt, seconds = resolved(given, {"dt": example.dt, "seconds": example.seconds}).values()
     require_positive(dt=dt, seconds=seconds)
     if not dt <= seconds < math.inf:
         raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
@@ -137,31 +128,27 @@ def prepare(given: Arguments) -> Prepared:
     return Prepared(given, example, stepper, dt, round(seconds / dt))
 
 
-def simulate(prepared: Prepared, folder: Path, console: Console) -> Moments:
+def simulate(prepared: Prepared, folder: Path) -> Moments:
     """Simulates one scene and writes its folder; gives its picture."""
     given, example, _, dt, steps = prepared
     write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
-    console.print(
+    print(
         f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements, "
         f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
     )
     if mesh.turned:
-        console.print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
+        print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
     if count := len(overlaps(mesh)):
-        console.print(
-            f"elements overlap at {count} of their {FACETS[mesh.dimension]}: there, mass and stiffness add up"
-        )
+        print(f"elements overlap at {count} of their {FACETS[mesh.dimension]}: there, mass and stiffness add up")
     motion = run_motion(prepared)
     rows = results(given.scene, mesh, motion)
-    numbers = {row.quantity: row.value for row in rows if math.isfinite(row.value)}
-    write_json(folder / "metrics.json", numbers)
-    facts = conditions(
-        dtype=jnp.dtype(PRECISIONS[given.precision]).name, seeds=[given.seed], integrator=given.integrator, dt=dt
-    )
+    write_json(folder / "metrics.json", {row.quantity: row.value for row in rows if math.isfinite(row.value)})
+    dtype = jnp.dtype(data_type(given.precision)).name
+    facts = conditions(dtype=dtype, seeds=[given.seed], integrator=given.integrator, dt=dt)
     write_report(folder / "report.json", rows, facts)
-    console.print(results_table(rows))
-    warn(motion, console)
+    print_numbers(map(line, rows))
+    warn(motion)
     title = f"{given.scene}: {given.integrator}, dt = {dt:.4g} s"
     return draw(given.scene, example, motion, folder, title=title, figures=given.figures)
 
@@ -173,10 +160,8 @@ def example_of(given: Arguments) -> Example:
         InputError: an unknown name, a choice that the scene does not have, or a value that cannot be.
     """
     scene = EXAMPLES[given.scene]
-    choices: dict[str, Any] = {
-        name: getattr(given, name)
-        for name in ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
-    }
+    names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
+    choices: dict[str, Any] = {name: getattr(given, name) for name in names}
     choices["strain_energy"] = None if given.material is None else MATERIALS[given.material]
     choices = {name: value for name, value in choices.items() if value is not None}
     known = inspect.signature(scene).parameters
@@ -198,7 +183,7 @@ def example_of(given: Arguments) -> Example:
     if "seed" in known:
         choices["seed"] = given.seed
     example = scene(**choices)
-    params = in_precision(example.scene.params, PRECISIONS[given.precision])
+    params = in_precision(example.scene.params, data_type(given.precision))
     return example._replace(scene=example.scene._replace(params=params))
 
 
@@ -212,7 +197,7 @@ def run_motion(prepared: Prepared) -> Motion:
     given, example, (init, step), dt, steps = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params
-    start = state = in_precision(init(), PRECISIONS[given.precision])
+    start = state = in_precision(init(), data_type(given.precision))
 
     def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
         # Whether the Hessian is definite is not asked for: it would cost a factorisation.

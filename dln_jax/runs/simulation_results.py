@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
@@ -44,43 +42,41 @@ class Motion(NamedTuple):
 
 def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
     """What the table shows."""
-    info = motion.info
+    info, iterations = motion.info, motion.info.iterations
     ratios = np.stack([simplex_volumes(x.astype(np.float64), mesh.elements) for x in motion.x]) / volumes(mesh)
-    missed = float((~info.converged).sum())
     numbers = (
         ("steps_per_second", motion.steps_per_second, "1/s", None),
         ("compile_seconds", motion.compile_seconds, "s", None),
-        ("newton_iterations_mean", float(info.iterations.mean()), "1", None),
-        ("newton_iterations_max", float(info.iterations.max()), "1", None),
+        ("newton_iterations_mean", float(iterations.mean()), "1", None),
+        ("newton_iterations_max", float(iterations.max()), "1", None),
         ("worst_residual_m_per_s2", float(info.residual.max()), "m/s²", None),
         ("steps", float(len(info.converged)), "1", None),
-        ("steps_not_converged", missed, "1", 0.0),
+        ("steps_not_converged", float((~info.converged).sum()), "1", 0.0),
         ("smallest_volume_ratio", float(ratios.min()), "1", None),
     )
     return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
 
 
-def results_table(rows: list[Row]) -> Table:
-    """One line per number."""
-    table = Table("quantity", "value", "unit")
-    table.columns[1].justify = "right"
-    labels = {"worst_residual_m_per_s2": "worst residual", "smallest_volume_ratio": "smallest J = volume / rest volume"}
-    for row in rows:
-        label = labels.get(row.quantity, row.quantity.replace("_", " "))
-        table.add_row(label, f"{row.value:.4g}", "" if row.unit == "1" else row.unit)
-    return table
+LABELS = {"worst_residual_m_per_s2": "worst residual", "smallest_volume_ratio": "smallest J = volume / rest volume"}
+"""Of numbers that do not say it themselves."""
 
 
-def warn(motion: Motion, console: Console) -> None:
+def line(row: Row) -> tuple[str, str, str]:
+    """A number in words, its value and its unit."""
+    label = LABELS.get(row.quantity, row.quantity.replace("_", " "))
+    return label, f"{row.value:.4g}", "" if row.unit == "1" else row.unit
+
+
+def warn(motion: Motion) -> None:
     """Says what is not as it should be."""
     missed = np.flatnonzero(~motion.info.converged)
     if missed.size:
-        console.print(
+        print(
             f"warning: {missed.size} of {len(motion.t) - 1} steps did not converge, the first at "
             f"t = {motion.t[missed[0] + 1]:.4g} s: the motion is not to be trusted from there; try a shorter --dt"
         )
     if (finite := finite_moments(motion)) < len(motion.t):
-        console.print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
+        print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
 
 
 def finite_moments(motion: Motion) -> int:

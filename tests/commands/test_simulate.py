@@ -11,7 +11,6 @@ import jax
 import numpy as np
 import pytest
 from calls import command, refused
-from rich.console import Console
 
 from dln_jax.commands import simulate
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
@@ -149,7 +148,7 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     x[3, 0, 0] = np.nan
     motion = Motion(np.arange(4.0), x, np.zeros_like(x), Info(numbers, numbers, converged, converged), 1.0, 1.0)
     assert finite_moments(motion) == 3
-    warn(motion, Console(highlight=False, soft_wrap=True))
+    warn(motion)
     said = capsys.readouterr().out
     assert "1 of 3 steps did not converge, the first at t = 2 s" in said and "not finite from t = 3 s" in said
 
