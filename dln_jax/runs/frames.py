@@ -44,9 +44,9 @@ def run(given: Options, command: str) -> None:
         with progress(optimiser.steps) as show:
             numbers, seen = pixel_task.measure_pixels(
                 kind,
+                data,
                 seed=given.seed,
                 steps=optimiser.steps,
-                trajectories=given.trajectories,
                 checkpoint=Checkpoint(folder, known, given.resume),
                 report=lambda at: show(at.step, losses(at)),
             )
