@@ -44,6 +44,7 @@ def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
     names = chosen_tasks(given)
     counts = {key: getattr(given, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
+    cases(names, folder=None, **counts)  # refuses before anything is written
     with command_folder(given, "hnn_table") as folder:
         chosen = cases(names, folder=folder if given.figures else None, **counts)
         stored = stored_findings(folder, chosen) if given.resume else {}
