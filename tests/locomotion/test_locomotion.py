@@ -202,7 +202,7 @@ def test_the_actor_is_the_network_of_tanh_layers(task):
 
 
 def test_vector_lanes_are_single_environments(task, environment):
-    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("stable_baselines3", reason="PPO needs the extra [rl]")
     from dln_jax.locomotion.vector_environment import VectorEnvironment
 
     lanes = VectorEnvironment(task, 2, reward_scale=10.0)
