@@ -25,7 +25,11 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.02)
 # Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
 
-QUICKLY = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
+QUICKLY = [
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
+    "--xla_cpu_parallel_codegen_split_count=1",  # the test processes have the cores
+]
 if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at what they do not know
     QUICKLY.append("--xla_cpu_use_fusion_emitters=false")
 

@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_type_hints
 
 import numpy as np
 import pytest
@@ -28,9 +28,10 @@ PAGES = {path.name: path.read_text() for path in [ROOT / "README.md", *sorted((R
 PROSE = {name: re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE) for name, text in PAGES.items()}
 MOST_WORDS = 900
 """Of the README."""
+BARE = "--no-figures --no-low-latency"
 SMALL = {
-    "train_delan": "--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 --no-figures",
-    "train_hnn_task": "--steps 2 --no-figures --no-low-latency",
+    "train_delan": f"--optimizer adam --precision f64 --steps 40 --width 4 --depth 1 --batch 64 {BARE}",
+    "train_hnn_task": f"--steps 2 {BARE}",
     "export_c": "",
 }
 """Put behind what a page gives, so that a command runs for a second: what is printed there stays as it is."""
@@ -107,8 +108,14 @@ def test_a_command_of_a_block_runs(words, workplace):
 
 @pytest.mark.parametrize("text", sorted(INLINE))
 def test_a_command_in_the_text_parses(text):
-    script, arguments = script_and_arguments(shlex.split(text))
-    tyro.cli(script.Arguments, args=arguments)
+    script, words = script_and_arguments(shlex.split(text))
+    given = tyro.cli(script.Arguments, args=words)
+    for name, hint in get_type_hints(script.Arguments, include_extras=True).items():
+        for shown in (getattr(each, "metavar", None) for each in getattr(hint, "__metadata__", ())):
+            if shown and shown.startswith("{"):
+                known = re.match(r"{(.*?)}", shown)[1].split(",")
+                named = [each for each in str(getattr(given, name)).split(",") if not each.endswith(".npz")]
+                assert set(named) <= {*known, "None"}, name
 
 
 @pytest.mark.parametrize("block", blocks("python"), ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}")
