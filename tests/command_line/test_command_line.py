@@ -154,8 +154,9 @@ WAYS = ("console", "package", "script")
 
 @pytest.mark.parametrize("way", WAYS)
 def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
-    """The first import of the command waits, so that the interrupt meets it."""
-    (tmp_path / "jax.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    """The first import of the command waits, so that the interrupt meets it, also of a parent that ignores its own."""
+    heard = "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    (tmp_path / "jax.py").write_text(f"{heard}print('importing', flush=True)\ntime.sleep(60)\n")
     with subprocess.Popen(
         [sys.executable, *ways(tmp_path)[way]],
         cwd=ROOT,
