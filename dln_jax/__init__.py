@@ -25,7 +25,7 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
-from dln_jax.models.delan import make_delan
+from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe

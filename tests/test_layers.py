@@ -77,6 +77,6 @@ def test_imports_point_down(module):
 
 def test_an_arrow_that_points_up_is_seen():
     assert faults("mechanics", "from dln_jax.models import delan") == ["models"]
-    assert faults("scenes", "import dln_jax.models.delan") == ["models"]
+    assert faults("scenes", "import dln_jax.models.lagrangian") == ["models"]
     assert faults("nn", "import scripts.train_delan") == ["scripts"]
     assert not faults("models", "from dln_jax.mechanics import natural")

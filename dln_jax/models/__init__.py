@@ -1,16 +1,17 @@
 """Energies made of networks, built from what a scene needs."""
 
-from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.delan import make_delan
+from dln_jax.models.baselines import make_feed_forward, make_phase_network
 from dln_jax.models.dissipative import make_dissipative
-from dln_jax.models.feed_forward import make_feed_forward
-from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
+from dln_jax.models.hamiltonian import (
+    make_black_box_hamiltonian,
+    make_separable_hamiltonian,
+    make_structured_hamiltonian,
+)
+from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.latent_phase import make_latent_phase
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.n_body import make_pairwise_hamiltonian
-from dln_jax.models.phase_network import make_phase_network
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
-from dln_jax.models.separable import make_separable_hamiltonian
 from dln_jax.models.trigonometric import make_trigonometric
 
 __all__ = [

@@ -10,8 +10,8 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.equations import Canonical
-from dln_jax.models.features import joint_features
 from dln_jax.models.model import Model, Parameters
+from dln_jax.models.networks import joint_features, perceptron
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
@@ -46,7 +46,7 @@ def make_dissipative(
     @hk.without_apply_rng
     @hk.transform
     def coefficients(q: Vector) -> Vector:
-        layers = hk.nets.MLP([width] * depth + [d], activation=activation.value, name="friction")
+        layers = perceptron("friction", width, depth, d, activation)
         return jax.nn.softplus(layers(joint_features(needs, q)) + shift)
 
     def init(key: Array) -> Parameters:

@@ -1,25 +1,30 @@
-"""Hamiltonian neural networks, structured and black-box (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural
-Networks"; the structured one as in Lutter and Peters 2021, who let a network give the inverse mass matrix).
+"""Hamiltonian neural networks, structured, black-box and separable.
 
     structured:  H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:   H = network([features(q), p / momentum_scale])
+    separable:   H = T(p / momentum_scale) + V(features(q)), a network each
 
-`mechanics.equations.flow` turns both into Hamilton's equations, and `dynamics` into those in velocities.
+The black-box one is of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"; the structured one as in
+Lutter and Peters 2021, who let a network give the inverse mass matrix; the separable one as in Chen et al. 2020,
+"Symplectic recurrent neural networks". No product of q and p can be learned by the separable one, so that explicit
+symplectic steps (`mechanics.integrators.stormer_verlet`) apply to it; it fits systems with a constant mass matrix,
+whatever the kinetic energy.
+
+`mechanics.equations.flow` turns all into Hamilton's equations, and `dynamics` into those in velocities.
 """
 
 from functools import partial
 
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics.hamiltonian import Guess, HamiltonianSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
-from dln_jax.models.black_box import Scale, one_network, per_coordinate
-from dln_jax.models.delan import structured_networks
+from dln_jax.models.lagrangian import one_network, structured_networks
 from dln_jax.models.model import Model, model_of
+from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import Needs, require_positive
+from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
 def make_structured_hamiltonian(
@@ -43,7 +48,7 @@ def make_structured_hamiltonian(
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
     )
-    return model_of(NaturalHamiltonian, terms, np.zeros(needs.degrees_of_freedom), dtype)
+    return model_of(NaturalHamiltonian, terms, needs.degrees_of_freedom, dtype)
 
 
 def make_black_box_hamiltonian(
@@ -73,4 +78,48 @@ def make_black_box_hamiltonian(
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     terms = partial(one_network, needs, "hamiltonian", width, depth, activation, momenta)
     record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
-    return model_of(record, terms, np.zeros(needs.degrees_of_freedom), dtype)
+    return model_of(record, terms, needs.degrees_of_freedom, dtype)
+
+
+def make_separable_hamiltonian(
+    needs: Needs,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation = tanh,
+    momentum_scale: Scale = 1.0,
+    iterations: int = 8,
+    initial_guess: Guess | None = None,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """The (init, apply) pair of T(p) + V(q).
+
+    Without gravity there is no V. Momenta and activation are as for `make_black_box_hamiltonian`.
+
+    Args:
+        momentum_scale: typical size of p, which enters the network divided by it.
+        iterations: Newton steps to p(qd), as in `mechanics.hamiltonian.conjugate`.
+        initial_guess: (q, qd) -> p [d] where they start; zero by default.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
+    """
+    require_positive(width=width, depth=depth, iterations=iterations)
+    momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
+
+    def kinetic(p: Vector) -> Scalar:
+        return perceptron("kinetic", width, depth, 1, activation)(p / jnp.asarray(momenta, p.dtype))[0]
+
+    def potential(q: Vector) -> Scalar:
+        return perceptron("potential", width, depth, 1, activation)(joint_features(needs, q))[0]
+
+    def energies(kinetic, potential=None, dissipation=None) -> HamiltonianSystem:
+        def total(q: Vector, p: Vector) -> Scalar:
+            return kinetic(p) if potential is None else kinetic(p) + potential(q)
+
+        return HamiltonianSystem(total, dissipation, iterations, initial_guess)
+
+    terms = {
+        "kinetic": kinetic,
+        "potential": potential if needs.gravity else None,
+        "dissipation": viscous_dissipation if needs.friction else None,
+    }
+    return model_of(energies, lambda: terms, needs.degrees_of_freedom, dtype)

@@ -31,9 +31,9 @@ from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.phase_network import make_phase_network
 from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
 from dln_jax.types import InputError, Needs, require_positive

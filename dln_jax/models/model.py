@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import haiku as hk
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 Parameters = Any
@@ -33,14 +34,14 @@ class Model(NamedTuple):
 
 
 def model_of(
-    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], start: Any, dtype: Any
+    record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], d: int, dtype: Any
 ) -> Model:
     """The model whose energies are `record(**terms)`.
 
     Args:
         record: of functions of one state; what the scene lacks is not handed to it.
         terms: builds Haiku modules, and gives by name the functions that use them; `None` for what is absent.
-        start: q [d], which stands for every argument where the parameters are made.
+        d: degrees of freedom. Where the parameters are made every argument is (0, 1, ..), where no two bodies meet.
         dtype: of the parameters.
     """
 
@@ -55,7 +56,7 @@ def model_of(
 
     networks = hk.without_apply_rng(hk.multi_transform(build))
     return Model(
-        init=lambda key: networks.init(key, jnp.asarray(start, dtype)),
+        init=lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)),
         energies=lambda parameters: record(
             **{name: partial(each, parameters) for name, each in networks.apply.items()}
         ),

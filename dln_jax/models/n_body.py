@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.models.model import Model, model_of
+from dln_jax.models.networks import perceptron
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
@@ -64,7 +65,7 @@ def make_pairwise_hamiltonian(
 
     def pair_energies(r: Float[Array, " pairs"]) -> Float[Array, "pairs kinds"]:
         seen = jnp.stack([FEATURES[name](r / distance_scale) for name in features], axis=1)
-        network = hk.nets.MLP([width] * depth + [kinds], activation=activation.value, name="pair")
+        network = perceptron("pair", width, depth, kinds, activation)
         return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + network(seen)
 
     def potential(q: Vector) -> Scalar:
@@ -77,7 +78,5 @@ def make_pairwise_hamiltonian(
         logarithm = hk.get_parameter("log_mass", (1 if alike else bodies,), q.dtype, hk.initializers.Constant(0.0))
         return jnp.diag(jnp.repeat(jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,))), dimension))
 
-    # Where the parameters are made all bodies stand apart, so that no feature is infinite.
-    start = np.arange(bodies * dimension)
     terms = {"potential": potential, "inverse_factor": inverse_factor}
-    return model_of(NaturalHamiltonian, lambda: terms, start, dtype)
+    return model_of(NaturalHamiltonian, lambda: terms, bodies * dimension, dtype)

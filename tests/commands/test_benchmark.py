@@ -15,7 +15,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.models.delan import make_delan
+from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.studies.arm.models import described
 from dln_jax.studies.arm.table import letters, published_split

@@ -15,7 +15,7 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Stop
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.models.delan import make_delan
+from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm

@@ -15,11 +15,10 @@ from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
+from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.dissipative import make_dissipative
-from dln_jax.models.hamiltonian import make_black_box_hamiltonian
-from dln_jax.models.phase_network import make_phase_network
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_separable_hamiltonian
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
-from dln_jax.models.separable import make_separable_hamiltonian
 from dln_jax.types import InputError, Needs
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)

@@ -11,9 +11,9 @@ from dln_jax.mechanics.equations import dynamics, flow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
-from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.feed_forward import make_feed_forward
+from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
+from dln_jax.models.lagrangian import make_black_box_lagrangian
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.run import compiled
 

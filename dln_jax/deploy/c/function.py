@@ -75,7 +75,7 @@ def source(layers: Layers, precision: str) -> str:
 
 
 def feed_forward_source(description: dict[str, Any], parameters: Any, needs: Needs, precision: str) -> str:
-    """Body of the C source of the two networks of `models.feed_forward`."""
+    """Body of the C source of the two networks of `models.baselines`."""
     d, features = needs.degrees_of_freedom, c_networks.feature_count(needs)
     text = [f"enum {{ D = {d}, FEATURES = {features} }};\n\n/* Typical sizes of qd, qdd and tau */\n"]
     scales = {"qdd": "acceleration_scale", "tau": "tau_scale"}

@@ -1,6 +1,6 @@
 """Networks as C functions: value, rate along a direction, pull-back of a covector, curvature; and their inputs.
 
-What a network sees of the coordinates is `models.features.joint_features`.
+What a network sees of the coordinates is `models.networks.joint_features`.
 
 The layer rules are those of `nn.differential_mlp`. With a_l = h_(l-1) W_l + b_l and h_l = g(a_l):
 
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.deploy.c.text import table
-from dln_jax.models.black_box import per_coordinate
+from dln_jax.models.networks import per_coordinate
 from dln_jax.types import Needs
 
 _LANES = 8

@@ -17,7 +17,7 @@ from dln_jax.figures.benchmarks import cost_curves, cost_panels
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import NaturalSystem, lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
-from dln_jax.models.delan import make_delan
+from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row

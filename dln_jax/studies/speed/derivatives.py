@@ -15,7 +15,7 @@ from jax import Array
 
 from dln_jax.mechanics import natural
 from dln_jax.metrics.latency import medians_in_turns
-from dln_jax.models.delan import cholesky_factor
+from dln_jax.models.lagrangian import cholesky_factor
 from dln_jax.nn import differential_mlp as network
 from dln_jax.nn.activations import tanh
 from dln_jax.studies.case import Case, Findings

@@ -20,8 +20,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.metrics.definiteness import definiteness
-from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.delan import make_delan
+from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.scenes.chain import chain
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, expect, largest

@@ -14,9 +14,8 @@ from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.delan import make_delan
-from dln_jax.models.feed_forward import make_feed_forward
+from dln_jax.models.baselines import make_feed_forward
+from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.double_pendulum import double_pendulum

@@ -17,9 +17,8 @@ import numpy as np
 
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.black_box import make_black_box_lagrangian
-from dln_jax.models.delan import make_delan
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
+from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.nn.activations import activation
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.studies.case import Findings

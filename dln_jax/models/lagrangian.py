@@ -1,29 +1,33 @@
-"""Structured deep Lagrangian network (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks").
+"""Deep Lagrangian networks, structured and black-box.
 
-One network gives the Cholesky factor of the mass matrix, another the potential:
+    structured:  L = ½ qdᵀ M(q) qd - V(q),  M = L(q) L(q)ᵀ,  diag L = softplus(x + shift) + floor
+    black-box:   L = network([features(q), qd / rate_scale])
 
-    T = ½ qdᵀ M(q) qd,  M = L(q) L(q)ᵀ,  diag L = softplus(x + shift) + floor,  V = V(q)
+The structured one (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks") has a network for the Cholesky factor
+of the mass matrix and another for the potential. What the scene lacks is not built: no potential network without
+gravity, no dissipation without friction, no cos and sin for prismatic joints.
 
-What the scene lacks is not built: no potential network without gravity, no dissipation without friction, no cos and
-sin for prismatic joints.
+The black-box one (Lutter and Peters 2021, "Combining physics and deep learning to learn continuous-time dynamics
+models", section on black-box models) has no structure. Its mass matrix d²L/dqd² is symmetric and nothing more:
+`metrics.definiteness` reports where it is indefinite.
 """
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import haiku as hk
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
-from dln_jax.models.features import joint_features
 from dln_jax.models.model import Model, model_of
+from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import Matrix, Needs, Scalar, Vector
+from dln_jax.types import Matrix, Needs, Scalar, Vector, require_positive
 
 
 def make_delan(
@@ -49,19 +53,36 @@ def make_delan(
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
-    return model_of(NaturalSystem, terms, np.zeros(needs.degrees_of_freedom), dtype)
+    return model_of(NaturalSystem, terms, needs.degrees_of_freedom, dtype)
+
+
+def make_black_box_lagrangian(
+    needs: Needs,
+    *,
+    width: int = 64,
+    depth: int = 2,
+    activation: Activation = tanh,
+    rate_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """The (init, apply) pair of a black-box Lagrangian network; one network, so that absent gravity leaves nothing out.
+
+    The activation needs curvature in qd, since M is the second derivative.
+
+    Args:
+        rate_scale: typical size of qd, which enters the network divided by it.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
+    """
+    require_positive(width=width, depth=depth)
+    rates = per_coordinate(needs, "rate_scale", rate_scale)
+    terms = partial(one_network, needs, "lagrangian", width, depth, activation, rates)
+    return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
 
 
 def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
     """Lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the rest of the entries below it."""
     diagonal = jax.nn.softplus(entries[:d] + shift) + floor
     return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
-
-
-def viscous_dissipation(q: Vector, qd: Vector) -> Scalar:
-    """D = ½ Σ b qd², with one learned coefficient b = softplus(x) > 0 per coordinate; inside a transformed function."""
-    coefficients = hk.get_parameter("viscous_friction", qd.shape, qd.dtype, hk.initializers.Constant(-3.0))
-    return 0.5 * jnp.sum(jax.nn.softplus(coefficients) * qd**2)
 
 
 def structured_networks(
@@ -81,7 +102,7 @@ def structured_networks(
     shared = shared_trunk and needs.gravity
 
     def network(name: str, outputs: int):
-        layers = hk.nets.MLP([width] * depth + [outputs], activation=activation.value, name=name)
+        layers = perceptron(name, width, depth, outputs, activation)
         return lambda q: layers(joint_features(needs, q))
 
     first = network("energies", entries + 1) if shared else network("cholesky", entries)
@@ -98,3 +119,15 @@ def structured_networks(
         "potential": potential if needs.gravity else None,
         "dissipation": viscous_dissipation if needs.friction else None,
     }
+
+
+def one_network(
+    needs: Needs, name: str, width: int, depth: int, activation: Activation, sizes: tuple[float, ...]
+) -> dict[str, Callable[[Vector, Vector], Scalar] | None]:
+    """By `name`, the energy network([features(q), x / sizes]) -> scalar; and the dissipation."""
+
+    def energy(q: Vector, x: Vector) -> Scalar:
+        inputs = jnp.concatenate([joint_features(needs, q), x / jnp.asarray(sizes, x.dtype)])
+        return perceptron(name, width, depth, 1, activation)(inputs)[0]
+
+    return {name: energy, "dissipation": viscous_dissipation if needs.friction else None}
