@@ -17,9 +17,8 @@ from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem

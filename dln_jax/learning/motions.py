@@ -25,8 +25,8 @@ from jaxtyping import Float
 from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow
-from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.elimination import solve

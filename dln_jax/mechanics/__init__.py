@@ -5,9 +5,8 @@
 
 from dln_jax.mechanics import equations, integrators
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import hamiltonian_of
-from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem

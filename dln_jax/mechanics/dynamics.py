@@ -1,4 +1,4 @@
-"""What every mechanical system answers, whatever energy it comes from."""
+"""What every mechanical system answers, whatever energy it comes from: under forces, and in a phase space."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -54,6 +54,26 @@ class PlainDynamics(NamedTuple):
     """(q, qd, tau) -> qdd [d]."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
     """(q, qd, qdd) -> inertial, Coriolis and gravity force; friction counts as Coriolis force."""
+
+
+Rates = Callable[[VectorLike, VectorLike], tuple[Array, Array]]
+"""(q, p) -> (qd, pd), each [d]."""
+
+
+class Flow(NamedTuple):
+    """What an energy answers in coordinates and momenta, without applied forces; otherwise as `Dynamics`."""
+
+    rates: Rates
+    """(q, p) -> (qd, pd), each [d]."""
+    energy: Callable[[VectorLike, VectorLike], Array]
+    """(q, p) -> H, scalar."""
+
+
+class PlainFlow(NamedTuple):
+    """What moves without an energy."""
+
+    rates: Rates
+    """(q, p) -> (qd, pd), each [d]."""
 
 
 def make_dynamics(

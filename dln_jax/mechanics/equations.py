@@ -20,8 +20,7 @@ import jax.numpy as jnp
 from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.flow import Flow, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem

@@ -120,41 +120,39 @@ def conjugate(
     return x * jnp.where(converged > 0, 1, jnp.nan).astype(x.dtype)
 
 
-def legendre(energy: Energy, *, iterations: int | None = None, initial_guess: Guess | None = None) -> Energy:
+def legendre(energy: Energy, *, iterations: int | None = None) -> Energy:
     """H(q, p) = p·qd - L(q, qd) of a Lagrangian, and L(q, qd) of a Hamiltonian: the transform is its own inverse.
 
-    Keywords as for `conjugate`; `initial_guess` is not differentiated, and must not close over what is.
+    `iterations` as for `conjugate`.
     """
     _require_iterations(iterations)
 
     def transform(q: Vector, slope: Vector) -> Scalar:
         # What the energy closes over becomes arguments, which a function with its own derivative rule needs.
         function, closed_over = jax.closure_convert(energy, q, slope)
-        return _legendre(function, iterations, initial_guess, q, slope, *closed_over)
+        return _legendre(function, iterations, q, slope, *closed_over)
 
     return transform
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
-def _legendre(function, iterations, initial_guess, q, slope, *closed_over):
-    x = _conjugate(function, iterations, initial_guess, q, slope, *closed_over)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _legendre(function, iterations, q, slope, *closed_over):
+    x = _conjugate(function, iterations, q, slope, *closed_over)
     return jnp.dot(x, slope) - function(q, x, *closed_over)
 
 
 @_legendre.defjvp
-def _legendre_jvp(function, iterations, initial_guess, primals, tangents):
+def _legendre_jvp(function, iterations, primals, tangents):
     """The envelope theorem: dx drops out of the first derivative, which leaves no solve to differentiate."""
     q, slope, *closed_over = primals
     q_dot, slope_dot, *closed_over_dot = tangents
-    x = _conjugate(function, iterations, initial_guess, *primals)
+    x = _conjugate(function, iterations, *primals)
     value, rate = jax.jvp(lambda q, *rest: function(q, x, *rest), (q, *closed_over), (q_dot, *closed_over_dot))
     return jnp.dot(x, slope) - value, jnp.dot(x, slope_dot) - rate
 
 
-def _conjugate(function, iterations, initial_guess, q, slope, *closed_over):
-    return conjugate(
-        lambda q, x: function(q, x, *closed_over), q, slope, iterations=iterations, initial_guess=initial_guess
-    )
+def _conjugate(function, iterations, q, slope, *closed_over):
+    return conjugate(lambda q, x: function(q, x, *closed_over), q, slope, iterations=iterations)
 
 
 def _require_iterations(iterations: int | None) -> None:

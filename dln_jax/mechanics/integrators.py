@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float
 
 from dln_jax.rollout import rollout as steps_in_turn
 from dln_jax.solvers.newton import find_root
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import require_positive
 
 State = Any
 """A pytree of real arrays, such as (q, qd) or (q, p)."""
@@ -188,8 +188,7 @@ def adaptive_rollout(
     """
     import diffrax  # here, since it takes longer to import than the rest of this package
 
-    if not tolerance > 0:
-        raise InputError(f"tolerance is {tolerance}; expected a positive number")
+    require_positive(tolerance=tolerance)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, state, _: field(t, state)),
         diffrax.Dopri8(),

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, pictures, render, rod
+from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import flow
-from dln_jax.mechanics.flow import Flow
 from dln_jax.mechanics.integrators import advance, rk4, rollout, second_order
 from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, summary
 from dln_jax.models.latent_phase import LatentModel

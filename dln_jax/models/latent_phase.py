@@ -27,8 +27,8 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow
-from dln_jax.mechanics.flow import Flow, PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.baselines import make_phase_network
@@ -94,29 +94,26 @@ def latent_field(
     # Written out, so that no change of their defaults changes a stored model.
     size["momentum_scale"] = 1.0
     if name == "black-box-hnn":
-        return _slowed(make_black_box_hamiltonian(NEEDS, **size), momentum_scale)
-    return _slowed(make_phase_network(NEEDS, **size, rate_scale=1.0), momentum_scale)
+        model, slowed = make_black_box_hamiltonian(NEEDS, **size), _slowed_energy
+    else:
+        model, slowed = make_phase_network(NEEDS, **size, rate_scale=1.0), _slowed_rates
+    return Model(model.init, lambda parameters: slowed(model.energies(parameters), momentum_scale))
 
 
-def _slowed(model: Model, rate: float) -> Model:
-    """A model whose states and rates are about one, for motions that take 1 / rate frames for what takes it one.
+# The models' states and rates are about one, and their motions take 1 / rate frames for what takes them one. With
+# P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
 
-    With P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
-    """
 
-    def energies(parameters: Parameters) -> HamiltonianSystem | PhaseRates:
-        inner = model.energies(parameters)
-        if isinstance(inner, HamiltonianSystem):
-            return HamiltonianSystem(lambda q, p: rate**2 * inner.hamiltonian(q, p / rate))
-        assert isinstance(inner, PhaseRates)
+def _slowed_energy(system: HamiltonianSystem, rate: float) -> HamiltonianSystem:
+    return HamiltonianSystem(lambda q, p: rate**2 * system.hamiltonian(q, p / rate))
 
-        def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
-            qd, pd = inner.rates(q, p / rate)
-            return rate * qd, rate**2 * pd
 
-        return PhaseRates(rates)
+def _slowed_rates(system: PhaseRates, rate: float) -> PhaseRates:
+    def rates(q: Latent, p: Latent) -> tuple[Latent, Latent]:
+        qd, pd = system.rates(q, p / rate)
+        return rate * qd, rate**2 * pd
 
-    return Model(model.init, energies)
+    return PhaseRates(rates)
 
 
 def make_latent_phase(

@@ -10,7 +10,6 @@ shows. Hamilton's equations are linear in c, so that rates of states identify it
 
 import itertools
 import math
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,14 +23,6 @@ from dln_jax.types import InputError, Needs, Scalar, Vector
 
 MOST_TERMS = 5_000
 """Of the energy; the fit's cost grows with their square."""
-
-
-class _Choice(NamedTuple):
-    """One factor of a term: a function of one variable."""
-
-    degree: int
-    place: int
-    """In the table of that variable's functions."""
 
 
 def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> Model:
@@ -51,18 +42,18 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     if degree < 2:
         raise InputError(f"degree is {degree}; expected at least 2, since kinetic energy is quadratic in p")
     d = needs.degrees_of_freedom
-    # Functions of one variable: 1, then x^n, or cos nx and sin nx.
-    powers = [_Choice(n, n) for n in range(degree + 1)]
-    harmonics = [_Choice((n + 1) // 2, n) for n in range(2 * degree + 1)]
+    # Degrees of the functions of one variable, in the order of its table: 1, then x^n, or cos nx and sin nx.
+    powers = list(range(degree + 1))
+    harmonics = [(place + 1) // 2 for place in range(2 * degree + 1)]
     choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d
     most = math.prod(len(each) for each in choices)
     if most > MOST_TERMS * 100:
         raise InputError(f"{d} coordinates to degree {degree} make too many terms; lower the degree")
     terms = np.array(
         [
-            [factor.place for factor in term]
-            for term in itertools.product(*choices)
-            if 0 < sum(factor.degree for factor in term) <= degree
+            [place for place, _ in term]
+            for term in itertools.product(*map(enumerate, choices))
+            if 0 < sum(order for _, order in term) <= degree
         ]
     )
     if len(terms) > MOST_TERMS:

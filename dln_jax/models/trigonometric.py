@@ -71,10 +71,8 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
     if len(degrees) != d or not all(isinstance(n, int) and n >= 0 for n in degrees):
         raise InputError(f"degree is {degree}; expected a whole number >= 0, or one for each of the {d} joints")
     mass_basis = functools.partial(basis, needs.joints, degrees)
-    potential_degrees = tuple(
-        max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)
-    )
-    potential_basis = functools.partial(basis, needs.joints, potential_degrees)
+    spring_degrees = potential_degrees(needs.joints, degrees)
+    potential_basis = functools.partial(basis, needs.joints, spring_degrees)
     rows, columns = np.tril_indices(d)
     # (i, j) and (j, i) of M read the same row of coefficients.
     entry = np.zeros((d, d), int)
@@ -90,7 +88,7 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
     def init(key: Array) -> TrigonometricParameters:
         identity = np.zeros((entries, functions))
         identity[rows == columns, 0] = 1.0
-        potential = jnp.zeros(_size(needs.joints, potential_degrees) - 1, dtype)
+        potential = jnp.zeros(_size(needs.joints, spring_degrees) - 1, dtype)
         return TrigonometricParameters(
             mass=jnp.asarray(identity, dtype),
             potential=potential if needs.gravity else None,
@@ -98,6 +96,11 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
         )
 
     return Model(init, lambda parameters: _closed_form(parameters, entry, mass_basis, potential_basis))
+
+
+def potential_degrees(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> tuple[int, ...]:
+    """Degrees of the potential's basis, which holds a linear spring in each prismatic displacement."""
+    return tuple(max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(joints, degrees, strict=True))
 
 
 def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:

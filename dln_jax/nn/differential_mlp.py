@@ -72,38 +72,29 @@ def layer_shapes(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 def value(layers: Layers, x: Array, *, activation: Activation) -> Float[Array, "m"]:
     """y [m] at x [n]. Raises InputError if x or the layers have the wrong shape."""
-    _check(layers, x)
-    _, hidden = _hidden(layers, x, activation)
-    weight, bias = layers[-1]
-    return hidden @ weight + bias
+    return _forward(layers, x, activation)[2]
 
 
 def value_and_jacobian(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Float[Array, "m n"]]:
     """y [m] and dy/dx [m, n] at x [n]. Raises InputError if x or the layers have the wrong shape."""
-    sizes = _check(layers, x)
-    preactivations, hidden = _hidden(layers, x, activation)
-    weight, bias = layers[-1]
+    sizes, preactivations, y = _forward(layers, x, activation)
     if cheaper_jacobian(sizes) == "backward":
-        jacobian = _each_output(lambda adjoint: _gradient(layers, preactivations, adjoint, activation), weight)
+        jacobian = _each_output(lambda adjoint: _gradient(layers, preactivations, adjoint, activation), layers[-1][0])
     else:
         jacobian = _input_jacobians(layers, preactivations, activation)[-1].T
-    return hidden @ weight + bias, jacobian
+    return y, jacobian
 
 
 def value_jacobian_and_hessian(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Float[Array, "m n"], Float[Array, "m n n"]]:
     """y [m], dy/dx [m, n] and d²y/dx² [m, n, n] at x [n]. Raises InputError if a shape is wrong."""
-    sizes = _check(layers, x)
-    preactivations, hidden = _hidden(layers, x, activation)
-    weight, bias = layers[-1]
-    if cheaper_hessian(sizes) == "backward":
-        jacobian, hessian = _derivatives_by_two_sweeps(layers, preactivations, activation)
-    else:
-        jacobian, hessian = _derivatives_by_forward_sweep(layers, preactivations, activation)
-    return hidden @ weight + bias, jacobian, hessian
+    sizes, preactivations, y = _forward(layers, x, activation)
+    backward = cheaper_hessian(sizes) == "backward"
+    derivatives = _derivatives_by_two_sweeps if backward else _derivatives_by_forward_sweep
+    return y, *derivatives(layers, preactivations, activation)
 
 
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
@@ -148,13 +139,15 @@ def _check(layers: Layers, x: Array) -> tuple[int, ...]:
     return sizes
 
 
-def _hidden(layers: Layers, x: Array, activation: Activation) -> tuple[list[Array], Array]:
-    """Preactivations a_l of the hidden layers, and h_L."""
+def _forward(layers: Layers, x: Array, activation: Activation) -> tuple[tuple[int, ...], list[Array], Array]:
+    """Sizes, preactivations a_l of the hidden layers, and y."""
+    sizes = _check(layers, x)
     preactivations, hidden = [], x
     for weight, bias in layers[:-1]:
         preactivations.append(hidden @ weight + bias)
         hidden = activation.value(preactivations[-1])
-    return preactivations, hidden
+    weight, bias = layers[-1]
+    return sizes, preactivations, hidden @ weight + bias
 
 
 def _input_jacobians(layers: Layers, preactivations: list[Array], activation: Activation) -> list[Array]:

@@ -16,9 +16,6 @@ from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import BACKWARD_EULER, Integrator, Stepper, make_step
 from dln_jax.solvers.newton import Info
 
-Path = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k dim"]]
-Signal = Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T k"]]
-
 
 class Example(NamedTuple):
     """A scene, how it begins, and what drives it."""
@@ -32,10 +29,10 @@ class Example(NamedTuple):
     """Velocities at the start in m/s, [n, dim] or one for all; positions are the rest shape's."""
     ground: float | None = None
     """Rise of the ground over its run; it passes through the origin. `None` where there is none."""
-    control: Signal | None = None
-    """Actuation at the times given, in s."""
-    held_path: Path | None = None
-    """Where held vertices are at the times given, in s; without it they stay."""
+    control: Callable[[np.ndarray], np.ndarray] | None = None
+    """Times [T] in s -> actuation [T, k]."""
+    held_path: Callable[[np.ndarray], np.ndarray] | None = None
+    """Times [T] in s -> where held vertices are [T, k, dim]; without it they stay."""
     muscles: np.ndarray | None = None
     """Pairs of vertices [k, 2], for pictures."""
     moments: tuple[float, ...] = (0.0,)

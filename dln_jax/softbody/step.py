@@ -45,19 +45,24 @@ class Integrator(NamedTuple):
     """Whether it needs the state before."""
 
 
-def _bdf2_target(state: State, dt: Any) -> tuple[Array, Array]:
-    x, v, previous = state
-    if previous is None:
+def _previous(state: State) -> Previous:
+    if state.previous is None:
         raise InputError("the state has no room for the state before; make it by the `init` beside this step")
+    return state.previous
+
+
+def _bdf2_target(state: State, dt: Any) -> tuple[Array, Array]:
+    x, v, _ = state
+    previous = _previous(state)
     h = jnp.where(previous.known, 2 / 3 * dt, dt).astype(x.dtype)
     y = (4 * x - previous.x + h * (4 * v - previous.v)) / 3
     return h, jnp.where(previous.known, y, x + dt * v)
 
 
 def _bdf2_finish(state: State, x: Array, dt: Any) -> tuple[Array, Array]:
-    assert state.previous is not None  # as the target has seen
-    v = (3 * x - 4 * state.x + state.previous.x) / (2 * dt)
-    return x, jnp.where(state.previous.known, v, (x - state.x) / dt)
+    previous = _previous(state)
+    v = (3 * x - 4 * state.x + previous.x) / (2 * dt)
+    return x, jnp.where(previous.known, v, (x - state.x) / dt)
 
 
 BACKWARD_EULER = Integrator(

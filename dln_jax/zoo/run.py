@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from dln_jax.mechanics import equations
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.flow import Flow, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters

@@ -13,8 +13,8 @@ from dln_jax.commands import hnn_table, train_hnn, train_hnn_task
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
-from dln_jax.mechanics.flow import Flow
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.studies.case import Findings, rows_of
 from dln_jax.studies.hamiltonian import pixels as pixel_task

@@ -16,8 +16,8 @@ from dln_jax.learning import frames as learning_frames
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.frames import Matching, Weights, problem, terms, windows
+from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import flow
-from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.integrators import rk4, rollout
 from dln_jax.metrics import frames as frame_metrics

@@ -11,8 +11,8 @@ from dln_jax.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.rates import match_linear, problem
+from dln_jax.mechanics.dynamics import PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.metrics import phase_space as phase_metrics
 from dln_jax.models.baselines import make_phase_network

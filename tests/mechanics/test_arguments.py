@@ -15,9 +15,8 @@ from dln_jax.deploy.c.load import CDynamics, load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.deploy.export_stablehlo import export_stablehlo
 from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
-from dln_jax.mechanics.flow import PlainFlow
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem

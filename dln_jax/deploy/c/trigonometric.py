@@ -7,7 +7,7 @@ import numpy as np
 
 from dln_jax.deploy.c.interface import definitions
 from dln_jax.deploy.c.text import friction_table, table
-from dln_jax.models.trigonometric import SPRING_DEGREE
+from dln_jax.models.trigonometric import potential_degrees
 from dln_jax.types import Needs
 
 _MOTION = """
@@ -87,9 +87,7 @@ def source(description: dict[str, Any], parameters: Any, needs: Needs, precision
         coefficients = np.concatenate([[0.0], np.asarray(parameters.potential)])
         head += "\n/* Coefficients of V, J */\n" + table("potential", coefficients, precision)
         count = len(coefficients)
-        own_degrees = tuple(
-            max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(needs.joints, degrees, strict=True)
-        )
+        own_degrees = potential_degrees(needs.joints, degrees)
         declared = f"    real terms[{count}], term_slopes[D * {count}];\n"
         basis, slopes = "mass_basis", "slopes"
         if own_degrees != degrees:

@@ -12,6 +12,7 @@ A matrix that is not positive definite gives a solution that is not finite: noth
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -40,6 +41,12 @@ _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
 _MOST_ENTRIES = 3e7
+
+
+# Relative residuals of the conjugate gradients, and the products after which they give up.
+_SOLVE_RESIDUAL = 1e-10
+_SEARCH_RESIDUAL = 1e-2
+_MOST_PRODUCTS = 10_000
 
 
 class LinearSolver(NamedTuple):
@@ -122,22 +129,10 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     return LinearSolver(factorise, solve, solve)
 
 
-def matrix_free(
-    energies: Sequence[ElementEnergy],
-    at: Pattern,
-    *,
-    tolerance: float = 1e-10,
-    search_tolerance: float = 1e-2,
-    iterations: int = 10_000,
-) -> LinearSolver:
+def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     """Conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
 
-    Args:
-        energies: whose indices say where the elements' products go.
-        at: the pattern.
-        tolerance: relative residual of `solve`; a solve that does not get there is not finite.
-        search_tolerance: relative residual of `search`.
-        iterations: products after which either gives up.
+    A solve that does not get to its relative residual is not finite.
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
@@ -146,7 +141,7 @@ def matrix_free(
     def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
         return tuple(map(square, hessians)), jnp.linalg.inv(_with_constants(values)[of_blocks])
 
-    def run(factor: tuple[tuple[Array, ...], Array], right: Blocks, tolerance: float) -> Blocks:
+    def run(tolerance: float, factor: tuple[tuple[Array, ...], Array], right: Blocks) -> Blocks:
         hessians, inverse = factor
 
         def product(x: Blocks) -> Blocks:
@@ -160,11 +155,9 @@ def matrix_free(
             return (inverse @ x[..., None])[..., 0]
 
         right = jnp.where(at.free, right, 0)
-        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=iterations)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_MOST_PRODUCTS)
 
-    return LinearSolver(
-        factorise, lambda factor, right: run(factor, right, tolerance), lambda f, right: run(f, right, search_tolerance)
-    )
+    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, _SEARCH_RESIDUAL))
 
 
 def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
