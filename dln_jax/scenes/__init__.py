@@ -1,1 +1,28 @@
 """Textbook systems: what each needs, and its exact energies and equations of motion."""
+
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.oscillators import henon_heiles, mass_spring
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.registry import SCENES, scene_named
+from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
+from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
+
+__all__ = [
+    "SCENES",
+    "Scene",
+    "actuation_matrix",
+    "cart_pole",
+    "chain",
+    "closed_form_forward_dynamics",
+    "double_pendulum",
+    "henon_heiles",
+    "joint_angles",
+    "mass_spring",
+    "n_body",
+    "pendulum",
+    "scene_named",
+    "two_link_arm",
+]

@@ -1,1 +1,13 @@
 """Linear and nonlinear solvers that know no physics."""
+
+from dln_jax.solvers import elimination, least_squares, levenberg_marquardt, normal_equations
+from dln_jax.solvers.newton import Info, find_root
+
+__all__ = [
+    "Info",
+    "elimination",
+    "find_root",
+    "least_squares",
+    "levenberg_marquardt",
+    "normal_equations",
+]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.deploy import export_stablehlo as stablehlo
+from dln_jax.deploy import stablehlo
 from dln_jax.deploy.exports import described
 from dln_jax.deploy.low_latency import low_latency
 from dln_jax.mechanics.dynamics import Decomposition

@@ -13,7 +13,7 @@ import pytest
 
 from dln_jax.deploy.c.load import CDynamics, load_c
 from dln_jax.deploy.c.source import export_c
-from dln_jax.deploy.export_stablehlo import export_stablehlo
+from dln_jax.deploy.stablehlo import export_stablehlo
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
@@ -266,7 +266,7 @@ import jax
 from pathlib import Path
 from dln_jax import InputError, load
 from dln_jax.deploy.c.source import export_run
-from dln_jax.deploy.export_stablehlo import load_stablehlo
+from dln_jax.deploy.stablehlo import load_stablehlo
 folder = Path(sys.argv[1])
 loads = {
     "run": lambda: load(folder / "run").dynamics,

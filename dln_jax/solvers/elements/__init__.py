@@ -1,1 +1,19 @@
 """Minima of sums of element energies, and the linear systems on the way."""
+
+from dln_jax.solvers.elements.assembly import Pattern, pattern
+from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, by_size, dense, matrix_free
+from dln_jax.solvers.elements.minimise import minimise
+
+__all__ = [
+    "ElementEnergy",
+    "LinearSolver",
+    "Pattern",
+    "block_tridiagonal",
+    "by_size",
+    "dense",
+    "matrix_free",
+    "minimise",
+    "pattern",
+    "value",
+]
