@@ -64,7 +64,6 @@ class Flow(NamedTuple):
     """What an energy answers in coordinates and momenta, without applied forces; otherwise as `Dynamics`."""
 
     rates: Rates
-    """(q, p) -> (qd, pd), each [d]."""
     energy: Callable[[VectorLike, VectorLike], Array]
     """(q, p) -> H, scalar."""
 
@@ -73,7 +72,6 @@ class PlainFlow(NamedTuple):
     """What moves without an energy."""
 
     rates: Rates
-    """(q, p) -> (qd, pd), each [d]."""
 
 
 def make_dynamics(

@@ -53,11 +53,6 @@ class Tableau(NamedTuple):
         """c [s], the stages' times in units of dt: row sums of a."""
         return tuple(sum(row) for row in self.stages)
 
-    @property
-    def is_explicit(self) -> bool:
-        """Whether every stage takes rates of earlier stages only."""
-        return not any(entry for i, row in enumerate(self.stages) for entry in row[i:])
-
 
 EULER = Tableau(stages=((0.0,),), weights=(1.0,))
 CLASSICAL = Tableau(
@@ -85,9 +80,9 @@ def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iter
         iterations: Newton steps after which a step is given up; implicit methods only.
     """
     field = jax.jit(field)  # traced once for all stages
-    if tableau.is_explicit:
-        return functools.partial(_explicit_step, tableau, field)
-    return functools.partial(_implicit_step, tableau, field, tolerance, iterations)
+    if any(entry for i, row in enumerate(tableau.stages) for entry in row[i:]):
+        return functools.partial(_implicit_step, tableau, field, tolerance, iterations)
+    return functools.partial(_explicit_step, tableau, field)
 
 
 explicit_euler = functools.partial(runge_kutta, EULER)
