@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, make_dynamics, minus_potential, plus_potential
 from dln_jax.solvers import elimination
 from dln_jax.types import Dissipation, Lagrangian, Potential, Scalar, Vector
 
@@ -35,12 +35,7 @@ class ClosedForm(NamedTuple):
 
 def lagrangian(system: ClosedForm) -> Lagrangian:
     """L(q, qd) = ½ qdᵀ M(q) qd - V(q), for the generic functions of `mechanics.lagrangian`."""
-
-    def difference(q: Vector, qd: Vector) -> Scalar:
-        kinetic = 0.5 * qd @ system.mass_matrix(q) @ qd
-        return kinetic if system.potential is None else kinetic - system.potential(q)
-
-    return difference
+    return lambda q, qd: minus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
 def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
@@ -68,8 +63,7 @@ def forward_dynamics(system: ClosedForm, q: Vector, qd: Vector, tau: Vector) -> 
 
 def energy(system: ClosedForm, q: Vector, qd: Vector) -> Scalar:
     """Energy T + V."""
-    kinetic = 0.5 * qd @ system.mass_matrix(q) @ qd
-    return kinetic if system.potential is None else kinetic + system.potential(q)
+    return plus_potential(0.5 * qd @ system.mass_matrix(q) @ qd, system.potential, q)
 
 
 def dynamics(system: ClosedForm, *, degrees_of_freedom: int | None = None) -> Dynamics:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from dln_jax.mechanics.arguments import vectors
-from dln_jax.types import Dissipation, Vector, VectorLike
+from dln_jax.types import Dissipation, Potential, Scalar, Vector, VectorLike
 
 
 class Decomposition(NamedTuple):
@@ -123,6 +123,16 @@ def make_plain_dynamics(
         lambda q, qd, tau: forward_dynamics(*vectors(d, q=q, qd=qd, tau=tau)),
         lambda q, qd, qdd: decompose(*vectors(d, q=q, qd=qd, qdd=qdd)),
     )
+
+
+def plus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
+    """T + V(q), of an energy."""
+    return kinetic if V is None else kinetic + V(q)
+
+
+def minus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
+    """T - V(q), of a Lagrangian."""
+    return kinetic if V is None else kinetic - V(q)
 
 
 def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import (
+    Decomposition,
+    Dynamics,
+    friction_force,
+    make_dynamics,
+    minus_potential,
+    plus_potential,
+)
 from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, Matrix, Potential, Scalar, Vector
 
@@ -30,28 +37,17 @@ class NaturalSystem(NamedTuple):
 
 def lagrangian(system: NaturalSystem) -> Lagrangian:
     """L(q, qd) = ½ |Lᵀ qd|² - V(q), for the generic functions of `mechanics.lagrangian`."""
-
-    def difference(q: Vector, qd: Vector) -> Scalar:
-        kinetic = _kinetic(system.cholesky(q), qd)
-        return kinetic if system.potential is None else kinetic - system.potential(q)
-
-    return difference
+    return lambda q, qd: minus_potential(_kinetic(system.cholesky(q), qd), system.potential, q)
 
 
 def hamiltonian(system: NaturalSystem) -> Hamiltonian:
     """H(q, p) = ½ |L⁻¹ p|² + V(q) of a natural system with M = L Lᵀ."""
-
-    def total(q: Vector, p: Vector) -> Scalar:
-        kinetic = 0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2)
-        return kinetic if system.potential is None else kinetic + system.potential(q)
-
-    return total
+    return lambda q, p: plus_potential(0.5 * jnp.sum(solve_lower(system.cholesky(q), p) ** 2), system.potential, q)
 
 
 def energy(system: NaturalSystem, q: Vector, qd: Vector) -> Scalar:
     """Energy T + V."""
-    kinetic = _kinetic(system.cholesky(q), qd)
-    return kinetic if system.potential is None else kinetic + system.potential(q)
+    return plus_potential(_kinetic(system.cholesky(q), qd), system.potential, q)
 
 
 def mass_matrix(system: NaturalSystem, q: Vector, qd: Vector | None = None) -> Matrix:

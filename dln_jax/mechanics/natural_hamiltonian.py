@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics
+from dln_jax.mechanics.dynamics import Decomposition, Dynamics, friction_force, make_dynamics, plus_potential
 from dln_jax.solvers.elimination import solve_lower, solve_lower_transposed
 from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Potential, Scalar, Vector
 
@@ -30,12 +30,7 @@ class NaturalHamiltonian(NamedTuple):
 
 def hamiltonian(system: NaturalHamiltonian) -> Hamiltonian:
     """H(q, p) = ½ |Lᵀ p|² + V(q): no solve."""
-
-    def total(q: Vector, p: Vector) -> Scalar:
-        kinetic = 0.5 * jnp.sum((system.inverse_factor(q).T @ p) ** 2)
-        return kinetic if system.potential is None else kinetic + system.potential(q)
-
-    return total
+    return lambda q, p: plus_potential(0.5 * jnp.sum((system.inverse_factor(q).T @ p) ** 2), system.potential, q)
 
 
 def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = None) -> Dynamics:
@@ -72,8 +67,7 @@ def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = Non
         return solve_lower_transposed(factor, solve_lower(factor, vector))
 
     def energy(q: Vector, qd: Vector) -> Scalar:
-        kinetic = 0.5 * jnp.sum(solve_lower(system.inverse_factor(q), qd) ** 2)
-        return kinetic if system.potential is None else kinetic + system.potential(q)
+        return plus_potential(0.5 * jnp.sum(solve_lower(system.inverse_factor(q), qd) ** 2), system.potential, q)
 
     def decompose(q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
         return Decomposition(

@@ -86,10 +86,10 @@ def make_scene(
     names = [term.name for term in terms]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"two terms are named '{twice[0]}'; give each its own name")
-    for name, indices in ((term.name, term.indices) for term in terms):
-        if len(wrong := np.argwhere((indices < 0) | (indices >= n))):
-            vertex = indices[tuple(wrong[0])]
-            raise InputError(f"term '{name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
+    for term in terms:
+        if len(wrong := np.argwhere((term.indices < 0) | (term.indices >= n))):
+            vertex = term.indices[tuple(wrong[0])]
+            raise InputError(f"term '{term.name}', element {wrong[0][0]} names vertex {vertex}; expected 0..{n - 1}")
     held = np.asarray(held, int).reshape(-1)
     if len(outside := held[(held < 0) | (held >= n)]):
         raise InputError(f"held names vertex {outside[0]}; expected 0..{n - 1}")
