@@ -34,7 +34,7 @@ def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Pre
     def answer(x: jax.Array):
         if members == 1:
             return network(jax.tree.map(lambda leaf: leaf[0], layers), x), None
-        return tuple(ensembles.mean_and_spread(network, layers, x))
+        return ensembles.mean_and_spread(network, layers, x)
 
     mean, spread = jax.jit(jax.vmap(answer))(jnp.asarray(x, dtype))
     return Prediction(_samples(x, mean), None if spread is None else _samples(x, spread))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +14,15 @@ from dln_jax.nn.differential_mlp import Layers
 from dln_jax.types import InputError
 
 
-class Statistics(NamedTuple):
-    """Over the members, for each array that the network returns."""
-
-    mean: Any
-    """Mean, in the structure of the network's output."""
-    spread: Any
-    """Sample standard deviation (the sum of squares over K - 1), same structure."""
-
-
 def init(key: PRNGKeyArray | Array, sizes, *, members: int, **schemes) -> Layers:
     """`differential_mlp.init` for each of K = `members` keys: weights [K, in, out], biases [K, out]."""
     return jax.vmap(partial(differential_mlp.init, sizes=sizes, **schemes))(jax.random.split(key, members))
 
 
-def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: Array) -> Statistics:
+def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: Array) -> tuple[Any, Any]:
     """Mean and spread over K members at x [n] of all that `network(layers, x)` returns.
 
+    The spread is the sample standard deviation (the sum of squares over K - 1).
     `network` is a function of one member, for instance
     `partial(differential_mlp.value_jacobian_and_hessian, activation=tanh)`, which gives the statistics of value,
     Jacobian and Hessian. `layers` has the members on the leading axis of each array, as from `init`.
@@ -40,7 +32,5 @@ def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: 
     if members < 2:
         raise InputError(f"the ensemble has {members} member; its spread needs two or more")
     outputs = jax.vmap(network, in_axes=(0, None))(layers, x)
-    return Statistics(
-        mean=jax.tree.map(partial(jnp.mean, axis=0), outputs),
-        spread=jax.tree.map(partial(jnp.std, axis=0, ddof=1), outputs),
-    )
+    mean, spread = partial(jnp.mean, axis=0), partial(jnp.std, axis=0, ddof=1)
+    return jax.tree.map(mean, outputs), jax.tree.map(spread, outputs)

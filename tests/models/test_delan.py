@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from costs import flops_and_parameters
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -75,21 +76,10 @@ def test_dissipation_takes_power_away():
     assert float(rate) < 0
 
 
-def flops(**kinds):
-    """Floating-point operations and parameters of the inverse model."""
-    model = small(3, **kinds)
-    parameters = jax.eval_shape(model.init, jax.random.key(0))
-    states = (jax.ShapeDtypeStruct((3,), jnp.float64),) * 3
-    compiled = (
-        jax.jit(lambda p, *s: dynamics(model.energies(p)).inverse_dynamics(*s)).lower(parameters, *states).compile()
-    )
-    return compiled.cost_analysis()["flops"], sum(leaf.size for leaf in jax.tree.leaves(parameters))
-
-
 def test_absent_terms_cost_nothing():
-    full, full_parameters = flops(friction=True)
-    frictionless, frictionless_parameters = flops()
-    weightless, weightless_parameters = flops(gravity=False)
+    full, full_parameters = flops_and_parameters(small(3, friction=True), "inverse_dynamics", 3)
+    frictionless, frictionless_parameters = flops_and_parameters(small(3), "inverse_dynamics", 3)
+    weightless, weightless_parameters = flops_and_parameters(small(3, gravity=False), "inverse_dynamics", 3)
     assert weightless < 0.75 * frictionless < 0.75 * full
     potential = 6 * 6 + 6 + 6 * 6 + 6 + 6 + 1
     assert full_parameters - frictionless_parameters == 3

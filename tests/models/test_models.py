@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from costs import flops_and_parameters
 
 from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.dynamics import PlainDynamics
@@ -141,22 +142,14 @@ def test_feed_forward_has_no_energy():
     assert np.abs(tau(q + jnp.array([2 * jnp.pi, 0.0]), qd, qdd) - turned).max() > 1e-3
 
 
-def flops(gravity, friction):
-    """Floating-point operations and parameters of the structured forward model."""
-    needs = Needs(("revolute",) * 2, gravity=gravity, friction=friction)
-    model = make_structured_hamiltonian(needs, **SMALL)
-    parameters = jax.eval_shape(model.init, jax.random.key(0))
-    states = (jax.ShapeDtypeStruct((2,), jnp.float64),) * 3
-    compiled = (
-        jax.jit(lambda p, *s: dynamics(model.energies(p)).forward_dynamics(*s)).lower(parameters, *states).compile()
-    )
-    return compiled.cost_analysis()["flops"], sum(leaf.size for leaf in jax.tree.leaves(parameters))
-
-
 def test_absent_terms_cost_nothing():
-    full, full_parameters = flops(True, True)
-    frictionless, frictionless_parameters = flops(True, False)
-    weightless, weightless_parameters = flops(False, False)
+    def costs(gravity, friction):
+        needs = Needs(("revolute",) * 2, gravity=gravity, friction=friction)
+        return flops_and_parameters(make_structured_hamiltonian(needs, **SMALL), "forward_dynamics", 2)
+
+    full, full_parameters = costs(True, True)
+    frictionless, frictionless_parameters = costs(True, False)
+    weightless, weightless_parameters = costs(False, False)
     assert weightless < 0.9 * frictionless < 0.9 * full
     assert full_parameters - frictionless_parameters == 2
     assert frictionless_parameters - weightless_parameters == 4 * 5 + 5 + 5 + 1

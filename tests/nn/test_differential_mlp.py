@@ -217,12 +217,12 @@ def test_ensemble_equals_a_loop_over_its_members():
         member = jax.tree.map(lambda leaf, index=index: jnp.asarray(np.asarray(leaf)[index]), stacked)
         assert_close(member, init(own))
         outputs.append(jax.tree.map(np.asarray, single(member, x)))
-    statistics = jax.jit(partial(ensembles.mean_and_spread, network))(stacked, x)
+    means, spreads = jax.jit(partial(ensembles.mean_and_spread, network))(stacked, x)
     for order, of_members in enumerate(zip(*outputs, strict=True)):
         mean = sum(of_members) / members
         variance = sum((each - mean) ** 2 for each in of_members) / (members - 1)
-        assert_close(statistics.mean[order], mean)
-        assert_close(statistics.spread[order], np.sqrt(variance))
+        assert_close(means[order], mean)
+        assert_close(spreads[order], np.sqrt(variance))
 
 
 def test_haiku_front_is_the_same_network():

@@ -57,14 +57,10 @@ class Network(NamedTuple):
     """(weight [in, out], bias [out]), hidden layers first."""
 
     @property
-    def widths(self) -> list[int]:
-        """Padded widths of the hidden layers."""
-        return [-(-len(bias) // _LANES) * _LANES for _, bias in self.layers[:-1]]
-
-    @property
     def sizes(self) -> list[int]:
-        """n, the padded widths, m."""
-        return [self.layers[0][0].shape[0], *self.widths, self.layers[-1][0].shape[1]]
+        """n, the padded widths of the hidden layers, m."""
+        widths = [-(-len(bias) // _LANES) * _LANES for _, bias in self.layers[:-1]]
+        return [self.layers[0][0].shape[0], *widths, self.layers[-1][0].shape[1]]
 
     @property
     def last(self) -> int:
