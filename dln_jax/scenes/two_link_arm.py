@@ -25,7 +25,10 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
     (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
     """
     # The vertical of one convention is the other's, turned by a quarter.
-    offset = 0.0 if zero == "horizontal" else -jnp.pi / 2
+    if zero == "horizontal":
+        name, offset, rise, slope = "two-link-arm", 0.0, jnp.sin, jnp.cos
+    else:
+        name, offset, rise, slope = "two-link-arm-hanging", -jnp.pi / 2, lambda angle: -jnp.cos(angle), jnp.sin
 
     def mass_matrix(q: Vector) -> Matrix:
         cosine = jnp.cos(q[1])
@@ -38,23 +41,16 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
         return jnp.array([-sine * (2 * qd[0] * qd[1] + qd[1] ** 2), sine * qd[0] ** 2])
 
     def potential(q: Vector) -> Scalar:
-        return _SHOULDER_WEIGHT * _rise(q[0]) + _ELBOW_WEIGHT * _rise(q[0] + q[1])
+        return _SHOULDER_WEIGHT * rise(q[0]) + _ELBOW_WEIGHT * rise(q[0] + q[1])
 
     def gravity(q: Vector) -> Vector:
-        elbow = _ELBOW_WEIGHT * _slope(q[0] + q[1])
-        return jnp.array([_SHOULDER_WEIGHT * _slope(q[0]) + elbow, elbow])
+        elbow = _ELBOW_WEIGHT * slope(q[0] + q[1])
+        return jnp.array([_SHOULDER_WEIGHT * slope(q[0]) + elbow, elbow])
 
     def tip(q: Vector) -> Vector:
         angles = jnp.array([q[0], q[0] + q[1]]) + offset
         return LINK_LENGTH * jnp.array([jnp.sum(jnp.cos(angles)), jnp.sum(jnp.sin(angles))])
 
-    def _rise(angle: Scalar) -> Scalar:
-        return jnp.sin(angle) if zero == "horizontal" else -jnp.cos(angle)
-
-    def _slope(angle: Scalar) -> Scalar:
-        return jnp.cos(angle) if zero == "horizontal" else jnp.sin(angle)
-
-    name = "two-link-arm" if zero == "horizontal" else "two-link-arm-hanging"
     needs = Needs(joints=("revolute", "revolute"))
     return Scene(name, needs, mass_matrix, coriolis, potential, gravity, tip=tip)
 
