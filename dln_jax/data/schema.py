@@ -128,6 +128,13 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         np.savez_compressed(file, **arrays)
 
 
+def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """p and pd of data that must have them. Raises InputError where they have not."""
+    if data.p is None or data.pd is None:
+        raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
+    return data.p, data.pd
+
+
 def needs_from_text(text: str) -> Needs:
     """`Needs` from their JSON; errors as `needs_from_json`, and text that is no JSON."""
     try:

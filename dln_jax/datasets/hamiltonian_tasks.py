@@ -46,7 +46,7 @@ from dln_jax.scenes.oscillators import henon_heiles as henon_heiles_scene
 from dln_jax.scenes.oscillators import mass_spring
 from dln_jax.scenes.pendulum import pendulum as pendulum_scene
 from dln_jax.scenes.scene import Scene
-from dln_jax.types import Hamiltonian, InputError, Scalar, Vector
+from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
 
 
 @in_float64
@@ -105,12 +105,11 @@ damped_pendulum = functools.partial(pendulum, friction=0.1)
 def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
     """A unit mass in the well of Hénon and Heiles, on orbits that stay in it."""
     scene, H = _system(henon_heiles_scene)
-    assert scene.potential is not None
     random = np.random.default_rng(seed)
     angle, direction = random.uniform(0, 2 * np.pi, (2, trajectories))
     radius = 0.25 * np.sqrt(random.uniform(size=trajectories))
     q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(scene.potential)(jnp.asarray(q)))
+    kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(_potential(scene))(jnp.asarray(q)))
     p = np.sqrt(2 * kinetic)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     return _without_noise(scene, H, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
 
@@ -138,12 +137,14 @@ def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
 @functools.cache
 def _attracting(n: int) -> tuple[Scene, Hamiltonian]:
     scene = n_body(n)
+    potential = _potential(scene)
+    return scene, lambda q, p: 0.5 * jnp.sum(p**2) + potential(q)
 
-    def H(q: Vector, p: Vector) -> Scalar:
-        assert scene.potential is not None
-        return 0.5 * jnp.sum(p**2) + scene.potential(q)
 
-    return scene, H
+def _potential(scene: Scene) -> Potential:
+    if scene.potential is None:
+        raise InputError(f"{scene.name} has no potential; expected a scene with one")
+    return scene.potential
 
 
 def _circle(q: Vector, p: Vector) -> Scalar:

@@ -18,8 +18,7 @@ def label_ends(axis: Axes, ends: Mapping[str, tuple[float, float]], *, colours: 
 
     Call it when the limits of the axis and the size of the figure are settled.
     """
-    drawn = axis.get_figure(root=True)
-    assert drawn is not None
+    drawn = axis.figure.get_figure(root=True)
     fractions = axis.transData + axis.transAxes.inverted()
     heights = {name: float(np.clip(fractions.transform(end)[1], 0.0, 1.0)) for name, end in ends.items()}
     share = axis.get_position().height * drawn.get_figheight()
@@ -97,8 +96,7 @@ def label_points(
         size: of the text in points.
     """
     colour = "0.25"
-    drawn = axis.get_figure(root=True)
-    assert drawn is not None
+    drawn = axis.figure.get_figure(root=True)
     drawn.draw_without_rendering()
     pixels = drawn.dpi / 72
     covered, frame, taken = axis.transData.transform(obstacles), axis.get_window_extent(), []

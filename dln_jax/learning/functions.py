@@ -96,16 +96,14 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
         raise InputError(f"loss is '{network.loss}'; expected one of {', '.join(LOSSES)}")
     if network.derivative not in (1, 2):
         raise InputError(f"derivative is {network.derivative}; expected 1, or 2 to fit the Hessian too")
-    given = data._replace(
-        dy=data.dy if network.loss == "type1" else None, d2y=data.d2y if network.derivative == 2 else None
-    )
-    if network.loss == "type1" and given.dy is None:
+    dy, d2y = data.dy if network.loss == "type1" else None, data.d2y if network.derivative == 2 else None
+    if network.loss == "type1" and dy is None:
         raise InputError("type1 fits the gradient, but the data have no dy; add it or choose type2")
-    if network.derivative == 2 and given.d2y is None:
+    if network.derivative == 2 and d2y is None:
         raise InputError("derivative 2 fits the Hessian, but the data have no d2y; add it or choose derivative 1")
-    x, y, dy, d2y = (None if a is None else on_device(key, a, dtype) for key, a in given._asdict().items())
-    assert x is not None
-    return x, y, dy, d2y
+    slope = None if dy is None else on_device("dy", dy, dtype)
+    curvature = None if d2y is None else on_device("d2y", d2y, dtype)
+    return on_device("x", data.x, dtype), on_device("y", data.y, dtype), slope, curvature
 
 
 def residual(

@@ -22,12 +22,12 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.data.magnitudes import on_device
-from dln_jax.data.schema import Trajectories
+from dln_jax.data.schema import Trajectories, momenta
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training, mean_square, unmonitored
 from dln_jax.mechanics.equations import flow
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
-from dln_jax.types import InputError, Scalar, require_positive, require_seed
+from dln_jax.types import Scalar, require_positive, require_seed
 
 
 def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
@@ -102,6 +102,6 @@ def samples(data: Trajectories, dtype: Any = jnp.float64, chosen: Any = slice(No
     Raises:
         InputError: no p or pd in the data, or numbers whose squares overflow.
     """
-    if data.p is None or data.pd is None:
-        raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
-    return tuple(on_device(name, getattr(data, name)[chosen], dtype) for name in ("q", "p", "qd", "pd"))
+    p, pd = momenta(data)
+    named = {"q": data.q, "p": p, "qd": data.qd, "pd": pd}
+    return tuple(on_device(name, array[chosen], dtype) for name, array in named.items())

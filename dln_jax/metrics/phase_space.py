@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.schema import momenta
 from dln_jax.datasets.phase_samples import Part
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import adaptive_rollout
@@ -47,13 +48,13 @@ def field_rates(
 def field_errors(model: Model, parameters: Parameters, part: Part) -> dict[str, float]:
     """`loss`, against the measured rates, and `clean_field_mse`, against the exact field at the measured states."""
     data = part.data
-    assert data.p is not None and data.pd is not None
-    qd, pd = field_rates(model, parameters, data.q, data.p)
+    p, measured = momenta(data)
+    qd, pd = field_rates(model, parameters, data.q, p)
 
     def mean_square(velocity: np.ndarray, force: np.ndarray) -> float:
         return float(np.mean(np.concatenate([qd - velocity, pd - force]) ** 2))
 
-    return {"loss": mean_square(data.qd, data.pd), "clean_field_mse": mean_square(part.field.qd, part.field.pd)}
+    return {"loss": mean_square(data.qd, measured), "clean_field_mse": mean_square(part.field.qd, part.field.pd)}
 
 
 def predict(

@@ -22,8 +22,8 @@ from dln_jax.learning.objectives import TORQUE
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
-from dln_jax.runs.dynamics_task import Options, Task, prepare
-from dln_jax.runs.results import losses
+from dln_jax.runs.dynamics_task import Options, Solver, Task, prepare
+from dln_jax.runs.results import losses, settings_of
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -40,12 +40,12 @@ def run(given: Options, command: str) -> None:
     task = prepare(given)
     with command_folder(given, command) as folder:
         announce(task)
-        if CATALOGUE[task.kind].properties.linear:
+        if task.solver is None:
             task, training = fit_trigonometric(task, grown=given.degree is None)
         elif given.target is not None:
-            task, training = grow_to_target(task, given.target, folder, resume=given.resume)
+            task, training = grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume)
         else:
-            training = train(task, folder, resume=given.resume)
+            training = train(task, task.solver, folder, resume=given.resume)
         if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
@@ -56,7 +56,7 @@ def run(given: Options, command: str) -> None:
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
-        optimiser = {} if task.optimiser is None else {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
+        optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
         write_config(folder, given, **task.description, **optimiser, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
@@ -76,20 +76,19 @@ def announce(task: Task) -> None:
         print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
     if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:
         print("no momenta p in the data: the Hamiltonian is fitted to torques")
-    if task.optimiser is not None:
-        why = f" ({task.optimiser_reason})" if task.optimiser_reason else ""
-        print(f"{task.kind}, {task.precision}, {name_of(task.optimiser)}{why}")
+    if task.solver is not None:
+        why = f" ({task.solver.reason})" if task.solver.reason else ""
+        print(f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}")
 
 
-def train(task: Task, folder: Path, *, resume: bool) -> Training:
+def train(task: Task, solver: Solver, folder: Path, *, resume: bool) -> Training:
     """Trains the task's model, one seed or several."""
-    assert task.problem is not None and task.optimiser is not None
-    total = task.optimiser.steps
-    identity = dynamics.identity_of(task.optimiser, task.sets, task.objective, seeds=task.seeds)
+    total = solver.optimiser.steps
+    identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
         return fit(
-            task.problem,
-            task.optimiser,
+            solver.problem,
+            solver.optimiser,
             checkpoint=Checkpoint(folder, identity, resume),
             report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
             seconds=task.seconds,
@@ -135,7 +134,7 @@ def warn(task: Task, training: Training, folder: Path) -> None:
     if training.stop.reason == "time":
         print(f"out of time at step {training.stop.step}: kept is the best so far; --resume continues")
     if training.stop.reason == "not finite":
-        adam = isinstance(task.optimiser, Adam)
+        adam = task.solver is not None and isinstance(task.solver.optimiser, Adam)
         remedy = "lower --learning-rate or use --precision f64" if adam else "check the data"
         raise InputError(
             f"the loss stopped being finite after step {training.stop.step}; {folder} holds the last good one; {remedy}"

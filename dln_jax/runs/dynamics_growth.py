@@ -13,6 +13,7 @@ from dln_jax import learning
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
@@ -44,7 +45,9 @@ class Candidate(NamedTuple):
         return f"{self.depth} x {self.width}, {'one network' if self.networks == 1 else 'two networks'}"
 
 
-def grow_to_target(task: Task, target: float, folder: Path, *, resume: bool) -> tuple[Task, Training]:
+def grow_to_target(
+    task: Task, optimiser: Optimiser, target: float, folder: Path, *, resume: bool
+) -> tuple[Task, Training]:
     """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
 
     Chosen is the fastest that meets it, or, if none does, the most accurate. Writes `candidates.json` and a table.
@@ -54,7 +57,7 @@ def grow_to_target(task: Task, target: float, folder: Path, *, resume: bool) -> 
     for width in WIDTHS:
         for depth, shared in itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)):
             description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
-            tried.append(_try(task._replace(description=description), folder, resume=resume))
+            tried.append(_try(task._replace(description=description), optimiser, folder, resume=resume))
             candidate = tried[-1][0]
             met = candidate.validation_error <= target
             enough += tried[-1:] * met
@@ -77,16 +80,15 @@ def grow_to_target(task: Task, target: float, folder: Path, *, resume: bool) -> 
     return chosen[1], chosen[2]
 
 
-def _try(task: Task, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Training]:
+def _try(task: Task, optimiser: Optimiser, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Training]:
     """Trains one candidate and measures it."""
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
     name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"
-    assert task.optimiser is not None
-    identity = learning.dynamics.identity_of(task.optimiser, task.sets, task.objective, seeds=task.seeds)
+    identity = learning.dynamics.identity_of(optimiser, task.sets, task.objective, seeds=task.seeds)
     training = fit(
         learning.dynamics.problem(model, task.sets, task.objective, seeds=task.seeds),
-        task.optimiser,
+        optimiser,
         checkpoint=Checkpoint(folder, identity, resume, name),
         seconds=task.seconds,
     )

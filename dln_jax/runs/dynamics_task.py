@@ -75,6 +75,15 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
 
 
+class Solver(NamedTuple):
+    """How a model is trained."""
+
+    optimiser: Optimiser
+    reason: str
+    """Why it is that one; empty where the user chose."""
+    problem: Problem
+
+
 class Task(NamedTuple):
     """What the arguments come to: the data, what they need, and the model to train."""
 
@@ -87,14 +96,10 @@ class Task(NamedTuple):
     description: dict[str, Any]
     """Of the model, for `dln_jax.zoo.build`."""
     objective: Objective
-    optimiser: Optimiser | None
+    solver: Solver | None
     """`None` for the trigonometric model, which is one least-squares problem."""
-    optimiser_reason: str
-    """Why the optimiser is the one it is; empty where the user chose."""
     seeds: int | tuple[int, ...]
     """One, or several in one program."""
-    problem: Problem | None
-    """What the optimiser solves."""
     seconds: float
     """Of training, after which to stop."""
 
@@ -127,13 +132,12 @@ def prepare(given: Options) -> Task:
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
     limit = resolved(given, {"seconds": math.inf})
     require_positive(**limit)
-    model, problem = build(description), None
+    model, solver = build(description), None
     if optimiser is not None:
         problem = dynamics.problem(model, sets, objective, seeds=seeds)
         require_finite_start(problem, dynamics.samples(model, sets, objective))
-    return Task(
-        name, kind, sets, scene, needs, origin, description, objective, optimiser, reason, seeds, problem, **limit
-    )
+        solver = Solver(optimiser, reason, problem)
+    return Task(name, kind, sets, scene, needs, origin, description, objective, solver, seeds, **limit)
 
 
 def check_options(given: Options, kind: str) -> None:

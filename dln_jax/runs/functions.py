@@ -24,7 +24,7 @@ from dln_jax.metrics.functions import Prediction, errors, predictions, typical_s
 from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
 from dln_jax.runs.function_task import NAMED, Options, Task, of_named, prepare
-from dln_jax.runs.results import OF_LOSSES, cost_metrics, print_numbers, unit_of
+from dln_jax.runs.results import OF_LOSSES, cost_metrics, print_numbers, settings_of, unit_of
 from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load, save
 
@@ -41,8 +41,7 @@ def run(given: Options, command: str) -> None:
         announce(task)
         network, training, trials = fit(task, folder, resume=given.resume)
         task = task._replace(network=network)
-        optimiser = {"optimizer": name_of(task.optimiser), **task.optimiser._asdict()}
-        write_config(folder, given, **network._asdict(), **optimiser, **of_named(given))
+        write_config(folder, given, **network._asdict(), **settings_of(task.optimiser), **of_named(given))
         if training.stop.reason == "not finite":
             print("the loss stopped being finite; the run keeps the best parameters before that")
         layers = layers_in_own_units(training.parameters, task.units)

@@ -1,11 +1,14 @@
 """What every kind of run shows and keeps alike: its numbers with their units, and its costs."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
 
+from dln_jax.command_line.optimisers import name_of
+from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Progress, Training
 from dln_jax.metrics.latency import Latency
 
@@ -16,6 +19,11 @@ OF_LOSSES = {"error": "loss", "loss": "training loss"}
 def losses(at: Progress) -> str:
     """For a line of progress; of several seeds the medians."""
     return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
+
+
+def settings_of(optimiser: Optimiser) -> dict[str, Any]:
+    """For the file of arguments."""
+    return {"optimizer": name_of(optimiser), **optimiser._asdict()}
 
 
 def unit_of(metric: str, units: Mapping[str, str]) -> str:

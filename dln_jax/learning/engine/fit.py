@@ -54,7 +54,7 @@ def fit(
     run = _Run(stages[0].start(None), jnp.asarray(0))
     run, history = restore(checkpoint, run) or (run, [])
     train_seconds = history[-1].seconds if history else 0.0
-    compile_seconds, dispatched, stop = 0.0, False, None
+    compile_seconds, dispatched, stop = 0.0, False, Stop("finished", 0)
     for number in range(first := int(run.stage), len(stages)):
         stage, dispatch = stages[number], None
         if number > first:
@@ -82,7 +82,6 @@ def fit(
             report(at)
         if stop.reason == "time":
             break
-    assert stop is not None
     if must_start and stop == Stop("not finite", 0):
         raise InputError(NO_START)
     best = run.state.best

@@ -1,6 +1,7 @@
 """Gauss-Newton (Levenberg-Marquardt) as stages of `fit`: on some samples, where there are many, and on all."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -38,16 +39,17 @@ def stages(problem: Problem, optimiser: GaussNewton) -> list[Stage]:
     if problem.residual is None:
         raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
     arrays = jax.tree.map(jnp.asarray, problem.arrays)
+    iterate = functools.partial(levenberg_marquardt.run, problem.residual, improvement=optimiser.improvement)
+    stage = functools.partial(_stage, problem, optimiser, iterate)
     if not optimiser.has_coarse_stage(len(arrays[0])):
-        return [_stage(problem, optimiser, "", arrays, optimiser.steps)]
+        return [stage("", arrays, optimiser.steps)]
     some = jax.tree.map(lambda array: array[: optimiser.coarse_samples], arrays)
-    return [
-        _stage(problem, optimiser, SOME, some, optimiser.coarse_steps),
-        _stage(problem, optimiser, ALL, arrays, optimiser.steps),
-    ]
+    return [stage(SOME, some, optimiser.coarse_steps), stage(ALL, arrays, optimiser.steps)]
 
 
-def _stage(problem: Problem, optimiser: GaussNewton, name: str, arrays: Arrays, iterations: int) -> Stage:
+def _stage(
+    problem: Problem, optimiser: GaussNewton, iterate: Callable, name: str, arrays: Arrays, iterations: int
+) -> Stage:
     def start(before: State | None) -> State:
         of_seeds = jax.vmap if problem.several else lambda function: function
         if before is None:
@@ -63,17 +65,16 @@ def _stage(problem: Problem, optimiser: GaussNewton, name: str, arrays: Arrays, 
         done = not _remaining(state, iterations) or np.all(np.asarray(state.best.validation) <= optimiser.target)
         return Stop("finished", int(state.step)) if done else None
 
-    return Stage(name, start, functools.partial(_compile, problem, optimiser, arrays, iterations), ended)
+    return Stage(name, start, functools.partial(_compile, problem, optimiser, iterate, arrays, iterations), ended)
 
 
-def _compile(problem: Problem, optimiser: GaussNewton, arrays: Arrays, iterations: int, state: State) -> Dispatch:
+def _compile(
+    problem: Problem, optimiser: GaussNewton, iterate: Callable, arrays: Arrays, iterations: int, state: State
+) -> Dispatch:
     """Iterations, their score and the best so far: three programs, of which the first is to be compiled quickly."""
-    assert problem.residual is not None
-    advance = jax.jit(
-        functools.partial(levenberg_marquardt.run, problem.residual, improvement=optimiser.improvement),
-        compiler_options=quick_compilation(),
+    advance = (
+        jax.jit(iterate, compiler_options=quick_compilation()).lower(state.solver, arrays, jnp.asarray(0)).compile()
     )
-    advance = advance.lower(state.solver, arrays, jnp.asarray(0)).compile()
 
     def score(parameters: Any) -> Array:
         return jnp.stack(problem.score(parameters))
