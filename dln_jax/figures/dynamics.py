@@ -12,6 +12,10 @@ from dln_jax.figures import style
 from dln_jax.metrics.rollouts import Motion, valid_prediction_times
 
 PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
+MOST_JOINTS, MOST_MOTIONS = 4, 6
+"""Whose forces are shown."""
+MOST_PATHS = 24
+"""That are shown."""
 HIGH, LOW = 0.8, 0.36
 """Inches of a panel of forces, and of one of errors."""
 
@@ -21,8 +25,6 @@ def force_decomposition(
     predicted: dict[str, np.ndarray],
     *,
     model: str = "model",
-    most_joints: int = 4,
-    most_trajectories: int = 6,
 ) -> Figure:
     """Torque and its parts over the first test motions, a column per joint: truth, model, and below the error.
 
@@ -30,13 +32,13 @@ def force_decomposition(
 
     `data` are the test's, `predicted` [N, d] by the keys of `PARTS`; the colour is that of the model's name.
     """
-    shown = np.unique(data.trajectory)[:most_trajectories]
+    shown = np.unique(data.trajectory)[:MOST_MOTIONS]
     samples = np.flatnonzero(np.isin(data.trajectory, shown))
     trajectory = data.trajectory[samples]
     starts = np.flatnonzero(np.r_[True, np.diff(trajectory) != 0])
     moving = len(samples) > 2 * len(shown)
     x = _running_time(data.t[samples], starts) if moving else np.arange(len(samples), dtype=float)
-    joints = min(data.degrees_of_freedom, most_joints)
+    joints = min(data.degrees_of_freedom, MOST_JOINTS)
     truths = {key: getattr(data, key) for key in PARTS}
     errors = {key: predicted[key] - truth for key, truth in truths.items() if truth is not None}
     largest = max((float(np.abs(error[samples, :joints]).max()) for error in errors.values()), default=0.0)
@@ -97,7 +99,6 @@ def tip_paths(
     test: Trajectories,
     motions: Sequence[Motion],
     model: str = "model",
-    most_trajectories: int = 24,
 ) -> Figure:
     """The paths that an arm's tip draws, a panel each: the test's first, and over them the model's own.
 
@@ -108,11 +109,10 @@ def tip_paths(
         motions: of the model from the test's first states under its torques, as `recorded_motions`, or none; a path
             ends where the prediction is no longer valid.
         model: name, of which the colour is taken.
-        most_trajectories: that are shown.
     """
     tested = list(np.unique(test.trajectory))
     others = [index for index in np.unique(data.trajectory) if index not in tested]
-    shown = [*tested, *others][:most_trajectories]
+    shown = [*tested, *others][:MOST_PATHS]
     columns = min(len(shown), 8)
     rows = -(-len(shown) // columns)
     figure, axes = style.figure(rows, columns, height=1.0 * rows + 0.55, sharex=True, sharey=True)

@@ -13,6 +13,8 @@ MODEL = style.colour("differential-network")
 HALO = {"color": "black", "linewidth": 3.0, "alpha": 0.3}
 """Of the truth behind a model's curve."""
 SIGNED, POSITIVE = "RdBu_r", "viridis"
+MOST_OUTPUTS = 4
+"""Whose curves are shown."""
 TITLES = {"y": "value", "dy": "gradient", "d2y": "Hessian"}
 
 
@@ -20,12 +22,12 @@ def _keys(data: FunctionSamples) -> list[str]:
     return [key for key in TITLES if getattr(data, key) is not None]
 
 
-def function_curves(truth: FunctionSamples, predicted: FunctionSamples, *, most_outputs: int = 4) -> Figure:
+def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     """A function of one input: a column each for value, slope and curvature; below each output, its error."""
     order = np.argsort(truth.x[:, 0])
     x = truth.x[order, 0]
     keys = _keys(truth)
-    outputs = min(truth.outputs, most_outputs)
+    outputs = min(truth.outputs, MOST_OUTPUTS)
     figure, axes = style.figure(
         2 * outputs, len(keys), height=0.6 + 2.7 * outputs, sharex=True, height_ratios=(2, 1) * outputs
     )
@@ -47,8 +49,8 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples, *, most_
     return figure
 
 
-def heat_maps(truth: FunctionSamples, predicted: FunctionSamples, *, output: int = 0) -> Figure:
-    """A function of two inputs on a square grid: a column per component; below each other truth, model and error."""
+def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
+    """A function of two inputs on a square grid, its first output: a column per component of truth, model and error."""
     places = range(truth.inputs)  # a component of the Hessian and its mirror image are one
     indices = {"y": [()], "dy": [(i,) for i in places], "d2y": [(i, j) for i in places for j in places[i:]]}
     components = [(key, index) for key in _keys(truth) for index in indices[key]]
@@ -57,7 +59,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples, *, output: int
     )
     grid = [_square(truth.x[:, axis]) for axis in range(2)]
     for column, (key, index) in zip(axes.T, components, strict=True):
-        wanted, found = (_square(getattr(data, key)[(slice(None), output, *index)]) for data in (truth, predicted))
+        wanted, found = (_square(getattr(data, key)[(slice(None), 0, *index)]) for data in (truth, predicted))
         factor, power = _power_of_ten(found - wanted)
         sizes = (abs(wanted).max(), abs(found).max(), 1e-300), (abs(found - wanted).max() / factor, 1e-300)
         scale, narrow = (Normalize(-max(each), max(each)) for each in sizes)
@@ -78,7 +80,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples, *, output: int
     return figure
 
 
-def surfaces(truth: FunctionSamples, predicted: FunctionSamples, *, output: int = 0) -> Figure:
+def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
     """The same as surfaces: rows for value, length of the gradient and trace of the Hessian."""
     keys = _keys(truth)
     names = {"y": "$f$", "dy": r"$|\nabla f|$", "d2y": r"trace $\nabla^2 f$"}
@@ -86,7 +88,7 @@ def surfaces(truth: FunctionSamples, predicted: FunctionSamples, *, output: int 
     figure = style.blank(height=0.2 + 2.3 * len(keys))
     grid = [_square(truth.x[:, axis]) for axis in range(2)]
     for row, key in enumerate(keys):
-        wanted, found = (_square(scalars[key](getattr(data, key)[:, output])) for data in (truth, predicted))
+        wanted, found = (_square(scalars[key](getattr(data, key)[:, 0])) for data in (truth, predicted))
         limits = min(wanted.min(), found.min()), max(wanted.max(), found.max())
         factor, power = _power_of_ten(found - wanted)
         error, colours = abs(found - wanted) / factor, POSITIVE if key == "dy" else SIGNED

@@ -30,7 +30,9 @@ from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_posit
 GRID = 180
 """Angles of the full circle at which the search starts; a step of Gauss-Newton is at most their distance."""
 ITERATIONS = 20
-_BATCH = 256
+LATE = 1000 + np.arange(32.0)
+"""Numbers of frames."""
+_BATCH, _CLIMB, _CORRECTIONS = 256, 20, 3
 
 
 class FrameMotions(NamedTuple):
@@ -94,8 +96,7 @@ def predict_frames(
 ) -> FrameMotions:
     """The motions from two frames each, integrated adaptively in the latent plane, decoded for `times` frames."""
     parameters = with_float64(parameters)
-    q, p = encoded(model, parameters, pairs)
-    latent = predict(model.field, parameters["field"], q, p, np.arange(float(times)))
+    latent = predict(model.field, parameters["field"], *encoded(model, parameters, pairs), np.arange(float(times)))
     return FrameMotions(latent, decoded(model, parameters, latent))
 
 
@@ -105,7 +106,7 @@ def encoded(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(z_q, z_p) of pairs of frames, each [..., 1]."""
     flat = jnp.asarray(pairs, float).reshape(-1, pairs.shape[-1])
-    q, p = _encoded(model, with_float64(parameters), flat)
+    q, p = _applied("encode", model, with_float64(parameters), flat)
     shape = (*pairs.shape[:-1], 1)
     return np.asarray(q).reshape(shape), np.asarray(p).reshape(shape)
 
@@ -114,7 +115,7 @@ def encoded(
 def decoded(model: LatentModel, parameters: Parameters, latent: Motions) -> Float[np.ndarray, "K T input"]:
     """Pairs of frames of latent motions."""
     flat = (jnp.asarray(state, float).reshape(-1, 1) for state in (latent.q, latent.p))
-    pairs = _decoded(model, with_float64(parameters), *flat)
+    pairs = _applied("decode", model, with_float64(parameters), *flat)
     return np.asarray(pairs).reshape(*latent.q.shape[:2], -1)
 
 
@@ -131,23 +132,19 @@ def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
-    """`energy_mse` and `frame_mse`, each as by `phase_metrics.summary`, of motions from the first pairs; and these."""
+    """`energy_mse` and `frame_mse`, each as by `phase_space.summary`, of motions from the first pairs; and these."""
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
     pictures = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))
-    found = summary("energy_mse", energy_errors(moved.pairs, test)) | summary("frame_mse", pictures)
-    return found, moved
+    return summary("energy_mse", energy_errors(moved.pairs, test)) | summary("frame_mse", pictures), moved
 
 
 @in_float64
-def late_energy_errors(
-    model: LatentModel, parameters: Parameters, test: Frames, *, after: int = 1000, times: int = 32
-) -> Float[np.ndarray, " K"]:
-    """As `energy_errors`, for `times` frames from the frame number `after` on: whether the energy drifts."""
+def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames) -> Float[np.ndarray, " K"]:
+    """As `energy_errors`, for the `LATE` frames: whether the energy drifts."""
     parameters = with_float64(parameters)
-    q, p = encoded(model, parameters, test.pairs[:, 0])
-    frames = np.concatenate([[0.0], after + np.arange(float(times))])
-    latent = predict(model.field, parameters["field"], q, p, frames)
+    frames = np.concatenate([[0.0], LATE])
+    latent = predict(model.field, parameters["field"], *encoded(model, parameters, test.pairs[:, 0]), frames)
     late = Motions(frames[1:], latent.q[:, 1:], latent.p[:, 1:])
     found = physical_energy(*physical_states(decoded(model, parameters, late)))
     return finite_or_infinite(np.mean((found - physical_energy(test.q[:, :1], test.qd[:, :1])) ** 2, axis=1))
@@ -156,9 +153,6 @@ def late_energy_errors(
 def energy_floor(test: Frames) -> float:
     """The estimator's own mean square error of the energy, in J², on true frames."""
     return float(np.mean(energy_errors(test.pairs, test)))
-
-
-_CLIMB, _CORRECTIONS = 20, 3
 
 
 class Injection(NamedTuple):
@@ -249,11 +243,6 @@ def _states(pairs: Array) -> tuple[Array, Array]:
 
 
 # Compiled once for each model, whatever its parameters.
-@functools.partial(jax.jit, static_argnames=("model",))
-def _encoded(model: LatentModel, parameters: Parameters, pairs: Array):
-    return jax.vmap(model.apply(parameters).encode)(pairs)
-
-
-@functools.partial(jax.jit, static_argnames=("model",))
-def _decoded(model: LatentModel, parameters: Parameters, q: Array, p: Array):
-    return jax.vmap(model.apply(parameters).decode)(q, p)
+@functools.partial(jax.jit, static_argnames=("model", "function"))
+def _applied(function: str, model: LatentModel, parameters: Parameters, *arrays: Array):
+    return jax.vmap(getattr(model.apply(parameters), function))(*arrays)

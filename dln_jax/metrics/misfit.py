@@ -15,6 +15,11 @@ from jaxtyping import Float
 
 from dln_jax.types import InputError
 
+LEAST_SIGNIFICANCE = 5.0
+"""Standard errors from zero at which the mean power counts."""
+LEAST_SHARE = 0.01
+"""Of the residual's mean square that velocity must explain."""
+
 
 class Misfit(NamedTuple):
     """What residuals say of a force that is missing, for each joint [d]."""
@@ -37,21 +42,16 @@ def velocity_misfit(
     qd: Float[np.ndarray, "N d"],
     residual: Float[np.ndarray, "N d"],
     trajectory: np.ndarray | None = None,
-    *,
-    least_significance: float = 5.0,
-    least_share: float = 0.01,
 ) -> Misfit:
     """Looks for friction that a model lacks in its torque residuals tau - tau_hat [N, d].
 
     A potential that is missing does work too, along motions that do not return; it explains little of its residual
-    by velocity, which is what `least_share` is for.
+    by velocity, which is what `LEAST_SHARE` is for.
 
     Args:
         qd: velocities.
         residual: tau - tau_hat.
         trajectory: index of each sample's trajectory, whose samples count as one; `None` for independent samples.
-        least_significance: standard errors from zero at which the mean power counts.
-        least_share: of the residual's mean square that velocity must explain.
 
     Raises:
         InputError: fewer than three samples, or shapes that differ.
@@ -73,5 +73,5 @@ def velocity_misfit(
 
     coefficient = ratio(power.sum(axis=0), moving)
     share, significance = ratio(coefficient**2 * moving, left), ratio(means.mean(axis=0), error)
-    missing = (abs(significance) >= least_significance) & (share >= least_share)
+    missing = (abs(significance) >= LEAST_SIGNIFICANCE) & (share >= LEAST_SHARE)
     return Misfit(np.sqrt(left / len(qd)), coefficient, share, power.mean(axis=0), significance, missing)

@@ -22,7 +22,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.integrators import advance, rk4
 from dln_jax.rollout import rollout
-from dln_jax.types import InputError, Scalar, Vector, require_positive
+from dln_jax.types import InputError, Vector, require_positive
 
 Torque = Literal["held", "interpolated"]
 
@@ -212,18 +212,15 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, 
         def field(s, state):
             q, qd, _ = state
             driving = tau + s * slope
-            return qd, dynamics.forward_dynamics(q, qd, driving), _power(dynamics, q, qd, driving)
+            # The work's rate is that of the energy: friction counts.
+            at_work = driving - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else driving
+            return qd, dynamics.forward_dynamics(q, qd, driving), qd @ at_work
 
         return advance(rk4(field), jnp.zeros_like(duration), state, duration, substeps=substeps), None
 
     start = (q0, qd0, jnp.zeros_like(q0[0]))
     _, later = rollout(interval, start, (tau, slopes, durations))
     return Motion(*(jnp.concatenate([first[None], rest]) for first, rest in zip(start, later, strict=True)))
-
-
-def _power(dynamics: Dynamics | PlainDynamics, q: Vector, qd: Vector, tau: Vector) -> Scalar:
-    """qdᵀ (tau - friction), which is dE/dt."""
-    return qd @ (tau - dynamics.friction(q, qd)) if isinstance(dynamics, Dynamics) else qd @ tau
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:
