@@ -1,1 +1,21 @@
 """What a user's file is: the schema, its reading and its splits."""
+
+from dln_jax.data import functions
+from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.data.schema import Trajectories, load, save
+from dln_jax.data.splits import Split, hold_out, merged, partition_labels, select, split
+
+__all__ = [
+    "FunctionSamples",
+    "SampleSplit",
+    "Split",
+    "Trajectories",
+    "functions",
+    "hold_out",
+    "load",
+    "merged",
+    "partition_labels",
+    "save",
+    "select",
+    "split",
+]
