@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.arguments import Unstated, require_positive_if_given
 from dln_jax.command_line.options import Resumable
 from dln_jax.command_line.running import command_folder
 from dln_jax.files import write_bytes, write_figure
 from dln_jax.studies.arm import table
-from dln_jax.studies.case import Case, measure, say_numbers, stored_findings
+from dln_jax.studies.case import Case, measure, say_numbers
 from dln_jax.studies.report import conditions, publish
-from dln_jax.types import require_positive
 
 
 @dataclass(frozen=True)
@@ -45,16 +44,13 @@ class Arguments(Resumable):
 
 def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
-    require_positive(seeds=given.seeds, split_seeds=given.split_seeds)
-    if given.steps is not None:
-        require_positive(steps=given.steps)
+    require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
     sets, parts = table.data_sets(given.data, given.uniform, given.splits)
     counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
     cases = table.cases(sets, parts, **counts)
     with command_folder(given, "arm_table") as folder:
-        stored = stored_findings(folder, cases) if given.resume else {}
         say = say_numbers("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
-        found = measure(sorted(cases, key=_late), say, folder=folder, stored=stored)
+        found = measure(sorted(cases, key=_late), say, folder=folder, resume=given.resume)
         rows = table.table_rows({case.name: found[case.name] for case in cases})
         facts = conditions(
             dtype="float64; adam float32",

@@ -8,8 +8,7 @@ gradients of the torque loss at batch 512, single calls are one state. `mechanic
 from dataclasses import dataclass
 
 from dln_jax.command_line.options import Folder
-from dln_jax.studies.case import measure_and_draw
-from dln_jax.studies.report import conditions, publish
+from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.speed.derivatives import cases
 from dln_jax.zoo.run_folder import run_folder
 
@@ -28,5 +27,5 @@ def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     chosen = cases(width=given.width, repetitions=given.repetitions)
     with run_folder(given.out, "delan_derivatives_report") as folder:
-        facts = conditions(dtype="float32", seeds=[0], call_path="default jit, compilation apart, results waited for")
-        publish(folder, measure_and_draw(folder, chosen), facts)
+        timed = "default jit, compilation apart, results waited for"
+        measure_and_publish(folder, chosen, dtype="float32", seeds=[0], call_path=timed)

@@ -15,8 +15,7 @@ from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import CHARACTERS_TEST
 from dln_jax.studies.arm.published_protocol import cases
 from dln_jax.studies.arm.table import letters
-from dln_jax.studies.case import measure_and_draw
-from dln_jax.studies.report import conditions, publish
+from dln_jax.studies.case import measure_and_publish
 from dln_jax.types import require_positive
 from dln_jax.zoo.run_folder import run_folder
 
@@ -43,6 +42,5 @@ def main(given: Arguments) -> None:
     data, name = letters(given.data), "embedded-letters" if given.data is None else given.data.stem
     sets = [split(data, test=given.test.split(","), seed=seed) for seed in range(given.seeds)]
     with run_folder(given.out, "delan_report") as folder:
-        rows = measure_and_draw(folder, cases(name, sets, steps=given.steps))
-        facts = conditions(dtype="float32; textbook float64", seeds=list(range(given.seeds)), call_path="default jit")
-        publish(folder, rows, facts)
+        chosen, seeds = cases(name, sets, steps=given.steps), list(range(given.seeds))
+        measure_and_publish(folder, chosen, dtype="float32; textbook float64", seeds=seeds, call_path="default jit")

@@ -7,14 +7,14 @@ formulas of its activations already give faster derivatives. Repetitions of all 
 machine slows all alike; medians are compared. Prints a table and writes report.json.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Folder
-from dln_jax.studies.case import measure_and_draw
-from dln_jax.studies.differential_networks.one_pass import PLAIN, Timed, cases
-from dln_jax.studies.report import conditions, publish
+from dln_jax.command_line.running import stored_arguments
+from dln_jax.studies.case import measure_and_publish
+from dln_jax.studies.differential_networks.one_pass import PLAIN, cases
 from dln_jax.zoo.run_folder import run_folder
 
 
@@ -37,9 +37,8 @@ class Arguments(Folder):
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     names_in("--activation", given.activation, PLAIN)
-    chosen = cases(Timed(**{key: value for key, value in asdict(given).items() if key != "out"}))
+    chosen = cases(**stored_arguments(given))
     with run_folder(given.out, "diffnet_report") as folder:
         network = f"{given.depth} layers of {given.width}, {given.activation}, batch {given.batch}"
-        facts = conditions(dtype="float32", network=network, repetitions=given.repetitions)
-        publish(folder, measure_and_draw(folder, chosen), facts)
+        measure_and_publish(folder, chosen, dtype="float32", network=network, repetitions=given.repetitions)
         print(f"{network}; gradient of the training loss included; medians of {given.repetitions} interleaved calls")

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.command_line.options import Resumable
-from dln_jax.command_line.running import command_folder
-from dln_jax.studies.differential_networks.table import Extent, cases, measure_into
+from dln_jax.command_line.running import command_folder, stored_arguments
+from dln_jax.learning.functions import WIDTHS
+from dln_jax.studies.case import by_case, measure, rows_in, say_numbers
+from dln_jax.studies.differential_networks.table import OPTIMIZERS, QUANTITIES, cases, comparison, table_rows
+from dln_jax.studies.report import conditions, publish
 from dln_jax.types import require_seed
 
 
@@ -35,7 +38,21 @@ class Arguments(Resumable):
 def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     require_seed(given.seed)
-    extent = Extent(*(getattr(given, name) for name in Extent._fields))
-    chosen = cases(extent)
+    chosen = cases(**stored_arguments(given))
     with command_folder(given, "diffnet_table") as folder:
-        measure_into(folder, chosen, extent, resume=given.resume)
+        say = say_numbers(*QUANTITIES, "width", "job_seconds")
+        rows = table_rows(rows_in(measure(chosen, say, folder=folder, resume=given.resume)))
+        facts = conditions(
+            dtype="float64 for gauss-newton, float32 for adam",
+            seeds=[given.seed],
+            adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
+            gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
+            f"grown through {', '.join(map(str, WIDTHS))} by validation",
+            selection="widths and stopping by validation; best of a row over losses and activations, as published",
+            samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
+        )
+        numbers = by_case(rows)
+        tables = [comparison(numbers, optimizer, facts[optimizer.replace("-", "_")]) for optimizer in OPTIMIZERS]
+        publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
+        print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
+        print(facts["samples"])

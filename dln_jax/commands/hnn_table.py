@@ -14,7 +14,7 @@ from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.options import Drawn, Resumable
 from dln_jax.command_line.running import command_folder
 from dln_jax.files import write_bytes
-from dln_jax.studies.case import measure, say_numbers, stored_findings
+from dln_jax.studies.case import measure, rows_in, say_numbers
 from dln_jax.studies.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import PIXELS, REAL, problem_of
 from dln_jax.studies.hamiltonian.training import RECIPES
@@ -47,12 +47,11 @@ def main(given: Arguments) -> None:
     cases(names, folder=None, **counts)  # refuses before anything is written
     with command_folder(given, "hnn_table") as folder:
         chosen = cases(names, folder=folder if given.figures else None, **counts)
-        stored = stored_findings(folder, chosen) if given.resume else {}
         if REAL not in names and REAL in given.tasks.split(","):
             print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
         say = say_numbers("clean_field_mse", "energy_mse", "published_energy_mse", "train_seconds", "compile_seconds")
-        found = measure(chosen, say, folder=folder, stored=stored)
-        rows = table_rows([row for findings in found.values() for row in findings.rows])
+        found = measure(chosen, say, folder=folder, resume=given.resume)
+        rows = table_rows(rows_in(found))
         facts = conditions(
             dtype="float64",
             seeds=list(range(given.seeds)),

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Folder
-from dln_jax.studies.case import Done, measure
+from dln_jax.studies.case import Done, measure, rows_in
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.stability.interruptions import RUNS, cases
 from dln_jax.zoo.run_folder import run_folder
@@ -32,9 +32,8 @@ def main(given: Arguments) -> None:
     """Kills, resumes, compares, prints and writes."""
     chosen = cases(names_in("--runs", given.runs, RUNS), kills=given.kills, seed=given.seed)
     with run_folder(given.out, "interruptions") as folder:
-        rows = [row for findings in measure(chosen, say).values() for row in findings.rows]
-        facts = conditions(dtype="that of each run", seeds=[given.seed], kills=given.kills, runs=RUNS)
-        publish(folder, rows, facts)
+        rows = rows_in(measure(chosen, say))
+        publish(folder, rows, conditions(dtype="that of each run", seeds=[given.seed], kills=given.kills, runs=RUNS))
 
 
 def say(done: Done) -> None:

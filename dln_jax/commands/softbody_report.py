@@ -10,8 +10,7 @@ from typing import Annotated
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
-from dln_jax.studies.case import measure_and_draw
-from dln_jax.studies.report import conditions, publish
+from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.soft_bodies import SUBJECTS, cases
 
 
@@ -30,6 +29,5 @@ def main(given: Arguments) -> None:
     subjects = names_in("--only", given.only, SUBJECTS)
     chosen = [case for each in subjects for case in cases(quick=given.quick) if case.name.startswith(f"{each}/")]
     with command_folder(given, "softbody") as folder:
-        rows = measure_and_draw(folder, chosen, figures=given.figures)
-        facts = conditions(dtype="float64, and float32 where a case says so", seeds=[0], quick=given.quick)
-        publish(folder, rows, facts)
+        facts = {"dtype": "float64, and float32 where a case says so", "seeds": [0], "quick": given.quick}
+        measure_and_publish(folder, chosen, figures=given.figures, **facts)

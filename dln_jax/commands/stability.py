@@ -10,8 +10,7 @@ from typing import Annotated
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
-from dln_jax.studies.case import measure_and_draw, named
-from dln_jax.studies.report import conditions, publish
+from dln_jax.studies.case import measure_and_publish, named
 from dln_jax.studies.stability import NAMES, cases
 
 
@@ -29,6 +28,5 @@ def main(given: Arguments) -> None:
     """Measures, prints and writes."""
     chosen = named(cases(steps=given.steps), *names_in("--only", given.only, NAMES))
     with command_folder(given, "stability") as folder:
-        rows = measure_and_draw(folder, chosen, figures=given.figures)
-        facts = conditions(dtype="float64, and float32 where a case says so", seeds=[0], steps=given.steps)
-        publish(folder, rows, facts)
+        facts = {"dtype": "float64, and float32 where a case says so", "seeds": [0], "steps": given.steps}
+        measure_and_publish(folder, chosen, figures=given.figures, **facts)

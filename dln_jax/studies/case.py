@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeGuard
 from matplotlib.figure import Figure
 
 from dln_jax.files import is_file, matches, read_json, write_figure, write_json
-from dln_jax.studies.report import Row
+from dln_jax.studies.report import Row, conditions, publish
 from dln_jax.types import InputError
 
 JOBS = "jobs.json"
@@ -51,14 +51,14 @@ def measure(
     report: Callable[[Done], None],
     *,
     folder: Path | None = None,
-    stored: Mapping[str, Findings] | None = None,
+    resume: bool = False,
 ) -> dict[str, Findings]:
-    """Measures the cases one after the other, and tells `report` of each, also of one that was `stored` before.
+    """Measures the cases one after the other, and tells `report` of each.
 
     Returns the findings by name, in the order of the cases. The jobs.json of a `folder` keeps what is there after each
-    case; of rows that is case, quantity and value.
+    case; of rows that is case, quantity and value. With `resume`, what it has is not measured again.
     """
-    found = dict(stored or {})
+    found = stored_findings(folder, cases) if folder and resume else {}
     for number, case in enumerate(cases, start=1):
         began = time.perf_counter()
         if case.name not in found:
@@ -73,17 +73,22 @@ def measure(
     return {case.name: found[case.name] for case in cases}
 
 
-def measure_and_draw(folder: Path, cases: Sequence[Case], *, figures: bool = True) -> list[Row]:
-    """All rows of the cases; prints a line of each as it is measured, and writes its figure."""
+def measure_and_publish(folder: Path, cases: Sequence[Case], *, figures: bool = True, **facts: Any) -> None:
+    """Measures cases with a line and a figure of each, and publishes all rows with `facts` among the conditions."""
 
-    def report(done: Done) -> None:
+    def say(done: Done) -> None:
         bound = [row.passed for row in done.findings.rows if row.passed is not None]
         passed = f"{sum(bound)}/{len(bound)} pass  " if bound else ""
         print(f"{done.place}  {done.case.name:30s} {passed}{done.seconds:.1f} s", flush=True)
         if figures:
             draw(folder, done.case, done.findings)
 
-    return [row for findings in measure(cases, report).values() for row in findings.rows]
+    publish(folder, rows_in(measure(cases, say)), conditions(**facts))
+
+
+def rows_in(found: Mapping[str, Findings]) -> list[Row]:
+    """All rows of what was measured."""
+    return [row for findings in found.values() for row in findings.rows]
 
 
 def say_numbers(*shown: str) -> Callable[[Done], None]:

@@ -5,16 +5,27 @@ import json
 import numpy as np
 import pytest
 
+from dln_jax.studies import soft_bodies, stability
+from dln_jax.studies.arm import table as arm
 from dln_jax.studies.case import JOBS, Case, Findings, by_case, measure, named, rows_of, stored_findings
+from dln_jax.studies.differential_networks import one_pass
+from dln_jax.studies.differential_networks import table as differential_networks
+from dln_jax.studies.hamiltonian import table as hamiltonian
 from dln_jax.studies.published import ARM, DIFFERENTIAL_NETWORKS, HAMILTONIAN, published
-from dln_jax.studies.registry import STUDIES
+from dln_jax.studies.speed import derivatives, subjects
+from dln_jax.studies.stability import interruptions
 from dln_jax.types import InputError
 
+STUDIES = (
+    *(arm, differential_networks, one_pass, hamiltonian, interruptions),
+    *(derivatives, soft_bodies, subjects, stability),
+)
 
-@pytest.mark.parametrize("study", STUDIES)
+
+@pytest.mark.parametrize("study", STUDIES, ids=lambda study: study.__name__)
 def test_every_study_has_cases_with_names_of_their_own(study, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    names = [case.name for case in STUDIES[study]()]
+    names = [case.name for case in study.cases()]
     assert names and len(set(names)) == len(names)
     assert all(name == name.lower() and " " not in name for name in names)
 
@@ -31,8 +42,8 @@ def test_a_table_is_continued_with_what_was_measured(tmp_path):
     assert told == ["1/2", "2/2"] and np.isnan(by_case(stored["b"].rows)["b"]["error"])
     assert stored["a"].rows == rows_of("a", {"error": 1.0})
     assert stored["a"].curves["t"][0] == 1.0 and np.isnan(stored["a"].curves["t"][1])
-    again = measure([numbers("a", 2.0), second], told.append, stored={"a": stored["a"]})
-    assert list(again) == ["a", "b"] and again["a"] is stored["a"]
+    again = measure([numbers("a", 2.0), second], told.append, folder=tmp_path, resume=True)
+    assert list(again) == ["a", "b"] and again["a"].rows == stored["a"].rows
     assert stored_findings(tmp_path / "none", [first]) == {}
 
 

@@ -8,7 +8,6 @@ formulas of its activations already give faster derivatives.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,30 +26,23 @@ PLAIN = {"tanh": jnp.tanh, "softplus": jax.nn.softplus, "cos": jnp.cos, "sin": j
 """Activations as jax.numpy has them."""
 
 
-class Timed(NamedTuple):
-    """What is timed."""
-
-    width: int = 128
-    depth: int = 2
-    batch: int = 512
-    activation: str = "tanh"
-    repetitions: int = 30
-
-
-def cases(timed: Timed = Timed()) -> list[Case]:  # noqa: B008  a tuple
+def cases(
+    *, width: int = 128, depth: int = 2, batch: int = 512, activation: str = "tanh", repetitions: int = 30
+) -> list[Case]:
     """A case for each number of inputs; `InputError` for sizes that are not positive."""
-    require_network(width=timed.width, depth=timed.depth)
-    require_positive(batch=timed.batch, repetitions=timed.repetitions)
-    return [Case(f"diffnet-pass/n-{inputs}", partial(compared, inputs, timed)) for inputs in INPUTS]
+    require_network(width=width, depth=depth)
+    require_positive(batch=batch, repetitions=repetitions)
+    settings = {"hidden": (width,) * depth, "batch": batch, "activation": activation, "repetitions": repetitions}
+    return [Case(f"diffnet-pass/n-{inputs}", partial(compared, inputs, **settings)) for inputs in INPUTS]
 
 
-def compared(inputs: int, timed: Timed) -> Findings:
+def compared(inputs: int, *, hidden: tuple[int, ...], batch: int, activation: str, repetitions: int) -> Findings:
     """Times and their ratios for one number of inputs."""
-    programs, arguments = programs_for(inputs, timed)
+    programs, arguments = programs_for((inputs, *hidden, 1), batch, activation)
     seconds = medians_in_turns(
         {name: jax.jit(program).lower(*arguments).compile() for name, program in programs.items()},
         arguments,
-        repetitions=timed.repetitions,
+        repetitions=repetitions,
     )
     case, ours, bound = f"diffnet-pass/n-{inputs}", seconds["one_pass"], BOUNDS.get(inputs)
     rows = [
@@ -61,19 +53,18 @@ def compared(inputs: int, timed: Timed) -> Findings:
     return Findings([*rows, *(Row(case, f"{name}_ms", 1e3 * value, "ms") for name, value in seconds.items())])
 
 
-def programs_for(inputs: int, timed: Timed) -> tuple[dict[str, Callable], tuple]:
+def programs_for(sizes: tuple[int, ...], batch: int, name: str) -> tuple[dict[str, Callable], tuple]:
     """Gradients of a loss on value, gradient and Hessian by either way, and of one on the value; (layers, x)."""
-    function = activation(timed.activation)
-    sizes = (inputs, *(timed.width,) * timed.depth, 1)
+    function = activation(name)
     layers = differential_mlp.init(jax.random.key(0), sizes, dtype=jnp.float32)
-    x = jax.random.normal(jax.random.key(1), (timed.batch, inputs), jnp.float32)
+    x = jax.random.normal(jax.random.key(1), (batch, sizes[0]), jnp.float32)
 
     def value(layers, x):
         return differential_mlp.value(layers, x, activation=function)[0]
 
     def plain(layers, x):
         for weight, bias in layers[:-1]:
-            x = PLAIN[timed.activation](x @ weight + bias)
+            x = PLAIN[name](x @ weight + bias)
         return (x @ layers[-1][0] + layers[-1][1])[0]
 
     def by_autodiff(network):

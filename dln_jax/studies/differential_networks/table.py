@@ -4,8 +4,6 @@ import itertools
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from typing import NamedTuple
 
 from rich.table import Table
 
@@ -24,10 +22,10 @@ from dln_jax.learning.functions import (
 )
 from dln_jax.metrics.functions import errors, predictions
 from dln_jax.nn.activations import activation
-from dln_jax.studies.case import Case, Findings, by_case, measure, rows_of, say_numbers, stored_findings
+from dln_jax.studies.case import Case, Findings, rows_of
 from dln_jax.studies.published import DIFFERENTIAL_NETWORKS as TABLE
 from dln_jax.studies.published import published
-from dln_jax.studies.report import Row, conditions, publish, unit_of
+from dln_jax.studies.report import Row, unit_of
 
 OPTIMIZERS = ("gauss-newton", "adam")
 LOSSES = ("type1", "type2")
@@ -38,57 +36,28 @@ FACTORS = {"sin": 30.0, "cos_sin": 10.0}
 TITLES = {"sin": ("1-D f", "1-D f'", "1-D f''"), "cos_sin": ("2-D f", "2-D gradient", "2-D Hessian")}
 
 
-class Extent(NamedTuple):
-    """How much is trained, of what."""
+def cases(
+    *, samples: int = 25_600, seed: int = 0, steps: int = 40, coarse_steps: int = 200, epochs: int = 500
+) -> list[Case]:
+    """A case for each function, loss and activation by each optimiser; `InputError` for settings that cannot be.
 
-    samples: int = 25_600
-    seed: int = 0
-    steps: int = 40
-    """Of Gauss-Newton on all samples, at most."""
-    coarse_steps: int = 200
-    """Before those on some of them, at most."""
-    epochs: int = 500
-    """Of Adam."""
-
-
-def measure_into(folder: Path, chosen: Sequence[Case], given: Extent, *, resume: bool = False) -> None:
-    """Measures what has not been measured yet of `cases(given)`, prints, and writes report.json."""
-    stored = stored_findings(folder, chosen) if resume else {}
-    found = measure(chosen, say_numbers(*QUANTITIES, "width", "job_seconds"), folder=folder, stored=stored)
-    rows = table_rows([row for findings in found.values() for row in findings.rows])
-    facts = conditions(
-        dtype="float64 for gauss-newton, float32 for adam",
-        seeds=[given.seed],
-        adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
-        gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
-        f"grown through {', '.join(map(str, WIDTHS))} by validation",
-        selection="widths and stopping by validation; best of a row over losses and activations, as published",
-        samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
-    )
-    numbers = by_case(rows)
-    tables = [comparison(numbers, optimizer, facts[optimizer.replace("-", "_")]) for optimizer in OPTIMIZERS]
-    publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
-    print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
-    print(facts["samples"])
-
-
-def cases(given: Extent = Extent()) -> list[Case]:  # noqa: B008  a tuple
-    """A case for each function, loss and activation by each optimiser; `InputError` for settings that cannot be."""
+    Gauss-Newton takes `steps` iterations on all samples at most, before those `coarse_steps` on some; Adam `epochs`.
+    """
     problems = {
-        "sin": (functions.sine(samples=given.samples, seed=given.seed), functions.sine_grid()),
-        "cos_sin": (functions.cosine_sine(samples=given.samples, seed=given.seed), functions.cosine_sine_grid()),
+        "sin": (functions.sine(samples=samples, seed=seed), functions.sine_grid()),
+        "cos_sin": (functions.cosine_sine(samples=samples, seed=seed), functions.cosine_sine_grid()),
     }
     found = []
     for optimizer, function, loss, name in itertools.product(OPTIMIZERS, problems, LOSSES, ACTIVATIONS):
         if (optimizer, name) == ("gauss-newton", "relu"):
             continue
         data, test = problems[function]
-        sets = functions.split(data, seed=given.seed)
-        network = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=given.seed)
-        optimiser = published_adam(len(sets.train.x), epochs=given.epochs)
+        sets = functions.split(data, seed=seed)
+        network = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=seed)
+        optimiser = published_adam(len(sets.train.x), epochs=epochs)
         if optimizer == "gauss-newton":
             network = network._replace(width=WIDTHS[0], precision="f64")
-            optimiser = GAUSS_NEWTON._replace(steps=given.steps, coarse_steps=given.coarse_steps)
+            optimiser = GAUSS_NEWTON._replace(steps=steps, coarse_steps=coarse_steps)
         targets(data, network)
         optimisers.check(optimiser)
         case = f"{function}/{loss}/{name}/{optimizer}"
