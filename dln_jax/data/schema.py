@@ -68,6 +68,14 @@ def load(path: str | Path) -> Trajectories:
     return archive.load(path, from_arrays, KEYS)
 
 
+def column(data: Trajectories, key: str) -> np.ndarray:
+    """One of the arrays that data may lack; `InputError` where they do."""
+    array = getattr(data, key)
+    if array is None:
+        raise InputError(f"the data have no {key}, which is needed here; add it")
+    return array
+
+
 def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     """Checks arrays against the schema and completes them.
 

@@ -34,19 +34,19 @@ def stubbed(tmp_path, monkeypatch):
 
     def measure(*arguments, **keywords):
         calls.append(arguments)
-        return NUMBERS, arm_models.Curve([1.0, 4.0], [1e-3, 1e-7])
+        return NUMBERS, {"seconds": [1.0, 4.0], "errors": [1e-3, 1e-7]}
 
     def measure_split(kind, sets, *, seeds, steps):
         """Errors that grow from one call to the next, the worst seed ten times the median."""
         calls.append(sets.test)
-        return {"torque_mse": len(calls) * 1e-9, "torque_mse_largest": len(calls) * 1e-8}, None
+        return {"torque_mse": len(calls) * 1e-9, "torque_mse_largest": len(calls) * 1e-8}, {}
 
     for name in ("measure_seeds", "measure_trigonometric", "measure_adam"):
         monkeypatch.setattr(table, name, measure)
     monkeypatch.setattr(table, "measure_split", measure_split)
     plant = {"vpt_seconds": 3.1, "whole_circle_torque_mean_square": 70.0}
-    monkeypatch.setattr(table, "measure_plant", lambda scene, sets: (plant, None))
-    monkeypatch.setattr(table, "measure_one_by_one", lambda *a, **k: (TIMES, None))
+    monkeypatch.setattr(table, "measure_plant", lambda scene, sets: (plant, {}))
+    monkeypatch.setattr(table, "measure_one_by_one", lambda *a, **k: (TIMES, {}))
     return calls
 
 
@@ -86,7 +86,7 @@ def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys
     # A table that is continued measures nothing twice.
     measured = len(stubbed)
     command(arm_table, "--out", "table", "--resume")
-    assert len(stubbed) == measured == 2 + 3 * len(table.SIZES) + 7 * len(table.MODELS)
+    assert len(stubbed) == measured == 2 + 3 * len(table.WIDTHS) + 7 * len(table.MODELS)
     assert json.loads((tmp_path / "table" / "report.json").read_text())["rows"] == report["rows"]
 
 
@@ -105,8 +105,7 @@ def test_the_trigonometric_model_and_the_plant_are_measured(tmp_path):
     assert len(sets.validation.t) == 6 and len(np.unique(sets.test.trajectory)) == 3
     numbers, curve = arm_models.measure_trigonometric(sets)
     assert numbers["torque_mse"] < 1e-20 and numbers["noisy_torque_mse"] < 1e-2
-    assert curve is not None
-    assert curve.errors == [numbers["torque_mse"]] or curve.errors == [1e-32]
+    assert curve["errors"] == [numbers["torque_mse"]] or curve["errors"] == [1e-32]
     assert numbers["whole_circle_torque_mse"] < 1e-20
     plant, _ = arm_models.measure_plant(two_link_arm(), sets)
     assert numbers["vpt_seconds"] == pytest.approx(plant["vpt_seconds"])

@@ -1,6 +1,6 @@
 """One model of the arm's table: trained, measured on the test, and timed."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,32 +37,16 @@ TARGETS = (1.35e-5, 1e-8, 1e-9, 1e-10)
 """Test errors in (N m)² whose times are measured; the first is the published code's after 108 s."""
 
 
-class Size(NamedTuple):
-    """A network, and how long Gauss-Newton takes it to level off; chosen by validation errors."""
-
-    width: int
-    depth: int
-    activation: str
-    steps: int
-
-
-SIZES = {
-    "structured-delan": Size(8, 2, "tanh", 150),
-    "black-box-delan": Size(16, 2, "tanh", 150),
-    "structured-hnn": Size(8, 2, "tanh", 150),
-    "black-box-hnn": Size(16, 2, "tanh", 150),
-    "feed-forward": Size(16, 2, "tanh", 150),
+WIDTHS = {
+    **{"structured-delan": 8, "black-box-delan": 16, "structured-hnn": 8, "black-box-hnn": 16},
+    **{"feed-forward": 16},
 }
+DEPTH, STEPS = 2, 150
+"""Of these networks, of tanh, and until Gauss-Newton levels off; all chosen by validation errors."""
 
-
-class Curve(NamedTuple):
-    """Test torque error against seconds of training, per seed, compilation included."""
-
-    seconds: list[float]
-    errors: list[float]
-
-
-Measured = tuple[dict[str, float], Curve | None]
+Curve = dict[str, list[float]]
+"""Test torque "errors" against "seconds" of training, per seed, compilation included; empty where there are none."""
+Measured = tuple[dict[str, float], Curve]
 
 
 def whole_circle() -> Trajectories:
@@ -98,7 +82,7 @@ def measure_plant(scene: Scene, sets: Split) -> Measured:
         **on_the_test(scene.energies, sets, H=legendre(scene.lagrangian)),
         "free_motion_inside_seconds": free_motion_inside_seconds(scene, sets),
         "whole_circle_torque_mean_square": mean_square(whole_circle().tau),
-    }, None
+    }, {}
 
 
 def linear_fit(data: Trajectories) -> tuple[LinearFit, Driven]:
@@ -132,13 +116,13 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
     training, energies = trained(kind, sets, seeds=seeds, steps=steps)
     systems = [compiled(dynamics(each), jnp.float64) for each in energies]
     of_seeds = [
-        {
-            **on_the_test(of_seed, sets),
-            "whole_circle_torque_mse": torque_mse(system, whole_circle()),
-            **definite(kind, system, sets),
-        }
+        {**on_the_test(of_seed, sets), "whole_circle_torque_mse": torque_mse(system, whole_circle())}
         for of_seed, system in zip(energies, systems, strict=True)
     ]
+    if CATALOGUE[kind].properties.energy and not CATALOGUE[kind].properties.definite:
+        for numbers, system in zip(of_seeds, systems, strict=True):
+            found = definiteness(system, sets.test.q, sets.test.qd)
+            numbers["share_not_definite"] = found.share_not_definite
     torques = [each["torque_mse"] for each in of_seeds]
     numbers = {
         **{key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]},
@@ -152,7 +136,7 @@ def measure_seeds(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
 
 def trained(kind: str, sets: Split, *, seeds: int, steps: int | None) -> tuple[Training, list[Driven]]:
     """Gauss-Newton on several seeds in one program, and the energies of each."""
-    model, optimiser = prepared(kind, sets, SIZES[kind], steps)
+    model, optimiser = prepared(kind, sets, steps=steps)
     objective = objective_of(kind, sets.train)
     training = fit(problem(model, sets, objective, seeds=tuple(range(seeds))), optimiser)
     each = [jax.tree.map(lambda leaf, index=index: leaf[index], training.parameters) for index in range(seeds)]
@@ -166,7 +150,7 @@ def measure_split(kind: str, sets: Split, *, seeds: int, steps: int | None) -> M
     else:
         _, energies = trained(kind, sets, seeds=seeds, steps=steps)
     torques = [torque_mse(dynamics(each), sets.test) for each in energies]
-    return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, None
+    return {"torque_mse": float(np.median(torques)), "torque_mse_largest": float(np.max(torques))}, {}
 
 
 def measure_adam(kind: str, sets: Split, *, steps: int) -> Measured:
@@ -192,8 +176,7 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
 
     Also the cost of ten seeds in one program in units of a single run, compilation included.
     """
-    kind = "structured-delan"
-    model, optimiser = prepared(kind, sets, SIZES[kind], steps)
+    model, optimiser = prepared("structured-delan", sets, steps=steps)
     times: dict[float, list[float]] = {target: [] for target in TARGETS}
     final, singles = [], []
     for seed in range(seeds):
@@ -212,13 +195,15 @@ def measure_one_by_one(sets: Split, *, seeds: int, steps: int | None) -> Measure
         "torque_mse_largest": float(np.max(final)),
         "train_seconds": float(np.median(singles)),
         "cost_of_ten_seeds": (ten.compile_seconds + ten.train_seconds) / float(np.median(singles)),
-    }, None
+    }, {}
 
 
-def prepared(kind: str, sets: Split, size: Size, steps: int | None) -> tuple[Model, GaussNewton]:
+def prepared(
+    kind: str, sets: Split, *, steps: int | None, width: int | None = None, depth: int = DEPTH
+) -> tuple[Model, GaussNewton]:
     """The model of a kind, and its optimiser."""
-    model = build(described(kind, sets.train, width=size.width, depth=size.depth, activation=size.activation))
-    return model, GaussNewton(steps=steps or size.steps)
+    model = build(described(kind, sets.train, width=width or WIDTHS[kind], depth=depth))
+    return model, GaussNewton(steps=steps or STEPS)
 
 
 def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float], seeds: int) -> Curve:
@@ -226,26 +211,19 @@ def curve(kind: str, sets: Split, training: Training, numbers: dict[str, float],
     if objective_of(kind, sets.train) is not TORQUE:
         return end_of(numbers)
     seconds = [(training.compile_seconds + at.seconds) / seeds for at in training.history]
-    return Curve(seconds, np.minimum.accumulate([np.median(at.monitor) for at in training.history]).tolist())
+    errors = np.minimum.accumulate([np.median(at.monitor) for at in training.history]).tolist()
+    return {"seconds": seconds, "errors": errors}
 
 
 def end_of(numbers: dict[str, float]) -> Curve:
     """A path of which only the end is known."""
-    return Curve([numbers["train_seconds"]], [max(numbers["torque_mse"], 1e-32)])
-
-
-def definite(kind: str, system: Dynamics | PlainDynamics, sets: Split) -> dict[str, float]:
-    """The share of test states whose learned mass matrix is not definite, for models without structure."""
-    properties = CATALOGUE[kind].properties
-    if properties.definite or not properties.energy:
-        return {}
-    return {"share_not_definite": definiteness(system, sets.test.q, sets.test.qd).share_not_definite}
+    return {"seconds": [numbers["train_seconds"]], "errors": [max(numbers["torque_mse"], 1e-32)]}
 
 
 def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:
     """Errors, and how long motions are predicted; `H` as for `predictions`."""
-    predicted = predictions(energies, sets.test, dtype, H=H)
-    return {**errors(predicted, sets.test), **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
+    found = errors(predictions(energies, sets.test, dtype, H=H), sets.test)
+    return {**found, **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
 
 
 def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:

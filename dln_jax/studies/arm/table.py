@@ -19,8 +19,8 @@ from dln_jax.datasets.generators import uniform_tests
 from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.models import (
-    SIZES,
     TRIGONOMETRIC,
+    WIDTHS,
     Measured,
     measure_adam,
     measure_one_by_one,
@@ -34,7 +34,7 @@ from dln_jax.studies.published import ARM, published
 from dln_jax.studies.report import UNITS, Row, markdown_table, unit_of
 from dln_jax.types import InputError
 
-MODELS = (*SIZES, TRIGONOMETRIC)
+MODELS = (*WIDTHS, TRIGONOMETRIC)
 LAGRANGIAN = "structured-delan"
 STRUCTURED = (LAGRANGIAN, "structured-hnn")
 STRUCTURED_FACTOR = 100.0
@@ -108,7 +108,7 @@ def cases(
         ceilings = ("vpt_seconds", "whole_circle_torque_mean_square")
         found.append(_case(f"plant/{name}", partial(measure_plant, two_link_arm(), data), ceilings))
         found.append(_case(f"{TRIGONOMETRIC}/{name}", partial(measure_trigonometric, data), costs))
-        for kind in SIZES:
+        for kind in WIDTHS:
             found.append(_case(f"{kind}/{name}", partial(measure_seeds, kind, data, seeds=seeds, steps=steps), costs))
     for kind in MODELS:
         count = split_seeds if kind == LAGRANGIAN else 1
@@ -120,7 +120,7 @@ def cases(
     if timed_seeds:
         measure = partial(measure_one_by_one, written, seeds=timed_seeds, steps=steps)
         found.append(_case(f"{LAGRANGIAN}/characters/gauss-newton", measure))
-    for kind in SIZES if adam_steps else ():
+    for kind in WIDTHS if adam_steps else ():
         found.append(_case(f"{kind}/characters/adam", partial(measure_adam, kind, written, steps=adam_steps)))
     return found
 
@@ -128,7 +128,7 @@ def cases(
 def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] = ()) -> Case:
     def findings() -> Findings:
         numbers, curve = measure()
-        return Findings(rows_of(name, numbers), curve._asdict() if curve else {})
+        return Findings(rows_of(name, numbers), curve)
 
     return Case(name, findings, {name: quantities})
 

@@ -91,10 +91,10 @@ def generated(name: str, trajectories: int | None) -> Problem:
     """A task whose field is known."""
     task = PROTOCOLS[name](0) if trajectories is None else PROTOCOLS[name](0, trajectories=trajectories)
     clean = task.test.clean
-    assert clean.p is not None
     first = np.flatnonzero(np.diff(clean.trajectory, prepend=-1))[:STARTS]
     t = np.linspace(0.0, HORIZONS[name], POINTS)
-    q, p = reference_motion(task.hamiltonian, clean.q[first], clean.p[first], t, dissipation=task.scene.dissipation)
+    start = clean.q[first], schema.column(clean, "p")[first]
+    q, p = reference_motion(task.hamiltonian, *start, t, dissipation=task.scene.dissipation)
     energies = task.hamiltonian, task.published_energy
     return Problem(name, task.scene.needs, task.train.data, task.train, task.test, (Motions(t, q, p),), *energies)
 
@@ -132,8 +132,7 @@ def measured(name: str, data: Trajectories, file: str, needs: Needs | None) -> P
 
 def motion_of(test: Trajectories, length: int) -> Motions:
     """The first samples of one trajectory as the motion that is to be predicted."""
-    assert test.p is not None
-    return Motions(test.t[:length] - test.t[0], test.q[None, :length], test.p[None, :length])
+    return Motions(test.t[:length] - test.t[0], test.q[None, :length], schema.column(test, "p")[None, :length])
 
 
 def samples_of(data: Trajectories, chosen: slice) -> Trajectories:

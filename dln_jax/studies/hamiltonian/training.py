@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.data.magnitudes import spread
-from dln_jax.data.schema import Trajectories
+from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, hold_out
 from dln_jax.learning import motions, rates
 from dln_jax.learning.engine import problem as engine
@@ -237,8 +237,8 @@ def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, l
 
 def deviations(data: Trajectories) -> Weights:
     """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
-    assert data.p is not None
-    of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", data.p)))
-    if "qd" in data.estimated and np.array_equal(data.p, data.qd):
+    p = column(data, "p")
+    of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", p)))
+    if "qd" in data.estimated and np.array_equal(p, data.qd):
         of_p = ANCHOR * of_p
     return Weights(state=tuple(np.concatenate([of_q, of_p]).tolist()))

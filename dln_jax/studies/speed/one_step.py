@@ -20,7 +20,7 @@ import numpy as np
 
 from dln_jax.command_line.running import run
 from dln_jax.data.splits import Split
-from dln_jax.deploy.c.load import FLAGS, WARNINGS, CDynamics, compile_c, load_c
+from dln_jax.deploy.c.load import FLAGS, WARNINGS, CFunction, compile_c, load_c
 from dln_jax.deploy.c.source import export_run
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.figures.benchmarks import EXACT, cost_points
@@ -31,7 +31,7 @@ from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
-from dln_jax.studies.arm.models import SIZES, TRIGONOMETRIC, described
+from dln_jax.studies.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, described
 from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, unit_of
@@ -57,7 +57,7 @@ PROCESSES = 3
 def measure(quick: bool) -> Findings:
     """Trains every model of the arm, and times single calls in processes of their own."""
     sets = published_split(letters(None))
-    names = (WIDE, TRIGONOMETRIC) if quick else (*SIZES, WIDE, TRIGONOMETRIC)
+    names = (WIDE, TRIGONOMETRIC) if quick else (*WIDTHS, WIDE, TRIGONOMETRIC)
     with tempfile.TemporaryDirectory() as place:
         folders = [train_into(Path(place), name, sets, quick=quick) for name in names]
         predicted = [predictions(load(folder).energies, sets.test, jnp.float64) for folder in folders]
@@ -89,9 +89,8 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
     folder = place / name
     folder.mkdir()
     kind, wide = SMALL if name == WIDE else name, name == WIDE
-    network = {"width": 64, "depth": 2} if wide else SIZES[kind]._asdict() if kind in SIZES else {}
-    steps, precision = network.pop("steps", 20_000), "f32" if wide else "f64"
-    description = described(kind, sets.train, precision=precision, **network)
+    width, steps, precision = (64, 20_000, "f32") if wide else (WIDTHS.get(kind), STEPS, "f64")
+    description = described(kind, sets.train, precision=precision, width=width, depth=DEPTH)
     model = build(description)
     if kind == TRIGONOMETRIC:
         parameters = fit_linear(model, sets.train).parameters
@@ -186,7 +185,7 @@ def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arg
         except InputError:
             return found  # a kind that is not exported
         exported = load_c(place, name=EXPORTED)
-        assert isinstance(exported, CDynamics)
+        assert not isinstance(exported, CFunction)
         functions = {"inverse": exported.inverse_dynamics, "forward": exported.forward_dynamics}
         found["c-from-python"] = timed(functions, host)
         found["c-loop"] = {"inverse": {"calls_per_second": calls_in_c(Path(place), 20 * given.calls)}}

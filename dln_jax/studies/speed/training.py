@@ -8,9 +8,8 @@ from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.arm.models import (
-    SIZES,
+    WIDTHS,
     Measured,
-    Size,
     curve,
     end_of,
     linear_fit,
@@ -36,15 +35,14 @@ def measure(quick: bool) -> Findings:
     jobs: dict[str, Callable[[], Measured]] = {"trigonometric/letters": partial(linear, sets)}
     if quick:
         jobs[f"{QUICK}/letters/gauss-newton"] = partial(gauss_newton_alone, sets, steps=20)
-    for kind in () if quick else SIZES:
+    for kind in () if quick else WIDTHS:
         jobs[f"{kind}/letters/gauss-newton"] = partial(measure_seeds, kind, sets, seeds=1, steps=None)
         jobs[f"{kind}/letters/adam"] = partial(measure_adam, kind, sets, steps=ADAM_STEPS)
     rows, lines = [], {}
     for case, job in jobs.items():
         numbers, path = job()
         rows += [Row(case, name, numbers[name], unit) for name, unit in UNITS.items()]
-        if path is not None:
-            lines[case] = (path.seconds, path.errors)
+        lines[case] = (path["seconds"], path["errors"])
     return Findings(rows, lines)
 
 
@@ -57,7 +55,7 @@ def linear_alone(sets: Split) -> Measured:
 
 def gauss_newton_alone(sets: Split, *, steps: int) -> Measured:
     """A few steps of a small network, likewise."""
-    model, optimiser = prepared(QUICK, sets, Size(4, 1, "tanh", steps), steps)
+    model, optimiser = prepared(QUICK, sets, steps=steps, width=4, depth=1)
     training = fit(problem(model, sets), optimiser)
     error = torque_mse(dynamics(model.energies(training.parameters)), sets.test)
     numbers = {"torque_mse": error, "train_seconds": training.compile_seconds + training.train_seconds}

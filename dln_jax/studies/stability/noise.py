@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.data.schema import Trajectories
+from dln_jax.data.schema import Trajectories, column
 from dln_jax.datasets import generators
 from dln_jax.learning.linear import LinearFit, fit_linear
 from dln_jax.mechanics.equations import dynamics
@@ -39,7 +39,6 @@ def noise() -> Findings:
     model = make_trigonometric(scene.needs)
     cases, curves = [], {"torque": ([], []), "acceleration": ([], [])}
     inertia = np.linalg.norm(np.asarray(jax.vmap(scene.mass_matrix)(jnp.asarray(data.q))), axis=(1, 2))
-    assert data.tau_inertial is not None
     for level in LEVELS:
         for kind, key in (("torque", "tau"), ("acceleration", "qdd")):
             clean = getattr(data, key)
@@ -53,7 +52,7 @@ def noise() -> Findings:
                 text = f"s² P / N, P = {fit.rank}, within {DEVIATIONS:.0f} deviations of its chance"
             else:
                 variance = float(np.mean(inertia**2) * np.max(size**2))
-                predicted = variance * fit.rank / SAMPLES + level**4 * mean_square(data.tau_inertial)
+                predicted = variance * fit.rank / SAMPLES + level**4 * mean_square(column(data, "tau_inertial"))
                 text = "|M|² s² P / N plus the square of the bias s²/var(qdd) of M"
             name, text = f"noise/{kind}-{level:g}", f"torque MSE in units of {text}"
             cases.append(expect(name, "error_over_prediction", text, error / predicted, bound, reference=1.0))
