@@ -43,9 +43,9 @@ class Learner(NamedTuple):
 
     policy: Policy
     start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays."""
+    """Seed -> state, a tree of arrays; but for PPO, whose state is its model, and is not stored."""
     improve: Callable[[Any], Any]
-    """State -> state after some updates, traceable."""
+    """State -> state after some updates; of trees, traceable."""
     parameters: Callable[[Any], Parameters]
     """Of the policy in a state."""
     skipped: Callable[[Any], Any]
@@ -121,7 +121,7 @@ def learn(
     """Learns until the goal; with a directory, stores every evaluation's state there and can continue bit for bit.
 
     Args:
-        compiled: by `compile_learner`.
+        compiled: by `compile_learner`, or by `compile_ppo` without a directory.
         seed: decides everything random.
         goal: when to end.
         directory: an existing folder for checkpoints.

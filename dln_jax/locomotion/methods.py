@@ -13,7 +13,7 @@ from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learn
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn
 from dln_jax.locomotion.policy import WIDTH, Parameters, Policy, make_policy
-from dln_jax.locomotion.ppo import PPOSettings, learn_ppo, make_actor
+from dln_jax.locomotion.ppo import PPOSettings, compile_ppo
 from dln_jax.locomotion.task import Task, Walk, beginning, walk
 from dln_jax.types import InputError
 
@@ -70,19 +70,19 @@ def train(
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
+    chosen = settings_of(method, task.creature.name, window)
     if method == "ppo":
         if resume:
             raise InputError("runs of ppo are not stored on their way; train again without --resume")
-        actor = make_actor(task)
-        return Trained(actor, [learn_ppo(task, seed=s, goal=goal, report=partial(report, s)) for s in seeds])
-    policy, chosen = make_policy(task, width=width), settings_of(method, task.creature.name, window)
-    make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
-    compiled = compile_learner(task, make_learner(task, policy, chosen))
+        compiled, directory = compile_ppo(task, chosen), None
+    else:
+        make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
+        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen))
     settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
     settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
     settings |= chosen._asdict()
     one = partial(learn, compiled, goal=goal, directory=directory, settings=settings, resume=resume)
-    return Trained(policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
+    return Trained(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
 def settings_of(method: Method, creature: str, window: int | None = None) -> Any:

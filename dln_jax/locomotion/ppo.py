@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dln_jax.locomotion.learning import Goal, Learned, Record, Report, compile_evaluation, reached
+from dln_jax.locomotion.learning import Compiled, Learner, compile_evaluation
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, actuation_of
 from dln_jax.softbody.terms.creature import TIME_STEP
@@ -72,15 +72,8 @@ def actor_parameters(model: Any) -> Parameters:
     )
 
 
-def learn_ppo(
-    task: Task,
-    *,
-    seed: int,
-    goal: Goal,
-    settings: PPOSettings = PPOSettings(),  # noqa: B008
-    report: Report = lambda record: None,
-) -> Learned:
-    """Learns until the goal, and is evaluated after every update by an episode of the actor's mean from rest.
+def compile_ppo(task: Task, settings: PPOSettings = PPOSettings()) -> Compiled:  # noqa: B008
+    """The learner with its programs; each update is one of `settings.steps` of every lane.
 
     Raises:
         InputError: stable-baselines3 is not installed.
@@ -96,30 +89,28 @@ def learn_ppo(
     torch.set_num_threads(1)
     # Body lengths per second: rewards of a size that suits the critic.
     lanes = VectorEnvironment(task, settings.lanes, reward_scale=1.0 / TIME_STEP)
-    model = PPO(
-        "MlpPolicy",
-        lanes,
-        n_steps=settings.steps,
-        batch_size=settings.batch,
-        n_epochs=settings.epochs,
-        learning_rate=settings.learning_rate,
-        gamma=settings.discount,
-        gae_lambda=settings.trace,
-        clip_range=settings.clip,
-        ent_coef=settings.entropy,
-        policy_kwargs={"net_arch": [settings.width] * 2, "log_std_init": math.log(settings.deviation)},
-        seed=seed,
-        device="cpu",
-    )
-    evaluate = compile_evaluation(task, make_actor(task), actor_parameters(model))
-    compile_seconds = time.perf_counter() - began
-    best, records, farthest = actor_parameters(model), [], -math.inf
-    while not reached(records, goal):
-        model.learn(settings.steps * settings.lanes, reset_num_timesteps=not records)
-        parameters = actor_parameters(model)
-        distance = float(evaluate(parameters))
-        if distance > farthest:
-            farthest, best = distance, parameters
-        records.append(Record(int(model.num_timesteps), time.perf_counter() - began, distance, 0))
-        report(records[-1])
-    return Learned(best, records, compile_seconds, len(records) * task.episode)
+
+    def start(seed: int) -> Any:
+        return PPO(
+            "MlpPolicy",
+            lanes,
+            n_steps=settings.steps,
+            batch_size=settings.batch,
+            n_epochs=settings.epochs,
+            learning_rate=settings.learning_rate,
+            gamma=settings.discount,
+            gae_lambda=settings.trace,
+            clip_range=settings.clip,
+            ent_coef=settings.entropy,
+            policy_kwargs={"net_arch": [settings.width] * 2, "log_std_init": math.log(settings.deviation)},
+            seed=seed,
+            device="cpu",
+        )
+
+    def improve(model: Any) -> Any:
+        return model.learn(steps, reset_num_timesteps=model.num_timesteps == 0)
+
+    steps, actor = settings.steps * settings.lanes, make_actor(task)
+    learner = Learner(actor, start, improve, actor_parameters, lambda model: 0, steps)
+    evaluate = compile_evaluation(task, actor, actor_parameters(start(0)))
+    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)
