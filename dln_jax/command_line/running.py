@@ -36,11 +36,7 @@ Arguments = TypeVar("Arguments")
 def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: str, from_shell: bool = False) -> None:
     """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130.
 
-    Args:
-        main: the command.
-        arguments: the class of what it takes.
-        prog: what the user typed, for help and messages.
-        from_shell: whether the process is the command's own, which keeps compiled programs for the next one.
+    `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs.
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)

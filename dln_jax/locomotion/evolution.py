@@ -87,6 +87,5 @@ def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettin
         start=start,
         improve=lambda state: jax.lax.scan(generation, state, length=settings.generations)[0],
         parameters=lambda state: unravel(state.parameters),
-        skipped=lambda state: state.skipped,
         steps=settings.generations * 2 * settings.pairs * task.episode,
     )

@@ -103,7 +103,6 @@ def make_gradient_learner(task: Task, policy: Policy, settings: GradientSettings
         start=start,
         improve=lambda state: jax.lax.scan(update, state, length=settings.updates)[0],
         parameters=lambda state: state.parameters,
-        skipped=lambda state: state.skipped,
         steps=settings.updates * lanes * window,
     )
 

@@ -48,10 +48,10 @@ class Learner(NamedTuple):
     """State -> state after some updates; of trees, traceable."""
     parameters: Callable[[Any], Parameters]
     """Of the policy in a state."""
-    skipped: Callable[[Any], Any]
-    """Updates that a state has left out."""
     steps: int
     """Environment steps that `improve` takes."""
+    skipped: Callable[[Any], Any] = lambda state: state.skipped
+    """Updates that a state has left out."""
 
 
 class Compiled(NamedTuple):

@@ -111,6 +111,6 @@ def compile_ppo(task: Task, settings: PPOSettings = PPOSettings()) -> Compiled: 
         return model.learn(steps, reset_num_timesteps=model.num_timesteps == 0)
 
     steps, actor = settings.steps * settings.lanes, make_actor(task)
-    learner = Learner(actor, start, improve, actor_parameters, lambda model: 0, steps)
+    learner = Learner(actor, start, improve, actor_parameters, steps, skipped=lambda model: 0)
     evaluate = compile_evaluation(task, actor, actor_parameters(start(0)))
     return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)

@@ -101,14 +101,17 @@ def test_programs_take_turns():
     assert found.p50_us <= found.p99_us <= found.p999_us <= found.worst_us
 
 
-@pytest.fixture(scope="module")
-def small_run(tmp_path_factory):
+def run_of(kind, place):
     """A run with random parameters."""
-    folder = tmp_path_factory.mktemp("runs") / "structured-delan"
-    folder.mkdir()
-    description = described("structured-delan", published_split(letters(None)).train, width=2, depth=1)
+    (folder := place / kind).mkdir()
+    description = described(kind, published_split(letters(None)).train, width=2, depth=1)
     save(folder, description, build(description).init(jax.random.key(0)))
     return folder
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    return run_of("structured-delan", tmp_path_factory.mktemp("runs"))
 
 
 def test_low_latency_is_timed_in_a_process_of_its_own(small_run):
@@ -144,7 +147,7 @@ def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, m
     assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
 
 
-def test_call_paths_are_timed(small_run, capsys, monkeypatch):
+def test_call_paths_are_timed(small_run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
     for dispatch in ("default", "low-latency"):
         command(benchmark_one_step, "--runs", str(small_run), "--dispatch", dispatch, "--calls", "10")
@@ -152,6 +155,9 @@ def test_call_paths_are_timed(small_run, capsys, monkeypatch):
     assert set(first) == {"default-jit"}
     assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)
     assert second["c-loop"]["inverse"]["calls_per_second"] > 0
+    plain = str(run_of("feed-forward", tmp_path))
+    command(benchmark_one_step, "--runs", plain, "--dispatch", "low-latency", "--calls", "10")
+    assert set(json.loads(capsys.readouterr().out)["feed-forward"]) == set(second)
     merged = benchmark_one_step.over_processes([first, second, second])
     assert merged["c-from-python"]["inverse"]["p50_spread_us"] == 0 and set(merged) == {*first, *second}
     rows = [

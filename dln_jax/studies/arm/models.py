@@ -222,8 +222,8 @@ def end_of(numbers: dict[str, float]) -> Curve:
 
 def on_the_test(energies: Driven, sets: Split, dtype=jnp.float64, *, H: Hamiltonian | None = None) -> dict[str, float]:
     """Errors, and how long motions are predicted; `H` as for `predictions`."""
-    found = errors(predictions(energies, sets.test, dtype, H=H), sets.test)
-    return {**found, **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
+    predicted = predictions(energies, sets.test, dtype, H=H)
+    return {**errors(predicted, sets.test), **rollout_metrics(dynamics(energies), sets.test, dtype=dtype)}
 
 
 def torque_mse(dynamics: Dynamics | PlainDynamics, data: Trajectories) -> float:

@@ -35,6 +35,7 @@ from dln_jax.studies.arm.models import DEPTH, STEPS, TRIGONOMETRIC, WIDTHS, desc
 from dln_jax.studies.arm.table import letters, published_split
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, unit_of
+from dln_jax.studies.speed.low_latency_calls import last_line
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
@@ -104,10 +105,10 @@ def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
 def time_in_a_process(folders: list[Path], dispatch: str, *, calls: int) -> dict[str, dict]:
     """What `main` measures, by run."""
     command = [sys.executable, "-m", "dln_jax.studies.speed.one_step", "--dispatch", dispatch, "--calls", str(calls)]
-    done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True, text=True)
+    done = subprocess.run([*command, "--runs", *map(str, folders)], capture_output=True)
     if done.returncode:
-        raise InputError(f"timing in a process of its own failed: {done.stderr.strip().splitlines()[-1]}")
-    return json.loads(done.stdout.splitlines()[-1])
+        raise InputError(f"timing in a process of its own failed: {last_line(done.stderr)}")
+    return json.loads(last_line(done.stdout))
 
 
 def over_processes(turns: list[dict]) -> dict[str, dict[str, dict[str, float]]]:
