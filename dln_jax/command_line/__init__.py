@@ -1,1 +1,3 @@
 """What the commands share: typed arguments, errors as one line, progress and tables."""
+
+__all__ = []

@@ -1,1 +1,3 @@
 """What the reports measure."""
+
+__all__ = []
