@@ -34,7 +34,7 @@ def make_feed_forward(
     tau_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of the networks for tau and qdd.
+    """The (init, energies) pair of the networks for tau and qdd.
 
     Args:
         rate_scale: typical size of qd.
@@ -68,7 +68,7 @@ def make_phase_network(
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of the network for the rates.
+    """The (init, energies) pair of the network for the rates.
 
     Args:
         momentum_scale: typical size of p.

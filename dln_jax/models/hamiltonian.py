@@ -37,7 +37,7 @@ def make_structured_hamiltonian(
     diagonal_floor: float = 0.1,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of a structured Hamiltonian network.
+    """The (init, energies) pair of a structured Hamiltonian network.
 
     Args:
         diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
@@ -62,7 +62,7 @@ def make_black_box_hamiltonian(
     initial_guess: Guess | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of a black-box Hamiltonian network.
+    """The (init, energies) pair of a black-box Hamiltonian network.
 
     Hamilton's equations need no momentum solve and hold for any parameters. The functions of (q, qd) need one, which
     an untrained network may not have, and an activation with curvature in p, since M⁻¹ is that curvature. Absent
@@ -92,7 +92,7 @@ def make_separable_hamiltonian(
     initial_guess: Guess | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of T(p) + V(q).
+    """The (init, energies) pair of T(p) + V(q).
 
     Without gravity there is no V. Momenta and activation are as for `make_black_box_hamiltonian`.
 

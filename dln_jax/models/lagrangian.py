@@ -41,7 +41,7 @@ def make_delan(
     shared_trunk: bool = False,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of a structured DeLaN.
+    """The (init, energies) pair of a structured DeLaN.
 
     Args:
         diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
@@ -50,6 +50,7 @@ def make_delan(
         shared_trunk: whether factor and potential are outputs of one network instead of two.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
+    require_positive(width=width, depth=depth)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
@@ -65,7 +66,7 @@ def make_black_box_lagrangian(
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of a black-box Lagrangian network; one network, so that absent gravity leaves nothing out.
+    """The (init, energies) pair of a black-box Lagrangian; one network, so that absent gravity leaves nothing out.
 
     The activation needs curvature in qd, since M is the second derivative.
 

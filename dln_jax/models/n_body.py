@@ -40,7 +40,7 @@ def make_pairwise_hamiltonian(
     activation: Activation = tanh,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, apply) pair of bodies with learned masses and pair energies.
+    """The (init, energies) pair of bodies with learned masses and pair energies.
 
     Args:
         bodies: at least two.

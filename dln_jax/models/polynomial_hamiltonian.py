@@ -26,7 +26,7 @@ MOST_TERMS = 5_000
 
 
 def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> Model:
-    """The (init, apply) pair; parameters are the vector c, and start at zero.
+    """The (init, energies) pair; parameters are the vector c, and start at zero.
 
     Args:
         needs: what the scene needs; the kinds of its joints. Friction would not be linear beside H.

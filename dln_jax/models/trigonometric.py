@@ -53,7 +53,7 @@ class Basis(NamedTuple):
 
 
 def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype: DTypeLike = jnp.float64) -> Model:
-    """The (init, apply) pair of a trigonometric Lagrangian.
+    """The (init, energies) pair of a trigonometric Lagrangian.
 
     `init` takes a key as every model does, and starts without chance: M = 1, V = 0, no friction. The number of
     parameters grows as (2 degree + 1)^d d²/2.

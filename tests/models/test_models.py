@@ -14,7 +14,7 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.metrics.definiteness import definiteness
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_structured_hamiltonian
-from dln_jax.models.lagrangian import make_black_box_lagrangian
+from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.run import compiled
 
@@ -219,6 +219,7 @@ def test_definiteness_of_networks():
         (lambda: make_feed_forward(MIXED, tau_scale=(1.0, float("nan"))), "tau_scale is nan"),
         (lambda: make_feed_forward(MIXED, acceleration_scale=(1.0,)), "acceleration_scale has 1 sizes"),
         (lambda: make_structured_hamiltonian(MIXED, width=0), "width is 0"),
+        (lambda: make_delan(MIXED, width=-1), "width is -1"),
         (lambda: make_black_box_lagrangian(MIXED, depth=0), "depth is 0"),
         (lambda: definiteness(of_mass(jnp.ones_like), np.zeros((0, 2)), np.zeros((0, 2))), "no states"),
         (

@@ -72,7 +72,7 @@ def problem_of(
         InputError: an unknown name, too few trajectories, or a file that is missing or does not suit.
     """
     if name not in TASKS:
-        raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}, pixels")
+        raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}")
     if name in PROTOCOLS:
         if data is not None:
             raise InputError(f"task '{name}' generates its data; for a file choose {REAL} or {MEASURED}")
