@@ -170,9 +170,9 @@ def _scale(axis: Axes, lines) -> None:
 
 
 def _front(axis: Axes, points: list[tuple[float, float]]) -> None:
-    points.sort()
-    lowest = np.minimum.accumulate([height for _, height in points])
-    places = [place for place, _ in points]
+    finite = sorted(point for point in points if np.isfinite(point).all())
+    lowest = np.minimum.accumulate([height for _, height in finite])
+    places = [place for place, _ in finite]
     axis.step(places, lowest, where="post", color="0.85", linewidth=6, zorder=0, label=FRONT)
 
 

@@ -16,24 +16,30 @@ LINE = {"arrowstyle": "-", "linewidth": 0.5, "shrinkB": 3}
 def label_ends(axis: Axes, ends: Mapping[str, tuple[float, float]], *, colours: Mapping[str, str]) -> None:
     """Names curves at the right edge, each at the height of its end (x, y), moved apart where they would overlap.
 
-    Call it when the limits of the axis and the size of the figure are settled.
+    A curve whose end is not finite is named on top, with these words. Call it when the limits of the axis and the size
+    of the figure are settled.
     """
     drawn = axis.figure.get_figure(root=True)
     fractions = axis.transData + axis.transAxes.inverted()
-    heights = {name: float(np.clip(fractions.transform(end)[1], 0.0, 1.0)) for name, end in ends.items()}
+    lost = [name for name, end in ends.items() if not np.isfinite(end).all()]
+    heights = {
+        name: 1.0 if name in lost else float(np.clip(fractions.transform(end)[1], 0.0, 1.0))
+        for name, end in ends.items()
+    }
     share = axis.get_position().height * drawn.get_figheight()
     places = spread(heights, gap=1.25 * SMALL / 72 / share)
     for name, place in places.items():
         axis.annotate(
-            name,
-            ends[name],
+            f"{name}: not finite" if name in lost else name,
+            (1.0, place) if name in lost else ends[name],
             (1.03, place),
+            xycoords="axes fraction" if name in lost else "data",
             textcoords="axes fraction",
             annotation_clip=False,
             va="center",
             fontsize=SMALL,
             color=colours[name],
-            arrowprops={**LINE, "color": colours[name], "alpha": 0.6},
+            arrowprops=None if name in lost else {**LINE, "relpos": (0, 0.5), "color": colours[name], "alpha": 0.6},
         )
 
 

@@ -21,7 +21,8 @@ from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]
-TINY = ("--optimizer", "adam", "--steps", "40", "--width", "4", "--depth", "1", "--batch", "64", "--no-low-latency")
+NETWORK = ("--width", "4", "--depth", "1", "--precision", "f64")
+TINY = ("--optimizer", "adam", "--steps", "40", "--batch", "64", "--no-low-latency", *NETWORK)
 FILES = {
     ".lock",
     "config.json",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dln_jax.figures import style
+from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.figures.labels import label_points, spread
 
 # How the colour-blind see linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
@@ -76,3 +77,13 @@ def test_labels_of_points_cover_neither_each_other_nor_obstacles():
     assert not one.overlaps(two)
     covered = axis.transData.transform(wall)
     assert one.count_contains(covered) == two.count_contains(covered) == 0
+
+
+def test_a_curve_that_is_not_finite_is_said_to_be_so_and_hides_no_other():
+    curves = {"structured-delan/letters": ([1.0, 2.0], [1e-3, 1e-9]), "black-box-hnn/letters": ([3.0], [np.nan])}
+    figure = error_against_time(curves)
+    figure.draw_without_rendering()
+    (axis,) = figure.axes
+    assert {"structured-delan", "black-box-hnn: not finite"} <= {text.get_text() for text in axis.texts}
+    (front,) = (line for line in axis.lines if line.get_label().startswith("front"))
+    assert np.isfinite(front.get_ydata()).all() and front.get_ydata()[-1] == 1e-9
