@@ -9,14 +9,14 @@ import pytest
 EXAMPLES = sorted((Path(__file__).parents[2] / "docs" / "examples").glob("*.py"))
 REDUCED = {
     "01_spherical_pendulum": {"SECONDS": 2},
-    "02_train_the_arm": {"ITERATIONS": 25},
-    "03_measured_pendulum": {"ITERATIONS": 10},
+    "02_train_the_arm": {"ITERATIONS": 15},
+    "03_measured_pendulum": {"ITERATIONS": 7},
     "04_two_bodies": {"TRAJECTORIES": 20, "SECONDS": 5},
     "05_differential_network": {"SAMPLES": 500},
     "06_soft_body": {"STEPS": 30, "RINGS": 2},
     "07_gait": {"GOAL": 0.3},
     "08_c_in_a_loop": {},
-    "09_fine_tune": {"ITERATIONS": 10},
+    "09_fine_tune": {"ITERATIONS": 5},
 }
 """Constants of the examples, and what they are here."""
 
