@@ -17,6 +17,8 @@ Curves = Mapping[str, Sequence[Sequence[Record]]]
 """Records of each seed, by the name of the way of learning."""
 
 COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE}
+BELOW_LEGEND = 0.62
+"""Share of a panel's height that curves may take."""
 
 
 def first_reaching(records: Sequence[Record], distance: float) -> Record | None:
@@ -63,8 +65,7 @@ def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if field == "seconds" else (1,)))
         axis.xaxis.set_major_formatter(FuncFormatter(lambda place, _: f"{place:,.0f}"))
         axis.xaxis.set_minor_formatter(NullFormatter())
-    # Room for the legends.
-    panels[0].set_ylim(top=1.45 * panels[0].get_ylim()[1])
+    panels[0].set_ylim(top=panels[0].get_ylim()[1] / BELOW_LEGEND)
     panels[0].set_ylabel("distance in one episode, body lengths")
     figure.suptitle(title, fontsize=style.TEXT)
     return figure
@@ -102,8 +103,6 @@ def _panel(axis: Axes, curves: Curves, field: str, distance: float) -> None:
     first = curves.get("gradient")
     places = [crossover(first, seeds, field) for name, seeds in curves.items() if name != "gradient"] if first else []
     if known := [place for place in places if place is not None]:
-        place, colour, where = max(known), COLOURS["gradient"], ("data", "axes fraction")
-        axis.axvline(place, color=colour, linewidth=0.9, linestyle=":")
-        text = "gradient ahead\nof all from here"
-        axis.annotate(text, (place, 0.7), xycoords=where, fontsize=style.SMALL, color=colour)
+        look = {"color": COLOURS["gradient"], "linewidth": 1.2, "linestyle": ":"}
+        axis.axvline(max(known), ymax=BELOW_LEGEND, label="from here gradient is ahead", **look)
     style.legend(axis, loc="upper left", title="median to reach the dashed line", title_fontsize=style.SMALL)
