@@ -263,7 +263,10 @@ def test_medians_and_the_crossover():
     assert comparison.crossover(slow, quick, "steps") is None
     axes = comparison.comparison_figure({"gradient": quick, "ppo": slow}, distance=1.0, title="").axes
     assert [axis.get_xscale() for axis in axes] == ["log", "log"]
-    assert {text.get_text() for text in axes[0].get_legend().get_texts()} == {"gradient: 30", "ppo: not reached"}
+    said = {text.get_text() for text in axes[0].get_legend().get_texts()}
+    assert said == {"gradient: 30", "ppo: not reached", "from here gradient is ahead"}
+    (ahead,) = (line for line in axes[0].lines if line.get_label().startswith("from here"))
+    np.testing.assert_array_equal(ahead.get_xdata(), 30)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):
