@@ -55,11 +55,6 @@ def no_program_has_options_of_its_own(pytestconfig):
         yield
 
 
-def pytest_sessionfinish():
-    """Leaves what has lived until now to the end of the process: pytest would look through gigabytes five times."""
-    gc.freeze()
-
-
 LONGEST = (
     "test_compilation",
     "test_examples",
