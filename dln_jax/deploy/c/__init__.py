@@ -1,13 +1,6 @@
-"""C99 source of trained models."""
+"""C99 source of JAX functions."""
 
-from dln_jax.deploy.c.load import CDynamics, CFunction, CPlainDynamics, load_c
-from dln_jax.deploy.c.source import export_c, export_run
+from dln_jax.deploy.c.load import load_c
+from dln_jax.deploy.c.source import export_c
 
-__all__ = [
-    "CDynamics",
-    "CFunction",
-    "CPlainDynamics",
-    "export_c",
-    "export_run",
-    "load_c",
-]
+__all__ = ["export_c", "load_c"]

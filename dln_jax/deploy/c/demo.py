@@ -1,112 +1,69 @@
-"""A small C program that calls an exported model, checks it and times it; and a CMake file that builds both."""
+"""A small C program that calls an export, prints what it gives and times it; and a CMake file that builds both."""
 
-from string import Template
+from collections.abc import Mapping
+from math import prod
 
+from dln_jax.deploy.c.interface import KINDS, Signature
 from dln_jax.deploy.c.text import PRECISIONS, comment
 
-_PROGRAM = """#include <stdio.h>
+_START = """#include <stdio.h>
 #include <stdlib.h>
 #include <time.h>
 
-#include "$name.h"
-
-enum { STATES = 64 };
+#include "{name}.h"
 
 /* Uniform in [-1, 1), the same on every machine */
 static unsigned long seed = 1;
 
-static $real uniform(void)
-{
+static {real} uniform(void)
+{{
     seed = (1103515245UL * seed + 12345UL) & 0x7fffffffUL;
-    return ($real)seed / ($real)0x40000000UL - 1;
-}
-
-static void print(const char *what, const $real *values, int count)
-{
-    printf("%s:", what);
-    for (int i = 0; i < count; ++i) printf(" %.9g", (double)values[i]);
-    printf("\\n");
-}
+    return ({real})seed / ({real})0x40000000UL - 1;
+}}
 
 int main(int arguments, char **argument)
-{
+{{
     const long calls = arguments > 1 ? atol(argument[1]) : 0;
-    static $real states[STATES][$per_state];
-$declarations
-    for (int k = 0; k < STATES; ++k)
-        for (int i = 0; i < $per_state; ++i) states[k][i] = uniform();
-$show
-    if (calls > 0) {
-        double sum = 0, seconds;
-        const clock_t start = clock();
-        for (long call = 0; call < calls; ++call) {
-            const $real *state = states[call % STATES];
-            ${name}_$timed;
-            sum += (double)$summed[0];
-        }
-        seconds = (double)(clock() - start) / CLOCKS_PER_SEC;
-        printf("${name}_$function: %.0f calls/s, %.3f us each (sum %g)\\n", (double)calls / seconds,
-               1e6 * seconds / (double)calls, sum);
-    }
-    return 0;
-}
 """
-_MOTION = """\
-    print("q", states[0], $d);
-    print("qd", &states[0][$d], $d);
-    print("qdd", &states[0][$twice], $d);
-    ${name}_inverse_dynamics(states[0], &states[0][$d], &states[0][$twice], tau);
-    print("tau", tau, $d);
-    ${name}_forward_dynamics(states[0], &states[0][$d], tau, qdd);
-    print("qdd from tau", qdd, $d);"""
-_ENERGY = """
-    energy = ${name}_energy(states[0], &states[0][$d]);
-    print("energy", &energy, 1);
-    ${name}_mass_matrix(states[0], ${velocity}M);
-    print("mass matrix", M, $square);"""
-_FUNCTION = """\
-    print("x", states[0], $n);
-    ${name}_value(states[0], y);
-    print("y", y, $m);
-    ${name}_value_and_jacobian(states[0], y, jacobian);
-    print("dy/dx", jacobian, $square);"""
+_TIMED = """        if (calls > 0) {{
+            const clock_t start = clock();
+            for (long k = 0; k < calls; ++k) {{ {moved}{call}; }}
+            const double seconds = (double)(clock() - start) / CLOCKS_PER_SEC;
+            printf("{function}: %.0f calls/s, %.3f us each\\n", (double)calls / seconds, 1e6 * seconds / (double)calls);
+        }}
+"""
 
 
-def demo(name: str, functions: dict[str, list[str]], sizes: dict[str, int], precision: str) -> str:
-    """Text of NAME_demo.c: prints each function at one state, and with an argument N times N calls of the first.
-
-    `functions` are (result, arguments) as in the header.
-    """
+def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
+    """Text of NAME_demo.c: prints each function at one state, and with an argument N times N calls of each."""
     real = PRECISIONS[precision][1]
-    about = comment(
+    kinds = {**KINDS, "real": real}
+    text = comment(
         f"{name}_demo.c: prints what the functions of {name}.h give at one state.",
         f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
-        f"./{name}_demo 1000000    also times a million calls of the first function",
-    )
-    if "d" in sizes:
-        d = sizes["d"]
-        per_state, square, summed = 3 * d, d * d, "tau"
-        timed = f"inverse_dynamics(state, state + {d}, state + {2 * d}, tau)"
-        declarations, show = f"    {real} tau[{d}], qdd[{d}];", _MOTION
-        velocity = f"&states[0][{d}], " if " qd[" in functions.get("mass_matrix", ("", ""))[1] else ""
-        if "energy" in functions:
-            declarations += f"\n    {real} energy, M[{square}];"
-            show += _ENERGY
-        values = {"d": d, "twice": 2 * d, "velocity": velocity}
-    else:
-        n, m = sizes["n"], sizes["m"]
-        per_state, square, summed, timed = n, m * n, "y", "value(state, y)"
-        declarations, show, values = f"    {real} y[{m}], jacobian[{square}];", _FUNCTION, sizes
-    return about + Template(_PROGRAM).substitute(
-        name=name,
-        real=real,
-        per_state=per_state,
-        declarations=declarations,
-        show=Template(show).substitute(values, name=name, square=square),
-        timed=timed,
-        summed=summed,
-        function=next(iter(functions)),
-    )
+        f"./{name}_demo 1000000    also times a million calls of each",
+    ) + _START.format(name=name, real=real)
+    for key, each in functions.items():
+        leaves = [*each.arguments, *each.results]
+        names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
+        call = f"{name}_{key}({', '.join(names[: len(names) - each.returns])})"
+        call = f"{names[-1]} = {call}" if each.returns else call
+        text += "    {\n" + "".join(
+            f"        static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];\n" for leaf in leaves
+        )
+        for leaf in each.arguments:
+            value = "uniform()" if leaf.kind == "real" else "0"
+            text += f"        for (int i = 0; i < {prod(leaf.shape)}; ++i) {leaf.name}[i] = {value};\n"
+        text += f"        {call};\n"
+        for leaf in each.results:
+            text += f'        printf("{key} {leaf.name}:");\n'
+            text += f'        for (int i = 0; i < {prod(leaf.shape)}; ++i) printf(" %.9g", (double){leaf.name}[i]);\n'
+            text += '        printf("\\n");\n'
+        # Each call's state is another, so that none is left out.
+        first = next((leaf.name for leaf in each.arguments if leaf.kind == "real"), None)
+        moved = f"{first}[0] += ({real})1e-6; " if first else ""
+        text += _TIMED.format(moved=moved, call=call, function=f"{name}_{key}") + "    }\n"
+    return text + "    return 0;\n}\n"
 
 
 def cmake(name: str) -> str:

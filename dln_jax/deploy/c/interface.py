@@ -1,90 +1,147 @@
-"""What an exported source declares: functions and their signatures, and the description that states its sizes."""
+"""What an exported source declares: functions, their arguments and results, and the description that states them."""
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from dln_jax.deploy.c.text import PRECISIONS
+import jax
+import numpy as np
+
+from dln_jax.deploy.c.lowering import kind_of
+from dln_jax.deploy.c.text import PRECISIONS, check_name
 from dln_jax.deploy.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
-FUNCTION = "differential-network"
-FORMAT = 2
+FORMAT = 3
 """Version of the names and signatures in exported sources, and of their description."""
-LARGEST = 10_000
-"""Of the sizes d, n and m."""
-_STATE = "const {real} q[{d}], const {real} qd[{d}]"
-_DYNAMICS = {
-    "inverse_dynamics": ("void", _STATE + ", const {real} qdd[{d}], {real} tau[{d}]"),
-    "forward_dynamics": ("void", _STATE + ", const {real} tau[{d}], {real} qdd[{d}]"),
-}
-_ENERGY = {**_DYNAMICS, "energy": ("{real}", _STATE)}
-_MASS = {**_ENERGY, "mass_matrix": ("void", "const {real} q[{d}], {real} M[{d} * {d}]")}
-_MASS_OF_STATE = {**_ENERGY, "mass_matrix": ("void", _STATE + ", {real} M[{d} * {d}]")}
-_FUNCTION = {
-    "value": ("void", "const {real} x[{n}], {real} y[{m}]"),
-    "value_and_jacobian": ("void", "const {real} x[{n}], {real} y[{m}], {real} jacobian[{m} * {n}]"),
-}
-_DECLARED = {
-    **dict.fromkeys(("structured-delan", "structured-hnn", "trigonometric"), _MASS),
-    **dict.fromkeys(("black-box-delan", "black-box-hnn"), _MASS_OF_STATE),
-    "feed-forward": _DYNAMICS,
-    FUNCTION: _FUNCTION,
-}
-"""Result and arguments of each function, by kind of model."""
+LARGEST = 1 << 22
+"""Numbers of an argument or result."""
+KINDS = {"real": None, "bool": "int", "int": "int", "long": "long long", "unsigned": "unsigned"}
+KINDS |= {"unsigned_long": "unsigned long long"}
 
 
-def interface(name: str, kind: str, precision: str, sizes: dict[str, Any], version: str) -> dict[str, Any]:
-    """The description of an exported source, JSON values, with result and arguments of each function in C.
+class Leaf(NamedTuple):
+    """An argument or a result."""
 
-    `sizes` are d, or n and m of a differential network; `version` is that of the release that wrote the source.
+    name: str
+    kind: str
+    shape: tuple[int, ...]
+
+
+class Signature(NamedTuple):
+    """Of one function."""
+
+    arguments: tuple[Leaf, ...]
+    results: tuple[Leaf, ...]
+    stack_bytes: int = 0
+    operations: int = 0
+
+    @property
+    def returns(self) -> bool:
+        """Whether it returns its one number, in place of writing to an array."""
+        return len(self.results) == 1 and self.results[0].shape == ()
+
+
+def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
+    """Arguments by the names of the function's parameters; a tree's leaves by their path too."""
+    try:
+        names = list(inspect.signature(function).parameters)
+    except (ValueError, TypeError):
+        names = []
+    names += [f"argument_{k}" for k in range(len(names), len(examples))]
+    leaves = [leaf for name, each in zip(names, examples, strict=False) for leaf in _leaves(name, each)]
+    return _checked(leaves, "argument")
+
+
+def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
+    """Results by their keys, `result` where there are none."""
+    leaves = _leaves("", shapes) if jax.tree.structure(shapes) != jax.tree.structure(0) else _leaves("result", shapes)
+    used = {leaf.name for leaf in taken}
+    leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
+    return _checked(leaves, "result")
+
+
+def _leaves(name: str, tree: Any) -> list[Leaf]:
+    found = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
+        whole = "_".join(part for part in (name, *parts) if part)
+        whole = f"result_{whole}" if whole[:1].isdigit() else whole
+        array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
+        found.append(Leaf(whole, kind_of(array.dtype), tuple(map(int, array.shape))))
+    return found
+
+
+def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
+    names = [
+        check_name(leaf.name, f"the name of an {what}" if what == "argument" else f"the name of a {what}")
+        for leaf in leaves
+    ]
+    if len(set(names)) < len(names):
+        raise InputError(f"two {what}s have one name among {', '.join(names)}; rename one")
+    return leaves
+
+
+def declaration(name: str, function: str, signature: Signature, real: str) -> str:
+    """The prototype of a function, without its semicolon."""
+    kinds = {**KINDS, "real": real}
+    parameters = [
+        f"{kinds[kind]} {each}" if shape == () else f"const {kinds[kind]} {each}[{int(np.prod(shape))}]"
+        for each, kind, shape in signature.arguments
+    ]
+    result = "void"
+    if signature.returns:
+        result = str(kinds[signature.results[0].kind])
+    else:
+        parameters += [f"{kinds[kind]} {each}[{int(np.prod(shape))}]" for each, kind, shape in signature.results]
+    return f"{result} {name}_{function}({', '.join(parameters) or 'void'})"
+
+
+def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
+    """JSON values that state an export."""
+    stated = {
+        key: {
+            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.arguments],
+            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.results],
+            "stack_bytes": each.stack_bytes,
+            "operations": each.operations,
+        }
+        for key, each in functions.items()
+    }
+    return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
+
+
+def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
+    """Precision and signatures of an export, nothing merely believed, with its header and source.
 
     Raises:
-        InputError: no such kind or precision, or sizes that are no counts up to 10,000.
-    """
-    if kind not in _DECLARED:
-        raise InputError(f"kind is {kind!r}; expected one of {', '.join(_DECLARED)}")
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is {precision!r}; expected f32 or f64")
-    for key, size in sizes.items():
-        if type(size) is not int or not 1 <= size <= LARGEST:
-            raise InputError(f"{key} is {size!r}; expected a whole number from 1 to {LARGEST}")
-    declared = _signatures(kind, real=PRECISIONS[precision][1], **sizes)
-    stated = {"format": FORMAT, "version": version, "name": name, "kind": kind, "precision": precision}
-    return {**stated, **sizes, "functions": declared}
-
-
-def definitions(kind: str, bodies: Mapping[str, str]) -> str:
-    """The functions of a source from the bodies by name; `$name` is left to fill in."""
-    declared = _signatures(kind, real="real", d="D", n="INPUTS", m="OUTPUTS")
-    return "".join(
-        f"\n{result} ${{name}}_{function}({arguments})\n{{\n{bodies[function]}}}\n"
-        for function, (result, arguments) in declared.items()
-    )
-
-
-def _signatures(kind: str, **names: Any) -> dict[str, list[str]]:
-    return {function: [text.format(**names) for text in each] for function, each in _DECLARED[kind].items()}
-
-
-def read_interface(directory: Path, name: str) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The description of an exported model, nothing in it merely believed, and the header and source that it is of.
-
-    Raises:
-        InputError: a file is missing or altered, the format is another, or what is stated contradicts itself.
+        InputError: a file is missing or altered, the format is another, or what is stated contradicts the header.
     """
     path = directory / f"{name}.json"
-    values, files = read_export(path, (f"{name}.h", f"{name}.c"))
-    if values.get("format") != FORMAT:
-        raise InputError(f"{path}: C format {values.get('format')!r}; this release reads format {FORMAT}, so {AGAIN}")
-    kind, precision, version = (str(values.get(key)) for key in ("kind", "precision", "version"))
-    sizes = {key: values.get(key) for key in (("n", "m") if kind == FUNCTION else ("d",))}
+    stated, files = read_export(path, (f"{name}.h", f"{name}.c"))
+    if stated.get("format") != FORMAT:
+        raise InputError(f"{path}: C format {stated.get('format')!r}; this release reads format {FORMAT}, so {AGAIN}")
+    precision, header = stated.get("precision"), files[f"{name}.h"].decode(errors="replace")
     try:
-        expected = interface(name, kind, precision, sizes, version)
-    except InputError as error:
-        raise InputError(f"{path}: {error}; {AGAIN}") from error
-    for key in (*expected, *values):
-        if values.get(key) != expected.get(key):
-            stated, wanted = f"{values.get(key)!r:.60}", f"{expected.get(key)!r:.60}"
-            raise InputError(f"{path}: {key} is {stated}, expected {wanted}; {AGAIN}")
-    return expected, files
+        if stated.get("name") != name or precision not in PRECISIONS:
+            raise InputError(f"name is {stated.get('name')!r:.60} and precision {precision!r:.60}")
+        functions = {str(key): _signature(each) for key, each in dict(stated["functions"]).items()}
+        for key, each in functions.items():
+            if f"{declaration(name, check_name(key), each, PRECISIONS[precision][1])};" not in header:
+                raise InputError(f"{key} is not declared so in {name}.h")
+    except (InputError, TypeError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: contradicts itself ({str(error):.200}); {AGAIN}") from error
+    return precision, functions, files
+
+
+def _signature(stated: Any) -> Signature:
+    def leaves(key: str) -> tuple[Leaf, ...]:
+        found = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
+        for leaf in found:
+            counts = all(type(size) is int and size >= 0 for size in leaf.shape)
+            if leaf.kind not in KINDS or not counts or np.prod(leaf.shape, dtype=float) > LARGEST:
+                raise InputError(f"{leaf.name} is {leaf}")
+        return found
+
+    return Signature(leaves("arguments"), leaves("results"))

@@ -1,133 +1,169 @@
-"""A trained model as C99 source without dependencies, a demo of it, and what builds both.
+"""JAX functions as C99 source without dependencies, a demo of them, and what builds both.
 
 The source holds constant tables and functions of one state: no allocation, no mutable state outside the stack, no
-library but <math.h>. The same model, name and precision give the same files, byte for byte.
+library but <math.h>. The same functions, name and precision give the same files, byte for byte.
 """
 
 import importlib.metadata
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dln_jax.data.schema import needs_from_json
-from dln_jax.deploy.c import black_box as c_black_box
-from dln_jax.deploy.c import function as c_function
-from dln_jax.deploy.c import structured as c_structured
-from dln_jax.deploy.c import trigonometric as c_trigonometric
-from dln_jax.deploy.c.activations import EXPORTABLE
+import jax
+import numpy as np
+
+from dln_jax.deploy.c import kernels
 from dln_jax.deploy.c.demo import cmake, demo
-from dln_jax.deploy.c.interface import FORMAT, FUNCTION, interface
-from dln_jax.deploy.c.library import helpers
-from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, fill
+from dln_jax.deploy.c.elementary import definitions
+from dln_jax.deploy.c.emit import Source, body_of
+from dln_jax.deploy.c.interface import (
+    FORMAT,
+    Signature,
+    argument_leaves,
+    declaration,
+    description,
+    result_leaves,
+)
+from dln_jax.deploy.c.lowering import program_of
+from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
 from dln_jax.types import InputError
-from dln_jax.zoo.catalogue import entry_of
-from dln_jax.zoo.descriptions import Description, require_complete
-from dln_jax.zoo.run import load
 
-SOURCES = {
-    "structured-delan": c_structured.source,
-    "structured-hnn": c_structured.source,
-    "black-box-delan": c_black_box.source,
-    "black-box-hnn": c_black_box.source,
-    "trigonometric": c_trigonometric.source,
-    "feed-forward": c_function.feed_forward_source,
-}
-_MEANINGS = {
-    "inverse_dynamics": "Generalised force tau that the motion (q, qd, qdd) takes, friction included.",
-    "forward_dynamics": "Acceleration qdd of the state (q, qd) under the generalised force tau.",
-    "energy": "Energy T + V of the state, in J.",
-    "mass_matrix": "Mass matrix M, row by row.",
-    "value": "y at x.",
-    "value_and_jacobian": "y and dy/dx at x; element (k, j) of the Jacobian at k * {n} + j is dy_k/dx_j.",
-}
+Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
+"""Functions of arrays by name, each with example arguments."""
+STACK = 256 * 1024
+"""Bytes of the stack that a function may take."""
+LENGTH = 10_000_000
+"""Bytes of a source."""
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
-Arrays that are written must not overlap others. What is not finite in a state gives results that are not."""
+Results may overlap arguments: all of these are read before. What is not finite in a state is not hidden."""
 _NEEDED = """C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);
 results do not rely on reordered arithmetic (-ffast-math)."""
 
 
 def export_c(
-    description: Description,
-    parameters: Any,
+    functions: Functions,
     directory: str | Path,
     *,
     name: str = "model",
     precision: str | None = None,
+    libm: bool = False,
+    casadi: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
 
     Args:
-        description: of the model, as `zoo.describe` gives and `model.json` holds it.
-        parameters: of the model; layers with the members of an ensemble first, for a differential network.
+        functions: of arrays by name, parameters closed over, each with one example for each argument: an array or a tree
+            of arrays. Arguments keep their names, and results those of a dictionary or named tuple.
         directory: is created where it is missing.
         name: a C name; every file and public function starts with it.
-        precision: f32 or f64; by default that of the training.
+        precision: f32 or f64 of all real numbers; by default that of the examples.
+        libm: call the C library's exp, tanh, sin, cos and log1p, in place of ones that vectorise.
+        casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
         overwrite: replace files that exist.
 
     Raises:
-        InputError: a model that has no C export, a name that is none in C, files that exist, or the folder of a run,
-            whose files are never replaced.
+        InputError: what has no C, a name that is none in C, more stack than 256 KiB or source than 10 MB, files that
+            exist, or the folder of a run, whose files are never replaced.
     """
-    texts = source_files(description, parameters, name=check_name(name), precision=precision)
+    texts = source_files(functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi)
     return write_exports(Path(directory), texts, overwrite=overwrite)
 
 
-def export_run(directory: str | Path, out: str | Path, **keywords: Any) -> list[Path]:
-    """`export_c` of the model in a run's folder, of `train_delan`, `train_hnn` or `train_diffnet`."""
-    run = load(directory)
-    return export_c(run.description, run.parameters, out, **keywords)
-
-
-def source_files(description: Description, parameters: Any, *, name: str, precision: str | None) -> dict[str, bytes]:
+def source_files(
+    functions: Functions, *, name: str, precision: str | None = None, libm: bool = False, casadi: bool = False
+) -> dict[str, bytes]:
     """Content of each file, by its name."""
-    kind, precision = str(description.get("name")), precision or str(description.get("precision"))
-    if kind not in SOURCES and kind != FUNCTION:
-        raise InputError(f"a {kind} has no C export; exportable are {', '.join((*SOURCES, FUNCTION))}")
-    require_complete(description, entry_of(kind).factory)
-    if description.get("friction_width") and description["needs"]["friction"]:
-        raise InputError("a friction that depends on q has no C export; train with one coefficient per coordinate")
-    activation = str(description.get("activation", "tanh"))
-    if activation not in EXPORTABLE:
-        raise InputError(f"activation is '{activation}'; C export knows {', '.join(EXPORTABLE)}")
-    if kind == FUNCTION:
-        sizes = {"n": parameters[0][0].shape[1], "m": parameters[-1][0].shape[2]}
-        body = partial(c_function.source, parameters)
-        about = f"{sizes['n']} inputs x, {sizes['m']} outputs y"
-    else:
-        needs = needs_from_json(description["needs"])
-        sizes = {"d": needs.degrees_of_freedom}
-        body = partial(SOURCES[kind], description, parameters, needs)
-        units = ", ".join(f"{joint} ({'rad' if joint == 'revolute' else 'm'})" for joint in needs.joints)
-        about = f"Joints: {units}; {'with' if needs.friction else 'without'} friction"
-    version = importlib.metadata.version("dln-jax")
-    stated = interface(name, kind, precision, sizes, version)
-    declared = stated["functions"]
-    written_by = f"Written by dln-jax {version}, C format {FORMAT}, from a {kind}.\n{about}."
-    constants, _, functions = fill(body(precision), precision, name=name).partition("\n")
-    about = comment(f"{name}.c", written_by, _NEEDED)
-    texts = {
-        f"{name}.h": _header(name, written_by, declared, sizes),
-        f"{name}.c": f'{about}#include <math.h>\n\n#include "{name}.h"\n\ntypedef {PRECISIONS[precision][1]} real;\n\n'
-        f"{constants}\n{helpers(functions, precision, activation)}{functions}",
-        f"{name}_demo.c": demo(name, declared, sizes, precision),
+    if not functions:
+        raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
+    precision = precision or _precision(functions)
+    if precision not in PRECISIONS:
+        raise InputError(f"precision is {precision!r}; expected f32 or f64")
+    source, signatures, texts = Source(precision, libm), {}, []
+    for key, (function, examples) in functions.items():
+        signature, text = _function(source, f"{name}_{check_name(key, 'a function')}", function, examples)
+        signatures[key] = signature
+        texts.append(text)
+    version, real = importlib.metadata.version("dln-jax"), PRECISIONS[precision][1]
+    written_by = f"Written by dln-jax {version}, C format {FORMAT}."
+    files = {
+        f"{name}.h": _header(name, written_by, signatures, real),
+        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + _preamble(source, name) + "".join(texts),
+        f"{name}_demo.c": demo(name, signatures, precision),
         "CMakeLists.txt": cmake(name),
     }
-    files = {file_name: text.encode() for file_name, text in texts.items()}
-    return {**files, f"{name}.json": described(stated, files)}
+    if len(files[f"{name}.c"]) > LENGTH:
+        size = len(files[f"{name}.c"]) / 1e6
+        raise InputError(f"the source would take {size:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
+    encoded = {file_name: text.encode() for file_name, text in files.items()}
+    return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
 
 
-def _header(name: str, written_by: str, declared: dict[str, list[str]], sizes: dict[str, int]) -> str:
-    units = "Units: q in rad or m, qd in 1/s and qdd in 1/s^2 of that, tau in N m or N.\n" * ("d" in sizes)
-    about, guard = comment(f"{name}.h", written_by, units + _PROMISES), f"{name.upper()}_H"
-    size_names = {"d": "DEGREES_OF_FREEDOM", "n": "INPUTS", "m": "OUTPUTS"}
-    defines = "".join(f"#define {name.upper()}_{size_names[key]} {size}\n" for key, size in sizes.items())
-    declarations = "".join(
-        f"\n/* {_MEANINGS[function].format(**sizes)} */\n{result} {name}_{function}({arguments});\n"
-        for function, (result, arguments) in declared.items()
-    )
+def _function(
+    source: Source, name: str, function: Callable[..., Any], examples: Sequence[Any]
+) -> tuple[Signature, str]:
+    """Signature and C text of one function."""
+    numpy_type, real, _ = PRECISIONS[source.precision]
+    examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
+    try:
+        arguments = argument_leaves(function, examples)
+        program, inputs, results, shapes = program_of(function, examples)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+    signature = Signature(tuple(arguments), tuple(result_leaves(shapes, arguments)))
+    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(arguments)}
+    targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
+    body = body_of(source, program, results, named, targets)
+    if body.bytes > STACK:
+        raise InputError(
+            f"{name} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
+        )
+    used = {inputs[k].number for k in range(len(inputs))} & {node.number for node in body.plan.needed}
+    unused = [
+        f"    (void){leaf.name};" for leaf, node in zip(arguments, inputs, strict=True) if node.number not in used
+    ]
+    key = name.partition("_")[2]
+    head = declaration(name.partition("_")[0], key, signature, "real")
+    text = "\n" + head + "\n{\n" + "\n".join([*unused, *body.lines]) + "\n}\n"
+    return signature._replace(stack_bytes=body.bytes, operations=body.operations), text
+
+
+def _at(leaf: Any, numpy_type: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    return array.astype(numpy_type) if array.dtype.kind == "f" else array
+
+
+def _precision(functions: Functions) -> str:
+    leaves = jax.tree.leaves([examples for _, examples in functions.values()])
+    sizes = {np.asarray(leaf).dtype.itemsize for leaf in leaves if np.asarray(leaf).dtype.kind == "f"}
+    return "f64" if max(sizes, default=8) == 8 else "f32"
+
+
+def _preamble(source: Source, name: str) -> str:
+    """What comes before the functions."""
+    real, suffix = PRECISIONS[source.precision][1], source.suffix
+    tables = "\n".join(table(table_name, array, source.precision) for table_name, array in source.tables.values())
+    upper = suffix.upper()
     return (
-        f'{about}#ifndef {guard}\n#define {guard}\n\n{defines}\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
-        f"{declarations}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
+        f'#include <math.h>\n\n#include "{name}.h"\n\ntypedef {real} real;\n\n'
+        f"/* Of two operations or of one, whichever the processor has */\n#ifdef FP_FAST_FMA{upper}\n"
+        f"#define MULTIPLY_ADD(a, b, c) fma{suffix}(a, b, c)\n#else\n"
+        f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
+        "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n\n"
+        f"{tables}{definitions(source.functions, source.precision, arrays=source.arrays)}"
+        f"{kernels.definitions(source.kernels, suffix)}"
+    )
+
+
+def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str) -> str:
+    about, guard = comment(f"{name}.h", written_by, _PROMISES), f"{name.upper()}_H"
+    declared = ""
+    for key, each in signatures.items():
+        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in each.results if leaf.shape)
+        facts = f"{each.operations} floating-point operations, {each.stack_bytes} bytes of stack"
+        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, each, real)};\n"
+    return (
+        f'{about}#ifndef {guard}\n#define {guard}\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
+        f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
     )

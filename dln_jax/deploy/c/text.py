@@ -11,25 +11,39 @@ from dln_jax.types import InputError
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
 """NumPy type, C type, and the suffix of its literals and of the functions of <math.h>."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# C99 and C++ keywords that fit the pattern; a library or a header of that name would not build.
+_FUNCTIONS = """
+acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp exp2 expm1 fabs fdim floor fma fmax fmin
+fmod frexp hypot ilogb ldexp lgamma llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter
+nexttoward pow remainder remquo rint round scalbln scalbn sin sinh sqrt tan tanh tgamma trunc
+"""
+# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and what a source defines itself: a
+# function, a library or a header of that name would not build, or hide what is needed.
 _RESERVED = frozenset(
     re.findall(
         r"\w+",
         """
-        auto bool break case catch char class const continue default delete do double else enum export extern false
-        float for friend goto if inline int long mutable namespace new operator private protected public register
-        restrict return short signed sizeof static struct switch template this throw true try typedef typename union
-        unsigned using virtual void volatile while main real test demo all clean install
-        """,
+        alignas alignof and asm auto bool break case catch char class compl const constexpr continue decltype default
+        delete do double else enum explicit export extern false float for friend goto if inline int long mutable
+        namespace new noexcept not nullptr operator or private protected public register restrict return short signed
+        sizeof static struct switch template this thread_local throw true try typedef typeid typename union unsigned
+        using virtual void volatile while xor
+        abort abs assert complex ctype div errno exit fenv free gamma index inttypes iso646 j0 j1 jn limits locale main
+        malloc math printf rand real setjmp signal stdarg stdbool stddef stdint stdio stdlib string tgmath time wchar
+        wctype y0 y1 yn all clean demo install test cholesky lu triangular_solve
+        """
+        + _FUNCTIONS
+        + re.sub(r"\b(\w+)\b", r"\1f", _FUNCTIONS),
     )
 )
 
 
-def check_name(name: str) -> str:
-    """A name that may start every C name of a model; InputError otherwise."""
-    if not _NAME.fullmatch(name) or name.lower() in _RESERVED or len(name) > 40:
+def check_name(name: str, what: str = "name") -> str:
+    """A name that may stand in C; InputError otherwise."""
+    taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|s|x|i|table|elementary|bounded)_?\d\w*", name)
+    if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
-            f"name is {name!r}; expected a C name: a letter, then letters, digits or _, at most 40, and no C keyword"
+            f"{what} is {name!r:.60}; expected a C name: a letter, then letters, digits or _, at most 40, no keyword of "
+            "C or C++ and nothing that their libraries or the source itself define"
         )
     return name
 
@@ -40,34 +54,33 @@ def fill(text: str, precision: str, **values) -> str:
 
 
 def number(value, precision: str) -> str:
-    """The shortest literal that reads back as the same number.
-
-    Raises InputError where it is not finite, or too large for the precision.
-    """
+    """The shortest literal that reads back as the same number, InputError where it is too large for the precision."""
     numpy_type, _, suffix = PRECISIONS[precision]
+    if not np.isfinite(value):
+        return "(real)NAN" if value != value else "(real)INFINITY" if value > 0 else "-(real)INFINITY"
     with np.errstate(over="ignore"):
         rounded = numpy_type(value)
     if not np.isfinite(rounded):
-        raise InputError(f"a parameter is {value}, which {precision} cannot hold; train again, or export in f64")
+        raise InputError(f"a constant is {value}, which {precision} cannot hold; export in f64")
     return f"{rounded!s}{suffix}"
+
+
+def literal(value, precision: str) -> str:
+    """A number inside of an expression."""
+    text = number(value, precision)
+    return f"({text})" if text.startswith("-") else text
 
 
 _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
 
 
-def table(name: str, values, precision: str) -> str:
-    """A constant array, row by row."""
-    rows = np.atleast_2d(np.asarray(values))
-    size = " * ".join(map(str, np.shape(values)))
-    lines = [line for row in rows for line in _wrapper.wrap(" ".join(f"{number(value, precision)}," for value in row))]
-    return f"static const real {name}[{size}] = {{\n" + "\n".join(lines) + "\n};\n"
-
-
-def friction_table(coefficients, precision: str) -> str:
-    """The table of viscous friction, nothing for None."""
-    if coefficients is None:
-        return ""
-    return "\n/* Viscous friction, N m s or N s/m */\n" + table("friction", coefficients, precision)
+def table(name: str, array: np.ndarray, precision: str) -> str:
+    """A constant array."""
+    real = array.dtype.kind == "f"
+    kind = "real" if real else "int" if array.dtype.itemsize <= 4 or array.dtype == bool else "long long"
+    texts = (number(each, precision) if real else str(int(each)) for each in array.ravel())
+    lines = "\n".join(_wrapper.wrap(" ".join(f"{each}," for each in texts)))
+    return f"static const {kind} {name}[{array.size}] = {{\n{lines}\n}};\n"
 
 
 def comment(*paragraphs: str) -> str:

@@ -1,0 +1,285 @@
+"""What is no product and not elementwise as C: reductions, updates at indices, factorisations, and control flow."""
+
+from textwrap import dedent
+
+import numpy as np
+
+from dln_jax.deploy.c.program import Loop, Node
+
+_REDUCE = {
+    "reduce_sum": ("{0} + {1}", 1),
+    "reduce_prod": ("{0} * {1}", 1),
+    "reduce_max": ("(({0} > {1} || {0} != {0}) ? {0} : {1})", 0),
+    "reduce_min": ("(({0} < {1} || {0} != {0}) ? {0} : {1})", 0),
+    "reduce_and": ("{0} & {1}", 0),
+    "reduce_or": ("{0} | {1}", 0),
+}
+_PUT = {"put_set": "{1}", "put_add": "{0} + {1}", "put_mul": "{0} * {1}"}
+_PUT |= {f"put_{name}": _REDUCE[f"reduce_{name}"][0] for name in ("min", "max")}
+FUNCTIONS = {
+    "cholesky": """
+    /* Lower triangular l with l l^T = a [n, n]; not a number where a is not positive definite */
+    static void cholesky(int n, const real *a, real *l)
+    {
+        for (int i = 0; i < n; ++i)
+            for (int j = 0; j < n; ++j) {
+                real rest = a[i * n + j];
+                if (j > i) {
+                    l[i * n + j] = 0;
+                    continue;
+                }
+                for (int k = 0; k < j; ++k) rest -= l[i * n + k] * l[j * n + k];
+                l[i * n + j] = i == j ? SQRT(rest) : rest / l[j * n + j];
+            }
+    }
+    """,
+    "triangular_solve": """
+    /* x [n, columns] with a x = b, a lower or upper triangular */
+    static void triangular_solve(int n, int columns, int lower, int unit, const real *a, const real *b, real *x)
+    {
+        for (int turn = 0; turn < n; ++turn) {
+            const int i = lower ? turn : n - 1 - turn;
+            for (int c = 0; c < columns; ++c) {
+                real rest = b[i * columns + c];
+                for (int j = lower ? 0 : i + 1; j < (lower ? i : n); ++j) rest -= a[i * n + j] * x[j * columns + c];
+                x[i * columns + c] = unit ? rest : rest / a[i * n + i];
+            }
+        }
+    }
+    """,
+    "lu": """
+    /* Factors of rows of a [n, m] by elimination with partial pivoting: packed, row exchanged at each step, order */
+    static void lu(int n, int m, const real *a, real *packed, int *pivots, int *order)
+    {
+        for (int i = 0; i < n * m; ++i) packed[i] = a[i];
+        for (int i = 0; i < n; ++i) order[i] = i;
+        for (int k = 0; k < n && k < m; ++k) {
+            int pivot = k;
+            for (int i = k + 1; i < n; ++i)
+                if (FABS(packed[i * m + k]) > FABS(packed[pivot * m + k])) pivot = i;
+            pivots[k] = pivot;
+            if (pivot != k) {
+                const int moved = order[k];
+                order[k] = order[pivot];
+                order[pivot] = moved;
+                for (int j = 0; j < m; ++j) {
+                    const real swapped = packed[k * m + j];
+                    packed[k * m + j] = packed[pivot * m + j];
+                    packed[pivot * m + j] = swapped;
+                }
+            }
+            for (int i = k + 1; i < n; ++i) {
+                packed[i * m + k] /= packed[k * m + k];
+                for (int j = k + 1; j < m; ++j) packed[i * m + j] -= packed[i * m + k] * packed[k * m + j];
+            }
+        }
+    }
+    """,
+}
+"""C functions that are put into a source that needs them."""
+
+
+def definitions(names: set[str], suffix: str) -> str:
+    """Text of these functions."""
+    text = "".join("\n" + dedent(FUNCTIONS[name]).strip() + "\n" for name in FUNCTIONS if name in names)
+    return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
+
+
+def combined(body, op: str, terms: list[str]) -> str:
+    """A reduction of few terms; a sum in two halves, for its latency."""
+    pattern, cost = _REDUCE[op]
+    body.spend(cost * (len(terms) - 1))
+    text = terms[0]
+    for term in terms[1:]:
+        text = f"({pattern.format(text, term)})"
+    return text
+
+
+def written(body, node: Node) -> None:
+    """The C of a node."""
+    _WRITERS[node.op](body, node)
+
+
+def _reduction(body, node: Node) -> None:
+    (a,) = node.args
+    rows, count = a.shape
+    pattern, cost = _REDUCE[node.op]
+    body.spend(cost * rows * (count - 1))
+    name, at = body.name(node), np.arange(a.size).reshape(a.shape)
+    scalar = node not in body.plan.arrays
+    body.declared(name, node.dtype, 0 if scalar else node.size)
+    parts = 8 if node.op == "reduce_sum" and node.dtype == "real" and count >= 16 else 1
+    body.opened(f"for (int r = 0; r < {rows}; ++r)")
+    kind = body.c_type(node.dtype)
+    whole = count // parts * parts
+    if parts > 1:
+        body.line(f"real part[{parts}] = {{0}};")
+        text = body.read(a, at, ["r", "(k + c)"])
+        body.line(f"for (int k = 0; k < {whole}; k += {parts})")
+        body.line(f"    for (int c = 0; c < {parts}; ++c) part[c] += {text};")
+        body.line("real sum = (part[0] + part[4]) + (part[1] + part[5]) + ((part[2] + part[6]) + (part[3] + part[7]));")
+        if whole < count:
+            body.line(f"for (int k = {whole}; k < {count}; ++k) sum += {body.read(a, at, ['r', 'k'])};")
+    else:
+        body.line(f"{kind} sum = {body.read(a, at[:, 0], ['r'])};")
+        body.opened(f"for (int k = 1; k < {count}; ++k)")
+        body.line(f"const {kind} term = {body.read(a, at, ['r', 'k'])};")
+        body.line(f"sum = {pattern.format('sum', 'term')};")
+        body.closed()
+    body.line(f"{name}{'' if scalar else '[r]'} = sum;")
+    body.closed()
+
+
+def _arg(body, node: Node) -> None:
+    """The first of the largest or smallest; what is not a number comes before all."""
+    (a,) = node.args
+    rows, count = a.shape
+    name, at = body.name(node), np.arange(a.size).reshape(a.shape)
+    scalar, kind = node not in body.plan.arrays, body.c_type(a.dtype)
+    body.declared(name, node.dtype, 0 if scalar else node.size)
+    body.opened(f"for (int r = 0; r < {rows}; ++r)")
+    body.line("int chosen = 0;")
+    body.line(f"{kind} best = {body.read(a, at[:, 0], ['r'])};")
+    body.opened(f"for (int k = 1; k < {count}; ++k)")
+    body.line(f"const {kind} x = {body.read(a, at, ['r', 'k'])};")
+    symbol = ">" if node.op == "argmax" else "<"
+    body.opened(f"if ((x {symbol} best || x != x) && best == best)")
+    body.line("best = x;")
+    body.line("chosen = k;")
+    body.closed()
+    body.closed()
+    body.line(f"{name}{'' if scalar else '[r]'} = chosen;")
+    body.closed()
+
+
+def _put(body, node: Node) -> None:
+    operand, targets, updates = node.args
+    name, count = body.name(node), updates.size
+    body.declared(name, node.dtype, node.size)
+    body.copied(operand, name)
+    body.spend(count)
+    index = np.arange(count)
+    body.opened(f"for (int k = 0; k < {count}; ++k)")
+    body.line(f"const long long target = {body.read(targets, index, ['k'])};")
+    body.line(f"const {body.c_type(node.dtype)} update = {body.read(updates, index, ['k'])};")
+    at = f"{name}[target]"
+    body.line(f"if (target >= 0) {at} = {_PUT[node.op].format(at, 'update')};")
+    body.closed()
+
+
+def _cholesky(body, node: Node) -> None:
+    (a,) = node.args
+    n = a.shape[0]
+    body.source.kernels.add("cholesky")
+    body.declared(body.name(node), "real", node.size)
+    body.line(f"cholesky({n}, {body.pointer(a)}, {body.pointer(node)});")
+    body.spend(n * (n + 1) * (n + 2) // 3)
+
+
+def _triangular_solve(body, node: Node) -> None:
+    a, b = node.args
+    n, columns = b.shape
+    lower, unit = map(int, node.attribute)
+    body.source.kernels.add("triangular_solve")
+    body.declared(body.name(node), "real", node.size)
+    sizes = f"{n}, {columns}, {lower}, {unit}"
+    body.line(f"triangular_solve({sizes}, {body.pointer(a)}, {body.pointer(b)}, {body.pointer(node)});")
+    body.spend(n * n * columns)
+
+
+def _lu(body, node: Node) -> None:
+    (a,) = node.args
+    n, m = a.shape
+    body.source.kernels.add("lu")
+    names = [f"v{node.number}_{part}" for part in range(3)]
+    for name, dtype, size in zip(names, ("real", "int", "int"), (n * m, min(n, m), n), strict=True):
+        body.declared(name, dtype, size)
+    body.line(f"lu({n}, {m}, {body.pointer(a)}, {', '.join(names)});")
+    body.spend(2 * n * n * m // 3)
+
+
+def _stored(body, prefix: str, nodes: list[Node]) -> list[str]:
+    """Declares what control flow hands on."""
+    names = [f"{prefix}_{index}" for index in range(len(nodes))]
+    for name, node in zip(names, nodes, strict=True):
+        body.declared(name, node.dtype, max(node.size, 1))
+    return names
+
+
+def _handed_on(body, loop: Loop, names: list[str], number: int) -> None:
+    """New carries from the results of a turn, which may be old carries."""
+    moved = loop.results[: len(names)]
+    temporary = [f"n{number}_{index}" for index in range(len(moved))]
+    for name, node in zip(temporary, moved, strict=True):
+        body.declared(name, node.dtype, max(node.size, 1))
+        body.copied(node, name)
+    for name, old, node in zip(names, temporary, moved, strict=True):
+        body.line(f"for (int k = 0; k < {node.size}; ++k) {name}[k] = {old}[k];")
+
+
+def _while(body, node: Node) -> None:
+    number, loop = node.attribute, body.program.loops[node.attribute]
+    names = _stored(body, f"c{number}", loop.carries)
+    for name, start in zip(names, node.args, strict=True):
+        body.copied(start, name)
+    region = (*node.region, number)
+    body.opened("for (;;)")
+    done: set[Node] = set()
+    body.region(region, done, body.ancestors(loop.conditions))
+    body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
+    body.region(region, done)
+    _handed_on(body, loop, names, number)
+    body.closed()
+
+
+def _repeat(body, node: Node) -> None:
+    number, loop = node.attribute, body.program.loops[node.attribute]
+    length, carried = int(loop.length or 0), len(loop.carries)
+    names = _stored(body, f"c{number}", loop.carries)
+    for name, start in zip(names, node.args, strict=True):
+        body.copied(start, name)
+    stacked = loop.results[carried:]
+    for index, each in enumerate(stacked):
+        body.declared(f"c{number}_{carried + index}", each.dtype, max(each.size * length, 1))
+    body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
+    turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
+    body.line(f"const long long i_{number} = {turn};")
+    body.region((*node.region, number))
+    for index, each in enumerate(stacked):
+        body.opened("")
+        body.declared(f"n{number}_{carried + index}", each.dtype, max(each.size, 1))
+        body.copied(each, f"n{number}_{carried + index}")
+        target = f"c{number}_{carried + index}[i_{number} * {each.size} + k]"
+        body.line(f"for (int k = 0; k < {each.size}; ++k) {target} = n{number}_{carried + index}[k];")
+        body.closed()
+    _handed_on(body, loop, names, number)
+    body.closed(max(length, 1))
+
+
+def _branch(body, node: Node) -> None:
+    numbers = node.attribute
+    first = body.program.loops[numbers[0]].results
+    names = _stored(body, f"c{numbers[0]}", first)
+    which = body.read(node.args[0], np.array(0))
+    for place, number in enumerate(numbers):
+        last = place == len(numbers) - 1
+        test = f"if ({which} {'<=' if place == 0 else '=='} {place})"
+        body.opened(("else " if place else "") + ("" if last else test))
+        body.region((*node.region, number))
+        for name, result in zip(names, body.program.loops[number].results, strict=True):
+            body.copied(result, name)
+        body.closed()
+
+
+_WRITERS = {
+    **dict.fromkeys(_REDUCE, _reduction),
+    **dict.fromkeys(_PUT, _put),
+    "argmax": _arg,
+    "argmin": _arg,
+    "cholesky": _cholesky,
+    "triangular_solve": _triangular_solve,
+    "lu": _lu,
+    "while": _while,
+    "repeat": _repeat,
+    "branch": _branch,
+}

@@ -1,0 +1,198 @@
+"""A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from dln_jax.deploy.c import indexing, linear_algebra, primitives
+from dln_jax.deploy.c.program import Loop, Node, Program
+from dln_jax.types import InputError
+
+_KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int8": "int", "int16": "int", "int32": "int"}
+_KINDS |= {"int64": "long", "uint8": "unsigned", "uint16": "unsigned", "uint32": "unsigned", "uint64": "unsigned_long"}
+_CALLS = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
+    "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_lin": "call_jaxpr",
+}  # fmt: skip
+_REFUSED = {
+    "random": "random numbers; draw them outside and pass them as arguments",
+    "threefry": "random numbers; draw them outside and pass them as arguments",
+    "callback": "a callback into Python, which a robot has not",
+    "debug_print": "printing, a side effect",
+}
+_RULES = {**primitives.RULES, **indexing.RULES, **linear_algebra.RULES}
+
+
+def program_of(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Program, list[Node], list[Node], Any]:
+    """The program of a function for arguments like the examples: with its inputs, its results, and their tree.
+
+    Raises:
+        InputError: what has no C: an unsupported primitive, with the line that made it, a side effect, random numbers,
+            another type of number, a shape that is not known.
+    """
+    flat, _ = jax.tree.flatten(tuple(examples))
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    program = Program()
+    inputs = [
+        program.make("input", np.shape(leaf), kind_of(np.asarray(leaf).dtype), attribute=number)
+        for number, leaf in enumerate(flat)
+    ]
+    if closed.effects:
+        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
+    results = _inline(program, closed, inputs)
+    return program, inputs, results, shapes
+
+
+def kind_of(dtype: Any) -> str:
+    """What a type is in a program; InputError for one that has no C."""
+    if str(dtype) not in _KINDS:
+        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to float32 or float64"
+        raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
+    return _KINDS[str(dtype)]
+
+
+def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
+    """Results of a closed jaxpr."""
+    jaxpr = closed.jaxpr
+    known: dict[Any, Node] = {}
+
+    def read(variable: Any) -> Node:
+        if hasattr(variable, "val"):
+            return _constant(program, variable.val, variable.aval)
+        return known[variable]
+
+    known.update(zip(jaxpr.invars, args, strict=True))
+    for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
+        known[variable] = _constant(program, value, variable.aval)
+    for equation in jaxpr.eqns:
+        try:
+            results = _apply(program, equation, [read(variable) for variable in equation.invars])
+        except InputError as error:
+            text = str(error)
+            where = "" if " (made at " in text else f" (made at {_line(equation)})"
+            raise InputError(text + where) from error
+        known.update(zip(equation.outvars, results, strict=True))
+    return [read(variable) for variable in jaxpr.outvars]
+
+
+def _constant(program: Program, value: Any, aval: Any) -> Node:
+    kind = kind_of(aval.dtype)
+    return program.constant(np.asarray(value).reshape(aval.shape), kind)
+
+
+def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
+    name, parameters = equation.primitive.name, equation.params
+    for variable in equation.outvars:
+        if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
+            raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
+    if name in _CALLS:
+        return _inline(program, _closed(parameters[_CALLS[name]]), args)
+    if name in _CONTROL:
+        return _CONTROL[name](program, parameters, args)
+    if name in primitives.TYPED_RULES:
+        dtype = kind_of(equation.outvars[0].aval.dtype)
+        return [primitives.TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
+    if name not in _RULES:
+        why = next((reason for part, reason in _REFUSED.items() if part in name), None)
+        raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
+    results = _RULES[name](program, parameters, *args)
+    return list(results) if isinstance(results, list | tuple) else [results]
+
+
+def _closed(jaxpr: Any) -> Any:
+    return jaxpr if hasattr(jaxpr, "consts") else jax.extend.core.ClosedJaxpr(jaxpr, ())
+
+
+def _line(equation: Any) -> str:
+    """File and line of the user's code that made an equation."""
+    traceback = equation.source_info.traceback
+    frames = [] if traceback is None else list(traceback.frames)
+    users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/deploy/" not in frame.file_name]
+    return f"{users[0].file_name}:{users[0].line_num}" if users else "an unknown line"
+
+
+def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    lengths, jaxprs = parameters["const_lengths"], parameters["jaxprs"]
+    before = lengths.matvec + lengths.vecmat
+    constants, right = args[before : before + lengths.solve], args[sum(lengths) :]
+    return _inline(program, jaxprs.solve, [*constants, *right])
+
+
+def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], int]:
+    """Where a loop over these nodes is, and its number."""
+    number = len(program.loops)
+    program.loops[number] = Loop([], [], [])
+    return max((program.floor, *(node.region for node in nodes)), key=len), number
+
+
+def _carries(program: Program, number: int, outer: tuple[int, ...], start: Sequence[Node]) -> list[Node]:
+    region = (*outer, number)
+    return [
+        program.make("carry", each.shape, each.dtype, attribute=(number, index), region=region)
+        for index, each in enumerate(start)
+    ]
+
+
+def _projections(program: Program, op: str, number: int, outer, start, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
+    loop = program.make(op, (), "int", start, attribute=number, region=outer)
+    return [
+        program.make("project", shape, dtype, [loop], attribute=index) for index, (shape, dtype) in enumerate(shapes)
+    ]
+
+
+def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
+    of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
+    outer, number = _region(program, args)
+    carries = _carries(program, number, outer, start)
+    (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
+    results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
+    program.loops[number] = Loop(carries, [condition], results)
+    return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
+
+
+def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    constants, count = parameters["num_consts"], parameters["num_carry"]
+    fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
+    length, reverse = parameters["length"], parameters["reverse"]
+    outer, number = _region(program, args)
+    carries = _carries(program, number, outer, start)
+    turn = program.make("counter", (), "long", attribute=number, region=(*outer, number))
+    slices = []
+    for each in stacked:
+        size = each.size // max(length, 1)
+        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "long")
+        first = program.elementwise("mul", turn, program.constant(size, "long"))
+        slices.append(indexing.take(program, each, program.elementwise("add", first, offsets)))
+    results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
+    program.loops[number] = Loop(carries, [], results, length, reverse)
+    shapes = [(each.shape, each.dtype) for each in start]
+    shapes += [((length, *each.shape), each.dtype) for each in results[count:]]
+    return _projections(program, "repeat", number, outer, start, shapes)
+
+
+def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    which, *operands = args
+    branches = parameters["branches"]
+    if len(branches) == 1 or which.op == "const":
+        chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
+        return _inline(program, branches[chosen], operands)
+    outer, number = _region(program, args)
+    floor, every = program.floor, []
+    for branch, closed in enumerate(branches):
+        inside = number if branch == 0 else _region(program, [])[1]
+        program.floor = (*outer, inside)
+        every.append((inside, _inline(program, closed, operands)))
+    program.floor = floor
+    for inside, results in every:
+        program.loops[inside] = Loop([], [], results)
+    shapes = [(each.shape, each.dtype) for each in every[0][1]]
+    numbers = tuple(inside for inside, _ in every)
+    branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
+    return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
+
+
+_CONTROL = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _custom_linear_solve}

@@ -1,0 +1,118 @@
+"""Elementwise operations: how each is written in C, computed beforehand, and what it costs."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from dln_jax.deploy.c.elementary import OPERATIONS as COSTS
+from dln_jax.deploy.c.elementary import VECTORISED as _VECTORISED
+
+
+class Operation(NamedTuple):
+    """One elementwise operation."""
+
+    c: str
+    """C expression of the arguments {0}, {1}, ...; {f} is the suffix of functions of <math.h>."""
+    fold: Callable[..., Any] | None
+    """The same of NumPy arrays."""
+    cost: int = 1
+    """Floating-point operations, 0 for what only compares, selects or moves."""
+    dtype: str | None = None
+    """Of the result; that of the last argument by default."""
+    function: str | None = None
+    """The function of <math.h> that it calls."""
+
+
+def _function(name: str, fold: Callable[..., Any], *, arguments: int = 1) -> Operation:
+    call = f"{name}{{f}}({', '.join(f'{{{k}}}' for k in range(arguments))})"
+    return Operation(call, fold, COSTS.get(name, 1), function=name)
+
+
+def _comparison(symbol: str, fold: Callable[..., Any]) -> Operation:
+    return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool")
+
+
+def _integer_division(a, b):
+    return np.trunc(a / b).astype(a.dtype) if np.asarray(a).dtype.kind in "iu" else np.divide(a, b)
+
+
+OPERATIONS = {
+    "add": Operation("({0} + {1})", np.add),
+    "sub": Operation("({0} - {1})", np.subtract),
+    "mul": Operation("({0} * {1})", np.multiply),
+    "div": Operation("({0} / {1})", _integer_division),
+    "neg": Operation("(-{0})", np.negative, 0),
+    "abs": Operation("fabs{f}({0})", np.abs, 0),
+    "integer_abs": Operation("({0} < 0 ? -{0} : {0})", np.abs, 0),
+    "max": Operation("(({0} > {1} || {0} != {0}) ? {0} : {1})", np.maximum, 0),
+    "min": Operation("(({0} < {1} || {0} != {0}) ? {0} : {1})", np.minimum, 0),
+    "integer_rem": Operation("({0} % {1})", np.fmod, 0),
+    "rem": _function("fmod", np.fmod, arguments=2),
+    "sqrt": _function("sqrt", np.sqrt),
+    "pow": _function("pow", np.power, arguments=2),
+    "atan2": _function("atan2", np.arctan2, arguments=2),
+    **{
+        name: _function(name, fold)
+        for name, fold in {
+            "cbrt": np.cbrt,
+            "exp": np.exp,
+            "exp2": np.exp2,
+            "expm1": np.expm1,
+            "log": np.log,
+            "log1p": np.log1p,
+            "sin": np.sin,
+            "cos": np.cos,
+            "tan": np.tan,
+            "asin": np.arcsin,
+            "acos": np.arccos,
+            "atan": np.arctan,
+            "sinh": np.sinh,
+            "cosh": np.cosh,
+            "tanh": np.tanh,
+            "asinh": np.arcsinh,
+            "acosh": np.arccosh,
+            "atanh": np.arctanh,
+            "erf": special.erf,
+            "erfc": special.erfc,
+            "lgamma": special.gammaln,
+            "floor": np.floor,
+            "ceil": np.ceil,
+            "rint": np.rint,
+            "trunc": np.trunc,
+        }.items()
+    },
+    "round": _function("round", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
+    "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
+    "eq": _comparison("==", np.equal),
+    "ne": _comparison("!=", np.not_equal),
+    "lt": _comparison("<", np.less),
+    "le": _comparison("<=", np.less_equal),
+    "gt": _comparison(">", np.greater),
+    "ge": _comparison(">=", np.greater_equal),
+    "and": Operation("({0} & {1})", np.bitwise_and, 0),
+    "or": Operation("({0} | {1})", np.bitwise_or, 0),
+    "xor": Operation("({0} ^ {1})", np.bitwise_xor, 0),
+    "not": Operation("(!{0})", np.logical_not, 0),
+    "integer_not": Operation("(~{0})", np.invert, 0),
+    "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
+    **{
+        f"to_{kind}": Operation(f"(({kind})({{0}}))", lambda x, t=dtype: np.asarray(x).astype(t), 0, kind)
+        for kind, dtype in {
+            "real": np.float64,
+            "int": np.int32,
+            "long": np.int64,
+            "unsigned": np.uint32,
+            "unsigned_long": np.uint64,
+        }.items()
+    },
+    "to_bool": Operation("({0} != 0)", lambda x: np.asarray(x) != 0, 0, "bool"),
+}
+"""By name."""
+COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
+"""Exactly so, also in floating point."""
+TRANSCENDENTAL = frozenset(name for name, each in OPERATIONS.items() if each.function and name not in ("sqrt",))
+"""What calls a function."""
+VECTORISED = frozenset(_VECTORISED)
+"""What is written so that loops of it vectorise."""

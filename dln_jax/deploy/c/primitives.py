@@ -1,0 +1,287 @@
+"""What each primitive of JAX is as nodes of a program: elementwise operations, moves, products and reductions.
+
+Each rule takes the program, the equation's parameters and its arguments, and gives the result, or a list of them.
+"""
+
+from collections.abc import Callable
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from dln_jax.deploy.c.program import Node, Program
+
+Rule = Callable[..., Any]
+
+_RENAMED = {
+    "add_any": "add",
+    "stop_gradient": None,
+    "copy": None,
+    "copy_p": None,
+    "optimization_barrier": None,
+    "reduce_precision": None,
+}
+_AS_NAMED = (
+    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
+    "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc",
+    "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
+)  # fmt: skip
+
+
+def _elementwise(name: str) -> Rule:
+    return lambda program, _, *args: program.elementwise(name, *args)
+
+
+def _moved(move: Callable[..., np.ndarray]) -> Rule:
+    """A rule of what only moves elements: `move` does so to an array of their indices."""
+
+    def rule(program: Program, parameters: dict[str, Any], node: Node, *_: Node) -> Node:
+        return program.arrange([node], move(np.arange(node.size).reshape(node.shape), parameters))
+
+    return rule
+
+
+def _broadcast_in_dim(index, parameters):
+    shape, dimensions = parameters["shape"], parameters["broadcast_dimensions"]
+    expanded = [1] * len(shape)
+    for axis, size in zip(dimensions, index.shape, strict=True):
+        expanded[axis] = size
+    return np.broadcast_to(index.reshape(expanded), shape)
+
+
+def _slice(index, parameters):
+    strides = parameters["strides"] or [1] * index.ndim
+    limits = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
+    return index[tuple(slice(int(start), int(limit), int(stride)) for start, limit, stride in limits)]
+
+
+def _integer_power(program: Program, parameters, x: Node) -> Node:
+    exponent, result = parameters["y"], None
+    power, left = x, abs(exponent)
+    while left:
+        if left & 1:
+            result = power if result is None else program.elementwise("mul", result, power)
+        left >>= 1
+        power = program.elementwise("mul", power, power) if left else power
+    one = program.constant(1.0, "real")
+    if result is None:
+        return program.broadcast(one, x.shape)
+    return result if exponent > 0 else program.elementwise("div", one, result)
+
+
+def _sign(program: Program, _, x: Node) -> Node:
+    zero, one = (program.constant(number, x.dtype) for number in ((0.0, 1.0) if x.dtype == "real" else (0, 1)))
+    minus = program.elementwise("neg", one)
+    positive, negative = (program.elementwise(name, x, zero) for name in ("gt", "lt"))
+    # What is neither, 0 or NaN, is its own sign.
+    return program.select(positive, program.select(negative, x, minus), one)
+
+
+def _logistic(program: Program, _, x: Node) -> Node:
+    one = program.constant(1.0, "real")
+    decay = program.elementwise("exp", program.elementwise("neg", x))
+    return program.elementwise("div", one, program.elementwise("add", one, decay))
+
+
+def _clamp(program: Program, _, low: Node, x: Node, high: Node) -> Node:
+    return program.elementwise("min", program.elementwise("max", x, low), high)
+
+
+def _select_n(program: Program, _, which: Node, *cases: Node) -> Node:
+    if which.dtype == "bool":
+        return program.select(which, *cases)
+    result = cases[-1]
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        result = program.select(program.elementwise("eq", which, program.constant(number, which.dtype)), result, case)
+    return result
+
+
+def _by_kind(real: str, integer: str) -> Rule:
+    return lambda program, _, *args: program.elementwise(real if args[-1].dtype == "real" else integer, *args)
+
+
+def _not(program: Program, _, x: Node) -> Node:
+    return program.elementwise("not" if x.dtype == "bool" else "integer_not", x)
+
+
+def _round(program: Program, parameters, x: Node) -> Node:
+    return program.elementwise("rint" if int(parameters["rounding_method"]) else "round", x)
+
+
+def convert(program: Program, node: Node, dtype: str) -> Node:
+    """The node as another type."""
+    if node.dtype == dtype:
+        return node
+    if node.dtype == "real" and dtype != "bool":
+        node = program.elementwise("trunc", node)
+    return program.elementwise(f"to_{dtype}", node)
+
+
+def _pad(program: Program, parameters, x: Node, padding: Node) -> Node:
+    index = np.arange(x.size).reshape(x.shape)
+    for axis, (low, high, interior) in enumerate(parameters["padding_config"]):
+        low, high, interior, extent = int(low), int(high), int(interior), index.shape[axis]
+        inner = extent + max(extent - 1, 0) * interior
+        shape = list(index.shape)
+        shape[axis] = inner
+        spread = np.full(shape, x.size)
+        np.moveaxis(spread, axis, 0)[:: interior + 1] = np.moveaxis(index, axis, 0)
+        wide = [(max(low, 0), max(high, 0)) if each == axis else (0, 0) for each in range(index.ndim)]
+        index = np.pad(spread, wide, constant_values=x.size)
+        cut = slice(max(-low, 0), index.shape[axis] - max(-high, 0))
+        index = index[(slice(None),) * axis + (cut,)]
+    return program.arrange([x, padding], index)
+
+
+def _concatenate(program: Program, parameters, *nodes: Node) -> Node:
+    starts = np.cumsum([0, *(node.size for node in nodes)])
+    pieces = [np.arange(node.size).reshape(node.shape) + start for node, start in zip(nodes, starts, strict=False)]
+    return program.arrange(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
+
+
+def _stack(program: Program, parameters, *nodes: Node) -> Node:
+    pieces = np.arange(sum(node.size for node in nodes)).reshape(len(nodes), *nodes[0].shape)
+    return program.arrange(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
+
+
+def _unstack(program: Program, parameters, node: Node) -> list[Node]:
+    index = np.moveaxis(np.arange(node.size).reshape(node.shape), parameters["axis"], 0)
+    return [program.arrange([node], piece) for piece in index]
+
+
+def _split(program: Program, parameters, node: Node) -> list[Node]:
+    index = np.arange(node.size).reshape(node.shape)
+    pieces = np.split(index, np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"])
+    return [program.arrange([node], piece) for piece in pieces]
+
+
+def _iota(program: Program, parameters, dtype: str) -> Node:
+    shape, dimension = parameters["shape"], parameters["dimension"]
+    expanded = [-1 if axis == dimension else 1 for axis in range(len(shape))]
+    numbers = np.broadcast_to(np.arange(shape[dimension]).reshape(expanded), shape)
+    return program.constant(numbers.astype(float if dtype == "real" else numbers.dtype), dtype)
+
+
+def _dot_general(program: Program, parameters, a: Node, b: Node) -> Node:
+    (a_sum, b_sum), (a_batch, b_batch) = parameters["dimension_numbers"]
+    a_free = [axis for axis in range(len(a.shape)) if axis not in (*a_sum, *a_batch)]
+    b_free = [axis for axis in range(len(b.shape)) if axis not in (*b_sum, *b_batch)]
+
+    def ordered(node: Node, *groups) -> Node:
+        index = np.arange(node.size).reshape(node.shape).transpose([axis for group in groups for axis in group])
+        return program.arrange([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
+
+    product = program.contract(ordered(a, a_batch, a_free, a_sum), ordered(b, b_batch, b_sum, b_free))
+    shape = [a.shape[axis] for axis in (*a_batch, *a_free)] + [b.shape[axis] for axis in b_free]
+    return program.reshape(product, shape)
+
+
+def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
+    """The node as [o, r], with the given axes last and as one."""
+    kept = [axis for axis in range(len(node.shape)) if axis not in axes]
+    index = np.arange(node.size).reshape(node.shape).transpose([*kept, *axes])
+    return program.arrange([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
+
+
+def _reduction(name: str, op: str, start: Any) -> Rule:
+    def rule(program: Program, parameters, node: Node) -> Node:
+        axes = tuple(parameters["axes"])
+        shape = [size for axis, size in enumerate(node.shape) if axis not in axes]
+        if node.size == 0:
+            return program.broadcast(program.constant(start, node.dtype), shape)
+        rows = rows_of(program, node, axes)
+        if rows.shape[1] == 1:
+            return program.reshape(rows, shape)
+        if rows.shape[1] == 2:
+            first, second = (program.arrange([rows], np.arange(rows.size).reshape(rows.shape)[:, k]) for k in range(2))
+            return program.reshape(program.elementwise(op, first, second), shape)
+        return program.reshape(program.make(name, rows.shape[:1], node.dtype, [rows]), shape)
+
+    return rule
+
+
+def _arg(name: str) -> Rule:
+    def rule(program: Program, parameters, node: Node, *, dtype: str) -> Node:
+        (axis,) = parameters["axes"]
+        shape = node.shape[:axis] + node.shape[axis + 1 :]
+        rows = rows_of(program, node, (axis,))
+        return program.reshape(program.make(name, rows.shape[:1], dtype, [rows]), shape)
+
+    return rule
+
+
+def _cumulative(op: str) -> Rule:
+    """Written out: element by element of the axis."""
+
+    def rule(program: Program, parameters, node: Node) -> Node:
+        axis = parameters["axis"]
+        index = np.moveaxis(np.arange(node.size).reshape(node.shape), axis, 0)
+        index = index[::-1] if parameters["reverse"] else index
+        pieces: list[Node] = []
+        for positions in index:
+            piece = program.arrange([node], positions)
+            pieces.append(program.elementwise(op, pieces[-1], piece) if pieces else piece)
+        if parameters["reverse"]:
+            pieces.reverse()
+        joined = np.arange(node.size).reshape(index.shape)
+        return program.arrange(pieces, np.moveaxis(joined, 0, axis)) if pieces else node
+
+    return rule
+
+
+def _reciprocal_root(program: Program, _, x: Node) -> Node:
+    return program.elementwise("div", program.constant(1.0, "real"), program.elementwise("sqrt", x))
+
+
+def _identity(_, __, *nodes: Node) -> Any:
+    return list(nodes)
+
+
+RULES: dict[str, Rule] = {
+    **{name: _elementwise(name) for name in _AS_NAMED},
+    **{name: _identity if op is None else _elementwise(op) for name, op in _RENAMED.items()},
+    "square": lambda program, _, x: program.elementwise("mul", x, x),
+    "neg": lambda program, _, x: program.elementwise("neg", x),
+    "abs": _by_kind("abs", "integer_abs"),
+    "rem": _by_kind("rem", "integer_rem"),
+    "not": _not,
+    "sign": _sign,
+    "rsqrt": _reciprocal_root,
+    "integer_pow": _integer_power,
+    "logistic": _logistic,
+    "clamp": _clamp,
+    "round": _round,
+    "select_n": _select_n,
+    "broadcast_in_dim": _moved(_broadcast_in_dim),
+    "reshape": _moved(lambda index, parameters: index.reshape(parameters["new_sizes"])),
+    "squeeze": _moved(lambda index, parameters: np.squeeze(index, tuple(parameters["dimensions"]))),
+    "expand_dims": _moved(lambda index, parameters: np.expand_dims(index, tuple(parameters["dimensions"]))),
+    "transpose": _moved(lambda index, parameters: index.transpose(parameters["permutation"])),
+    "rev": _moved(lambda index, parameters: np.flip(index, parameters["dimensions"])),
+    "slice": _moved(_slice),
+    "tile": _moved(lambda index, parameters: np.tile(index, parameters["reps"])),
+    "pad": _pad,
+    "concatenate": _concatenate,
+    "stack": _stack,
+    "unstack": _unstack,
+    "split": _split,
+    "dot_general": _dot_general,
+    "reduce_sum": _reduction("reduce_sum", "add", 0.0),
+    "reduce_prod": _reduction("reduce_prod", "mul", 1.0),
+    "reduce_max": _reduction("reduce_max", "max", -np.inf),
+    "reduce_min": _reduction("reduce_min", "min", np.inf),
+    "reduce_and": _reduction("reduce_and", "and", True),
+    "reduce_or": _reduction("reduce_or", "or", False),
+    "cumsum": _cumulative("add"),
+    "cumprod": _cumulative("mul"),
+    "cummax": _cumulative("max"),
+    "cummin": _cumulative("min"),
+}
+"""By the primitive's name."""
+TYPED_RULES: dict[str, Rule] = {
+    "convert_element_type": lambda program, _, x, *, dtype: convert(program, x, dtype),
+    "iota": lambda program, parameters, *, dtype: _iota(program, parameters, dtype),
+    "argmax": _arg("argmax"),
+    "argmin": _arg("argmin"),
+}
+"""Those that take the type of the result."""

@@ -1,0 +1,272 @@
+"""A program of small arrays: a graph of interned nodes, simplified as it is built.
+
+There are few kinds of nodes, because whatever only moves numbers (slices, transposes, concatenations, padding, gathers
+and selections that are known beforehand) is one of them, an `arrange`: for each of its elements, which element of which
+source it is. Arranges of arranges are one arrange.
+
+| op | value |
+|---|---|
+| `input`, `const` | an argument's leaf; numbers |
+| `arrange` | elements of the sources, laid end to end, at the positions `value` |
+| a name of `operations.OPERATIONS` | elementwise, of arguments of one shape or scalars |
+| `contract` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
+| `reduce_*`, `arg*` | over the last axis of an argument [o, r] |
+| `take` | flat elements of the first argument at the second's indices |
+| `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
+| `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
+| `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
+
+Simplifications keep what IEEE arithmetic gives: 1 x = x and 0 + x = x, but never 0 x = 0, which hides a NaN.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.deploy.c.operations import COMMUTATIVE, OPERATIONS
+from dln_jax.types import InputError
+
+Region = tuple[int, ...]
+"""The loops and branches that a node is in, outermost first."""
+LARGEST = 1 << 22
+"""Elements of an array."""
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """An array that a program computes; equal ones are the same object."""
+
+    op: str
+    shape: tuple[int, ...]
+    dtype: str
+    """real, bool, int, long, unsigned or unsigned long."""
+    args: tuple["Node", ...]
+    attribute: Any
+    value: np.ndarray | None
+    """Numbers of a `const`, positions of an `arrange` [shape]."""
+    region: Region
+    number: int
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+
+class Loop(NamedTuple):
+    """Inside of a `while`, `repeat` or `branch`."""
+
+    carries: list[Node]
+    """What a turn starts with; nothing for a branch."""
+    conditions: list[Node]
+    """Whether there is another turn, of a `while`."""
+    results: list[Node]
+    """New carries, then what each turn of a `repeat` leaves; results of each branch in turn."""
+    length: int | None = None
+    """Turns of a `repeat`."""
+    reverse: bool = False
+
+
+@dataclass
+class Program:
+    """Nodes in an order in which each follows its arguments."""
+
+    nodes: list[Node] = field(default_factory=list)
+    loops: dict[int, Loop] = field(default_factory=dict)
+    floor: Region = ()
+    """The branch that is being built: nodes stay in it even if they need nothing that is computed there."""
+    _interned: dict[Any, list[Node]] = field(default_factory=dict)
+
+    def make(
+        self,
+        op: str,
+        shape: Sequence[int],
+        dtype: str,
+        args: Sequence[Node] = (),
+        attribute: Any = None,
+        value: np.ndarray | None = None,
+        region: Region = (),
+    ) -> Node:
+        """The node, new or met before, in the innermost region of its arguments: nothing stays in a loop needlessly."""
+        shape, args = tuple(map(int, shape)), tuple(args)
+        if np.prod(shape, dtype=np.float64) > LARGEST:
+            raise InputError(
+                f"an array of shape {shape} is too large for generated C; expected at most {LARGEST} numbers"
+            )
+        region = max((region, self.floor, *(each.region for each in args)), key=len)
+        # A value's type is part of it: 1.0 and 1 may have the same bytes in no case, but True and 1 do.
+        key = (op, shape, dtype, args, attribute, None if value is None else (value.tobytes(), value.dtype.str))
+        for known in self._interned.setdefault(key, []):
+            if region[: len(known.region)] == known.region:
+                return known
+        node = Node(op, shape, dtype, args, attribute, value, region, len(self.nodes))
+        self.nodes.append(node)
+        self._interned[key].append(node)
+        return node
+
+    def constant(self, value: Any, dtype: str) -> Node:
+        """Numbers."""
+        array = np.asarray(value)
+        return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
+
+    def arrange(self, sources: Sequence[Node], positions: np.ndarray) -> Node:
+        """Elements of the sources, laid end to end, at the positions [shape]."""
+        inner, flat, start = [], [], 0
+        for source in sources:
+            parts = source.args if source.op == "arrange" else (source,)
+            within = np.arange(source.size) if source.value is None or source.op == "const" else source.value.ravel()
+            inner += parts
+            flat.append(within + start)
+            start += sum(part.size for part in parts)
+        positions = np.concatenate(flat)[np.asarray(positions, np.int64)]
+        inner, positions = _without_unused(inner, positions)
+        if not inner or positions.size == 0:
+            dtype = sources[0].dtype
+            return self.constant(np.zeros(positions.shape, bool if dtype == "bool" else float), dtype)
+        if all(each.op == "const" for each in inner):
+            total = sum(each.size for each in inner)
+            if positions.size <= max(total, 64):
+                joined = np.concatenate([each.value.ravel() for each in inner if each.value is not None])
+                return self.constant(joined[positions], inner[0].dtype)
+        if len(inner) == 1 and inner[0].shape == positions.shape:
+            if np.array_equal(positions.ravel(), np.arange(positions.size)):
+                return inner[0]
+        return self.make("arrange", positions.shape, inner[0].dtype, inner, value=positions)
+
+    def reshape(self, node: Node, shape: Sequence[int]) -> Node:
+        """The same elements in the same order."""
+        return self.arrange([node], np.arange(node.size).reshape(shape))
+
+    def broadcast(self, node: Node, shape: Sequence[int]) -> Node:
+        """As NumPy broadcasts."""
+        return self.arrange([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
+
+    def elementwise(self, op: str, *args: Node) -> Node:
+        """An operation of `OPERATIONS`, on arguments that broadcast as NumPy's."""
+        operation = OPERATIONS[op]
+        shape = np.broadcast_shapes(*(each.shape for each in args))
+        args = tuple(each if each.shape in ((), shape) else self.broadcast(each, shape) for each in args)
+        dtype = operation.dtype or args[-1].dtype
+        if all(each.op == "const" for each in args) and operation.fold is not None:
+            with np.errstate(all="ignore"):
+                value = operation.fold(*(each.value for each in args))
+            return self.constant(np.broadcast_to(value, shape), dtype)
+        if (known := self._simpler(op, args, shape)) is not None:
+            return known
+        if (pushed := self._below_broadcast(op, args, shape)) is not None:
+            return pushed
+        if op in COMMUTATIVE:
+            args = tuple(sorted(args, key=lambda each: each.number))
+        return self.make(op, shape, dtype, args)
+
+    def contract(self, a: Node, b: Node) -> Node:
+        """sum_k a[b, m, k] b[b, k, n]; a constant comes second."""
+        (batch, m, k), n = a.shape, b.shape[2]
+        if a.op == b.op == "const" and a.value is not None and b.value is not None:
+            return self.constant(np.matmul(a.value, b.value), "real")
+        if k == 0:
+            return self.constant(np.zeros((batch, m, n)), "real")
+        if k == 1:
+            return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
+        if is_constant(a) and not is_constant(b):
+            return self.transpose(self.contract(self.transpose(b), self.transpose(a)))
+        return self.make("contract", (batch, m, n), "real", (a, b))
+
+    def transpose(self, node: Node) -> Node:
+        """With the last two axes exchanged."""
+        return self.arrange([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
+
+    def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
+        """Elementwise, moved beforehand where the choice is known."""
+        shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
+        if chosen.op == "const" and chosen.value is not None:
+            chosen_value = np.broadcast_to(chosen.value, shape)
+            both = [self.broadcast(each, shape) for each in (if_false, if_true)]
+            index = np.arange(chosen_value.size).reshape(shape)
+            return self.arrange(both, np.where(chosen_value, index + chosen_value.size, index))
+        return self.elementwise("select", chosen, if_true, if_false)
+
+    def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        neutral = {"add": 0, "mul": 1, "sub": 0, "div": 1, "or": False, "and": True}
+        if op in neutral:
+            first, second = args
+            for kept, other in ((first, second), (second, first)) if op not in ("sub", "div") else ((first, second),):
+                if _is_all(other, neutral[op]) and kept.dtype == other.dtype:
+                    return self.broadcast(kept, shape)
+            if op == "sub" and _is_all(first, 0) and first.dtype == "real":
+                return self.elementwise("neg", second)
+        if op in ("add", "sub") and args[1].op == "neg":
+            return self.elementwise("sub" if op == "add" else "add", args[0], args[1].args[0])
+        if op == "add" and args[0].op == "neg":
+            return self.elementwise("sub", args[1], args[0].args[0])
+        if op == "neg" and args[0].op == "neg":
+            return args[0].args[0]
+        if op == "abs" and args[0].op in ("neg", "abs"):
+            return self.elementwise("abs", args[0].args[0])
+        if op == "select" and args[1] is args[2]:
+            return self.broadcast(args[1], shape)
+        return None
+
+    def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
+        """The operation before the arguments are repeated, where all are repeated in the same way."""
+        repeated = [each for each in args if each.size > 1 and not _is_uniform(each)]
+        others = [each for each in args if each.size == 1 or _is_uniform(each)]
+        if not shape or any(each.op == "const" for each in repeated) or len(repeated) + len(others) < len(args):
+            return None
+        if not repeated:
+            if np.prod(shape, dtype=np.int64) <= 1:
+                return None
+            return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
+        first = repeated[0]
+        if first.op != "arrange" or len(first.args) > 1 or first.args[0].size >= first.size:
+            return None
+        for each in repeated:
+            if each.op != "arrange" or each.args[0].shape != first.args[0].shape or len(each.args) > 1:
+                return None
+            if not np.array_equal(each.value, first.value):
+                return None
+        below = [each.args[0] if any(each is one for one in repeated) else self._one(each) for each in args]
+        return self.arrange([self.elementwise(op, *below)], first.value)
+
+    def _one(self, node: Node) -> Node:
+        """The scalar that all elements are."""
+        return node if node.shape == () else self.arrange([node], np.zeros((), np.int64))
+
+
+def is_constant(node: Node) -> bool:
+    """Whether it is known beforehand."""
+    return node.op == "const" or (node.op == "arrange" and all(each.op == "const" for each in node.args))
+
+
+def values(node: Node) -> np.ndarray:
+    """Numbers of a node that is known beforehand."""
+    if node.op == "const":
+        return np.asarray(node.value)
+    return np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)]
+
+
+def _is_all(node: Node, number: Any) -> bool:
+    return is_constant(node) and bool((values(node) == number).all())
+
+
+def _is_uniform(node: Node) -> bool:
+    if node.op == "const":
+        array = np.asarray(node.value)
+        return array.size > 0 and bool((array == array.flat[0]).all())
+    return node.op == "arrange" and node.value is not None and bool((node.value == node.value.flat[0]).all())
+
+
+def _without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Node], np.ndarray]:
+    """Each source once, and only those of which something is taken."""
+    starts = np.cumsum([0, *(each.size for each in sources)])
+    owner = np.searchsorted(starts, positions, side="right") - 1
+    kept, start, moved = {}, 0, np.zeros(len(sources), np.int64)
+    for index in np.unique(owner):
+        source = sources[index]
+        if source not in kept:
+            kept[source] = start
+            start += source.size
+        moved[index] = kept[source] - starts[index]
+    return list(kept), positions + moved[owner]
