@@ -13,7 +13,7 @@ import numpy as np
 from dln_jax.deploy.c import kernels, products
 from dln_jax.deploy.c.operations import OPERATIONS, VECTORISED
 from dln_jax.deploy.c.plan import WRITTEN_OUT, Plan, plan_of, strides
-from dln_jax.deploy.c.program import Node, Program, is_constant, values
+from dln_jax.deploy.c.program import Node, Program, Region, is_constant, values
 from dln_jax.deploy.c.text import literal
 
 C_TYPES = {"real": "real", "bool": "int", "int": "int", "long": "long long", "unsigned": "unsigned"}
@@ -65,6 +65,10 @@ class Body:
     lines: list[str] = field(default_factory=list)
     operations: int = 0
     bytes: int = 0
+    names: dict[Node, str] = field(default_factory=dict)
+    """Arrays that nodes are kept in."""
+    _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
+    """Arrays that nothing reads any more, by region, type and size."""
     _depth: int = 1
     _turns: int = 1
 
@@ -93,9 +97,25 @@ class Body:
         self.bytes += max(size, 1) * (4 if self.source.precision == "f32" and dtype == "real" else 8)
         self.line(f"{C_TYPES[dtype]} {name}{f'[{size}]' if size else ''}{value};")
 
+    def kept(self, node: Node) -> str:
+        """Name of the array that is to hold a node: one that nothing reads any more, or a new one."""
+        free = self._free.get((node.region, node.dtype, node.size))
+        self.names[node] = free.pop() if free else f"v{node.number}"
+        if self.names[node] == f"v{node.number}":
+            self.declared(self.names[node], node.dtype, node.size)
+        return self.names[node]
+
+    def finished(self, step: Node) -> None:
+        """Gives arrays back that no later step reads."""
+        for source in self.plan.reads.get(step, ()):
+            left = self.plan.readers[source]
+            left.discard(step)
+            if not left and source in self.names:
+                self._free.setdefault((source.region, source.dtype, source.size), []).append(self.names[source])
+
     def looped(self, shape: Sequence[int], inside: Callable[[list[str]], None]) -> None:
         """Loops over a box, with the names of their variables handed on."""
-        names = [f"i{axis}" for axis in range(len(shape))]
+        names = [f"i{axis}_" for axis in range(len(shape))]
         for name, extent in zip(names, shape, strict=True):
             self.opened(f"for (int {name} = 0; {name} < {extent}; ++{name})", extent)
         inside(names)
@@ -116,7 +136,7 @@ class Body:
             (loop,) = node.args
             number = loop.number if loop.op == "lu" else np.ravel(loop.attribute)[0]
             return f"{'v' if loop.op == 'lu' else 'c'}{number}_{node.attribute}"
-        return f"i_{node.attribute}" if node.op == "counter" else f"v{node.number}"
+        return f"i_{node.attribute}" if node.op == "counter" else self.names.get(node, f"v{node.number}")
 
     def read(self, node: Node, positions: np.ndarray, names: Sequence[str] = ()) -> str:
         """C expression of the elements at positions, over loops with these variables."""
@@ -134,10 +154,10 @@ class Body:
         name = self.name(node)
         if node.op == "input":
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
-        if node.op == "counter" or (node.size == 1 and node not in self.plan.arrays):
-            return name
         if node in self.plan.arrays or node.op in ("carry", "project"):
             return f"{name}[{self.index(positions, names)}]"
+        if node.op == "counter" or node.size == 1:
+            return name
         return f"{name}_{int(positions.flat[0])}"
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
@@ -191,6 +211,7 @@ class Body:
             if node not in done and (only is None or node in only):
                 done.add(node)
                 self._computed(node, done, only)
+                self.finished(node)
 
     def ancestors(self, nodes: Sequence[Node]) -> set[Node]:
         """These nodes and all that they need, with the loops that compute it."""
@@ -208,8 +229,7 @@ class Body:
             return
         if node.op == "arrange":
             if node in plan.arrays:
-                self.declared(self.name(node), node.dtype, node.size)
-                copied(self, node, self.name(node))
+                copied(self, node, self.kept(node), own=True)
         elif node in plan.written_out:
             self._elements(node)
         elif node.op == "contract":
@@ -221,15 +241,16 @@ class Body:
             ]  # fmt: skip
             done.update(members)
             products.contracted(self, [node, *members])
+            for each in members:
+                self.finished(each)
         elif node.op in OPERATIONS or node.op == "take":
             self._loop(node)
         else:
             kernels.written(self, node)
 
     def _elements(self, node: Node) -> None:
-        name, dtype = self.name(node), C_TYPES[node.dtype]
-        if node in self.plan.arrays:
-            self.declared(name, node.dtype, node.size)
+        dtype = C_TYPES[node.dtype]
+        name = self.kept(node) if node in self.plan.arrays else self.name(node)
         for k in np.flatnonzero(self.plan.needed[node]):
             text = self._element(node, int(k))
             if node in self.plan.arrays:
@@ -282,8 +303,7 @@ class Body:
             for arg in each.args[1:] if each.op == "take" else each.args:
                 if arg not in inside:
                     where[arg] = index if arg.size == node.size else np.zeros_like(index)
-        name = self.name(node)
-        self.declared(name, node.dtype, node.size)
+        name = self.kept(node)
         if node.op in VECTORISED and not self.source.libm:
             self.spend(OPERATIONS[node.op].cost * node.size)
             self.source.arrays.add(node.op)
@@ -342,25 +362,27 @@ def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[in
     return result or [1]
 
 
-def copied(body: Body, node: Node, target: str) -> None:
-    """Copies all elements of a node to an array."""
+def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
+    """Copies all elements of a node to an array; to its own, from where they come."""
     index = np.arange(node.size).reshape(node.shape)
-    if node.size <= WRITTEN_OUT and not (node.op != "arrange" and node in body.plan.arrays):
+    stored = node in body.plan.arrays and not own
+    if node.size <= WRITTEN_OUT and not stored:
         for k in range(node.size):
-            body.line(f"{target}[{k}] = {_moved(body, node, np.array(k))};")
+            body.line(f"{target}[{k}] = {_moved(body, node, np.array(k), own)};")
         return
-    for box in _boxes(node, index):
-        shape = box.shape if box.ndim else (1,)
-        box = box.reshape(shape)
+    for box in [index] if stored else _boxes(node, index):
+        box = box.reshape(box.shape or (1,))
         body.looped(
-            shape,
-            lambda names, box=box: body.line(f"{target}[{body.index(box, names)}] = {_moved(body, node, box, names)};"),
+            box.shape,
+            lambda names, box=box: body.line(
+                f"{target}[{body.index(box, names)}] = {_moved(body, node, box, own, names)};"
+            ),
         )
 
 
-def _moved(body: Body, node: Node, positions: np.ndarray, names: Sequence[str] = ()) -> str:
-    """Reading through an arrange that is itself kept."""
-    if node.op != "arrange":
+def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequence[str] = ()) -> str:
+    """Reading, through an arrange that is itself kept where it is its own copy."""
+    if not (own and node.op == "arrange"):
         return body.read(node, positions, names)
     starts = np.cumsum([0, *(each.size for each in node.args)])
     inside = np.asarray(node.value).ravel()[positions]

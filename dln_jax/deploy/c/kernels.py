@@ -100,33 +100,40 @@ def written(body, node: Node) -> None:
     _WRITERS[node.op](body, node)
 
 
+def _kept(body, node: Node) -> str:
+    """Name of the array or scalar that is to hold a node."""
+    if node in body.plan.arrays:
+        return body.kept(node)
+    body.declared(body.name(node), node.dtype, 0)
+    return body.name(node)
+
+
 def _reduction(body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
     pattern, cost = _REDUCE[node.op]
     body.spend(cost * rows * (count - 1))
-    name, at = body.name(node), np.arange(a.size).reshape(a.shape)
-    scalar = node not in body.plan.arrays
-    body.declared(name, node.dtype, 0 if scalar else node.size)
+    at, scalar = np.arange(a.size).reshape(a.shape), node not in body.plan.arrays
+    name = _kept(body, node)
     parts = 8 if node.op == "reduce_sum" and node.dtype == "real" and count >= 16 else 1
-    body.opened(f"for (int r = 0; r < {rows}; ++r)")
+    body.opened(f"for (int r_ = 0; r_ < {rows}; ++r_)")
     kind = body.c_type(node.dtype)
     whole = count // parts * parts
     if parts > 1:
-        body.line(f"real part[{parts}] = {{0}};")
-        text = body.read(a, at, ["r", "(k + c)"])
-        body.line(f"for (int k = 0; k < {whole}; k += {parts})")
-        body.line(f"    for (int c = 0; c < {parts}; ++c) part[c] += {text};")
-        body.line("real sum = (part[0] + part[4]) + (part[1] + part[5]) + ((part[2] + part[6]) + (part[3] + part[7]));")
+        body.line(f"real part_[{parts}] = {{0}};")
+        text = body.read(a, at, ["r_", "(k_ + c_)"])
+        body.line(f"for (int k_ = 0; k_ < {whole}; k_ += {parts})")
+        body.line(f"    for (int c_ = 0; c_ < {parts}; ++c_) part_[c_] += {text};")
+        body.line("real sum_ = (part_[0] + part_[4]) + (part_[1] + part_[5]) + ((part_[2] + part_[6]) + (part_[3] + part_[7]));")
         if whole < count:
-            body.line(f"for (int k = {whole}; k < {count}; ++k) sum += {body.read(a, at, ['r', 'k'])};")
+            body.line(f"for (int k_ = {whole}; k_ < {count}; ++k_) sum_ += {body.read(a, at, ['r_', 'k_'])};")
     else:
-        body.line(f"{kind} sum = {body.read(a, at[:, 0], ['r'])};")
-        body.opened(f"for (int k = 1; k < {count}; ++k)")
-        body.line(f"const {kind} term = {body.read(a, at, ['r', 'k'])};")
-        body.line(f"sum = {pattern.format('sum', 'term')};")
+        body.line(f"{kind} sum_ = {body.read(a, at[:, 0], ['r_'])};")
+        body.opened(f"for (int k_ = 1; k_ < {count}; ++k_)")
+        body.line(f"const {kind} term_ = {body.read(a, at, ['r_', 'k_'])};")
+        body.line(f"sum_ = {pattern.format('sum_', 'term_')};")
         body.closed()
-    body.line(f"{name}{'' if scalar else '[r]'} = sum;")
+    body.line(f"{name}{'' if scalar else '[r_]'} = sum_;")
     body.closed()
 
 
@@ -134,36 +141,34 @@ def _arg(body, node: Node) -> None:
     """The first of the largest or smallest; what is not a number comes before all."""
     (a,) = node.args
     rows, count = a.shape
-    name, at = body.name(node), np.arange(a.size).reshape(a.shape)
-    scalar, kind = node not in body.plan.arrays, body.c_type(a.dtype)
-    body.declared(name, node.dtype, 0 if scalar else node.size)
-    body.opened(f"for (int r = 0; r < {rows}; ++r)")
-    body.line("int chosen = 0;")
-    body.line(f"{kind} best = {body.read(a, at[:, 0], ['r'])};")
-    body.opened(f"for (int k = 1; k < {count}; ++k)")
-    body.line(f"const {kind} x = {body.read(a, at, ['r', 'k'])};")
+    at, scalar, kind = np.arange(a.size).reshape(a.shape), node not in body.plan.arrays, body.c_type(a.dtype)
+    name = _kept(body, node)
+    body.opened(f"for (int r_ = 0; r_ < {rows}; ++r_)")
+    body.line("int chosen_ = 0;")
+    body.line(f"{kind} best_ = {body.read(a, at[:, 0], ['r_'])};")
+    body.opened(f"for (int k_ = 1; k_ < {count}; ++k_)")
+    body.line(f"const {kind} x_ = {body.read(a, at, ['r_', 'k_'])};")
     symbol = ">" if node.op == "argmax" else "<"
-    body.opened(f"if ((x {symbol} best || x != x) && best == best)")
-    body.line("best = x;")
-    body.line("chosen = k;")
+    body.opened(f"if ((x_ {symbol} best_ || x_ != x_) && best_ == best_)")
+    body.line("best_ = x_;")
+    body.line("chosen_ = k_;")
     body.closed()
     body.closed()
-    body.line(f"{name}{'' if scalar else '[r]'} = chosen;")
+    body.line(f"{name}{'' if scalar else '[r_]'} = chosen_;")
     body.closed()
 
 
 def _put(body, node: Node) -> None:
     operand, targets, updates = node.args
-    name, count = body.name(node), updates.size
-    body.declared(name, node.dtype, node.size)
+    name, count = body.kept(node), updates.size
     body.copied(operand, name)
     body.spend(count)
     index = np.arange(count)
-    body.opened(f"for (int k = 0; k < {count}; ++k)")
-    body.line(f"const long long target = {body.read(targets, index, ['k'])};")
-    body.line(f"const {body.c_type(node.dtype)} update = {body.read(updates, index, ['k'])};")
-    at = f"{name}[target]"
-    body.line(f"if (target >= 0) {at} = {_PUT[node.op].format(at, 'update')};")
+    body.opened(f"for (int k_ = 0; k_ < {count}; ++k_)")
+    body.line(f"const long long target_ = {body.read(targets, index, ['k_'])};")
+    body.line(f"const {body.c_type(node.dtype)} update_ = {body.read(updates, index, ['k_'])};")
+    at = f"{name}[target_]"
+    body.line(f"if (target_ >= 0) {at} = {_PUT[node.op].format(at, 'update_')};")
     body.closed()
 
 
@@ -171,7 +176,7 @@ def _cholesky(body, node: Node) -> None:
     (a,) = node.args
     n = a.shape[0]
     body.source.kernels.add("cholesky")
-    body.declared(body.name(node), "real", node.size)
+    body.kept(node)
     body.line(f"cholesky({n}, {body.pointer(a)}, {body.pointer(node)});")
     body.spend(n * (n + 1) * (n + 2) // 3)
 
@@ -181,7 +186,7 @@ def _triangular_solve(body, node: Node) -> None:
     n, columns = b.shape
     lower, unit = map(int, node.attribute)
     body.source.kernels.add("triangular_solve")
-    body.declared(body.name(node), "real", node.size)
+    body.kept(node)
     sizes = f"{n}, {columns}, {lower}, {unit}"
     body.line(f"triangular_solve({sizes}, {body.pointer(a)}, {body.pointer(b)}, {body.pointer(node)});")
     body.spend(n * n * columns)
@@ -214,7 +219,7 @@ def _handed_on(body, loop: Loop, names: list[str], number: int) -> None:
         body.declared(name, node.dtype, max(node.size, 1))
         body.copied(node, name)
     for name, old, node in zip(names, temporary, moved, strict=True):
-        body.line(f"for (int k = 0; k < {node.size}; ++k) {name}[k] = {old}[k];")
+        body.line(f"for (int k_ = 0; k_ < {node.size}; ++k_) {name}[k_] = {old}[k_];")
 
 
 def _while(body, node: Node) -> None:
@@ -249,8 +254,8 @@ def _repeat(body, node: Node) -> None:
         body.opened("")
         body.declared(f"n{number}_{carried + index}", each.dtype, max(each.size, 1))
         body.copied(each, f"n{number}_{carried + index}")
-        target = f"c{number}_{carried + index}[i_{number} * {each.size} + k]"
-        body.line(f"for (int k = 0; k < {each.size}; ++k) {target} = n{number}_{carried + index}[k];")
+        target = f"c{number}_{carried + index}[i_{number} * {each.size} + k_]"
+        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{carried + index}[k_];")
         body.closed()
     _handed_on(body, loop, names, number)
     body.closed(max(length, 1))

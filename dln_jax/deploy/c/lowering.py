@@ -11,6 +11,8 @@ from dln_jax.deploy.c.program import Loop, Node, Program
 from dln_jax.types import InputError
 
 _KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int8": "int", "int16": "int", "int32": "int"}
+# The type of what has no derivative: nothing is computed with it.
+_KINDS |= {str(jax.dtypes.float0): "bool"}
 _KINDS |= {"int64": "long", "uint8": "unsigned", "uint16": "unsigned", "uint32": "unsigned", "uint64": "unsigned_long"}
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
@@ -80,6 +82,8 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
 
 def _constant(program: Program, value: Any, aval: Any) -> Node:
     kind = kind_of(aval.dtype)
+    if aval.dtype == jax.dtypes.float0:
+        value = np.zeros(aval.shape, bool)
     return program.constant(np.asarray(value).reshape(aval.shape), kind)
 
 

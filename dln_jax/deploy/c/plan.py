@@ -35,6 +35,10 @@ class Plan(NamedTuple):
     """Of what is written out, the elements that something reads."""
     levels: dict[Node, int]
     """Number of products that come before, one after the other."""
+    reads: dict[Node, set[Node]]
+    """Arrays of its region that each step reads; a loop reads what is read inside."""
+    readers: dict[Node, set[Node | None]]
+    """Steps that read an array, and None for the results."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
@@ -45,15 +49,15 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays, followed = set(contiguous), set()
     # What loops read is an array; of an arrange whose elements a loop cannot follow, a copy is.
     for node in reversed(nodes):
-        looped = node in whole or any(
+        looped = any(
             reader in followed if reader.op == "arrange" else reader not in written_out for reader in readers[node]
         )
-        if node.op == "arrange" and node not in contiguous and (not looped or is_direct(node)):
-            followed |= {node} if looped else set()
+        if node.op == "arrange" and node not in contiguous and not (looped and not is_direct(node)):
+            followed |= {node} if looped or node in whole else set()
         elif node.op == "arrange":
             arrays.add(node)
             (written_out if node.size <= WRITTEN_OUT else followed).add(node)
-        elif node.size > 1 and (looped or node not in written_out):
+        elif node.size > 1 and (looped or node in whole or node not in written_out):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root = _fused(nodes, readers, whole, written_out, arrays)
@@ -63,7 +67,13 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
         if node in written_out or root.get(node, node) is node:
             order.setdefault(node.region, []).append(node)
-    return Plan(order, written_out, arrays, root, _needed(nodes, written_out, arrays, results), levels)
+    needed = _needed(nodes, written_out, arrays, results)
+    reads = _reads(program, nodes, arrays, root)
+    steps: dict[Node, set[Node | None]] = {}
+    for step, read in [*reads.items(), (None, {source for node in results for source in sources(node, arrays)})]:
+        for source in read:
+            steps.setdefault(source, set()).add(step)
+    return Plan(order, written_out, arrays, root, needed, levels, reads, steps)
 
 
 def inner(program: Program, node: Node) -> list[Loop]:
@@ -161,6 +171,31 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
         for number in node.region:
             highest[number] = max(highest.get(number, 0), levels[node])
     return levels
+
+
+def sources(node: Node, arrays: set[Node]) -> set[Node]:
+    """Arrays that a reading of a node reads."""
+    if node.op == "arrange" and node not in arrays:
+        return {source for each in node.args for source in sources(each, arrays)}
+    return {node} & arrays
+
+
+def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
+    reads: dict[Node, set[Node]] = {}
+    loops = {number: node for node in nodes if inner(program, node) for number in np.ravel(node.attribute)}
+    for node in nodes:
+        if node.op == "arrange" and node not in arrays:
+            continue
+        read = [*node.args]
+        for loop in inner(program, node):
+            read += [*loop.results, *loop.conditions]
+        for each in read:
+            for source in sources(each, arrays):
+                # Where a loop inside of the array's region reads it, the loop does.
+                depth = len(source.region)
+                step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
+                reads.setdefault(step, set()).add(source)
+    return reads
 
 
 def _needed(nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:

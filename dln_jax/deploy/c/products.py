@@ -28,7 +28,7 @@ def chain(pairs: list[tuple[str, str]]) -> str:
 def contracted(body, members: list[Node]) -> None:
     """Products of several matrices with one."""
     for node in members:
-        body.declared(body.name(node), "real", node.size)
+        body.kept(node)
     (batch, _, count), columns = members[0].args[0].shape, members[0].args[1].shape[2]
     if columns == 1:
         for node in members:
@@ -67,31 +67,31 @@ def _block(body, rows: list[tuple[Node, int]], count: int, columns: int) -> None
         parts = _parts(len(rows), wide, count)
         column = start + np.arange(tiles)[:, None, None] * width + np.arange(wide)
         at = np.arange(count)[None, :, None] * columns + column
-        names = ["n", "(k + p)" if parts > 1 else "k", "c"]
+        names = ["n_", "(k_ + p_)" if parts > 1 else "k_", "c_"]
         if is_constant(factor):
             inside = np.broadcast_to(column < columns, at.shape)
             matrix = body.literal(np.where(inside, values(factor).ravel()[np.where(inside, at, 0)], 0), "real", names)
         else:
             matrix = body.read(factor, at, names)
-        body.opened(f"for (int n = 0; n < {tiles}; ++n)")
+        body.opened(f"for (int n_ = 0; n_ < {tiles}; ++n_)")
         for number in range(len(rows)):
-            body.line(f"real s{number}[{parts * wide}] = {{0}};")
-        body.opened(f"for (int k = 0; k < {count}; k += {parts})")
+            body.line(f"real s{number}_[{parts * wide}] = {{0}};")
+        body.opened(f"for (int k_ = 0; k_ < {count}; k_ += {parts})")
         if parts > 1:
-            body.opened(f"for (int p = 0; p < {parts}; ++p)")
+            body.opened(f"for (int p_ = 0; p_ < {parts}; ++p_)")
         for number, (node, row) in enumerate(rows):
-            body.line(f"const real x{number} = {body.read(node.args[0], row * count + np.arange(count), names[1:2])};")
-        body.opened(f"for (int c = 0; c < {wide}; ++c)")
-        body.line(f"const real w = {matrix};")
+            body.line(f"const real x{number}_ = {body.read(node.args[0], row * count + np.arange(count), names[1:2])};")
+        body.opened(f"for (int c_ = 0; c_ < {wide}; ++c_)")
+        body.line(f"const real w_ = {matrix};")
         for number in range(len(rows)):
-            target = f"s{number}[{f'{wide} * p + c' if parts > 1 else 'c'}]"
-            body.line(f"{target} = MULTIPLY_ADD(x{number}, w, {target});")
+            target = f"s{number}_[{f'{wide} * p_ + c_' if parts > 1 else 'c_'}]"
+            body.line(f"{target} = MULTIPLY_ADD(x{number}_, w_, {target});")
         for _ in range(3 if parts > 1 else 2):
             body.closed()
-        body.opened(f"for (int c = 0; c < {width}; ++c)")
+        body.opened(f"for (int c_ = 0; c_ < {width}; ++c_)")
         for number, (node, row) in enumerate(rows):
-            target = body.index(row * columns + column[:, 0, :width], ["n", "c"])
-            total = " + ".join(f"s{number}[{f'{wide * part} + c' if part else 'c'}]" for part in range(parts))
+            target = body.index(row * columns + column[:, 0, :width], ["n_", "c_"])
+            total = " + ".join(f"s{number}_[{f'{wide * part} + c_' if part else 'c_'}]" for part in range(parts))
             body.line(f"{body.name(node)}[{target}] = {total};")
         body.closed()
         body.closed()
@@ -107,19 +107,19 @@ def _many(body, node: Node) -> None:
         width = min(_TILE, columns - start)
         index = [np.arange(extent) for extent in (batch, m, count, width)]
         i, j, k, c = np.meshgrid(*index, indexing="ij")
-        names = ["b", "r", "k", "c"]
-        body.opened(f"for (int b = 0; b < {batch}; ++b)")
-        body.opened(f"for (int r = 0; r < {m}; ++r)")
-        body.line(f"real s[{width}] = {{0}};")
-        body.opened(f"for (int k = 0; k < {count}; ++k)")
-        body.line(f"const real x = {body.read(a, ((i * m + j) * count + k)[..., 0], names[:3])};")
-        body.opened(f"for (int c = 0; c < {width}; ++c)")
-        text = body.read(b, ((i * count + k) * columns + start + c)[:, 0], ["b", "k", "c"])
-        body.line(f"s[c] = MULTIPLY_ADD(x, {text}, s[c]);")
+        names = ["b_", "r_", "k_", "c_"]
+        body.opened(f"for (int b_ = 0; b_ < {batch}; ++b_)")
+        body.opened(f"for (int r_ = 0; r_ < {m}; ++r_)")
+        body.line(f"real s_[{width}] = {{0}};")
+        body.opened(f"for (int k_ = 0; k_ < {count}; ++k_)")
+        body.line(f"const real x_ = {body.read(a, ((i * m + j) * count + k)[..., 0], names[:3])};")
+        body.opened(f"for (int c_ = 0; c_ < {width}; ++c_)")
+        text = body.read(b, ((i * count + k) * columns + start + c)[:, 0], ["b_", "k_", "c_"])
+        body.line(f"s_[c_] = MULTIPLY_ADD(x_, {text}, s_[c_]);")
         body.closed()
         body.closed()
-        target = body.index(((i * m + j) * columns + start + c)[:, :, 0], ["b", "r", "c"])
-        body.line(f"for (int c = 0; c < {width}; ++c) {body.name(node)}[{target}] = s[c];")
+        target = body.index(((i * m + j) * columns + start + c)[:, :, 0], ["b_", "r_", "c_"])
+        body.line(f"for (int c_ = 0; c_ < {width}; ++c_) {body.name(node)}[{target}] = s_[c_];")
         body.closed()
         body.closed()
 
@@ -135,24 +135,24 @@ def _dots(body, node: Node) -> None:
     i, j, k = np.meshgrid(np.arange(batch), np.arange(m), np.arange(count), indexing="ij")
 
     def both(index: str) -> str:
-        first = body.read(a, (i * m + j) * count + k, ["b", "r", index])
-        return f"MULTIPLY_ADD({first}, {body.read(b, (i * count + k)[:, 0], ['b', index])}"
+        first = body.read(a, (i * m + j) * count + k, ["b_", "r_", index])
+        return f"MULTIPLY_ADD({first}, {body.read(b, (i * count + k)[:, 0], ['b_', index])}"
 
-    body.opened(f"for (int b = 0; b < {batch}; ++b)")
-    body.opened(f"for (int r = 0; r < {m}; ++r)")
-    body.line("real sum = 0;")
+    body.opened(f"for (int b_ = 0; b_ < {batch}; ++b_)")
+    body.opened(f"for (int r_ = 0; r_ < {m}; ++r_)")
+    body.line("real sum_ = 0;")
     if parts > 1:
-        body.line(f"real part[{parts}] = {{0}};")
-        body.opened(f"for (int k = 0; k < {whole}; k += {parts})")
-        body.line(f"for (int c = 0; c < {parts}; ++c) part[c] = {both('(k + c)')}, part[c]);")
+        body.line(f"real part_[{parts}] = {{0}};")
+        body.opened(f"for (int k_ = 0; k_ < {whole}; k_ += {parts})")
+        body.line(f"for (int c_ = 0; c_ < {parts}; ++c_) part_[c_] = {both('(k_ + c_)')}, part_[c_]);")
         body.closed()
         half = parts // 2
         while half:
-            body.line(f"for (int c = 0; c < {half}; ++c) part[c] += part[c + {half}];")
+            body.line(f"for (int c_ = 0; c_ < {half}; ++c_) part_[c_] += part_[c_ + {half}];")
             half //= 2
-        body.line("sum = part[0];")
+        body.line("sum_ = part_[0];")
     if whole < count or parts == 1:
-        body.line(f"for (int k = {whole if parts > 1 else 0}; k < {count}; ++k) sum = {both('k')}, sum);")
-    body.line(f"{body.name(node)}[{body.index((i * m + j)[..., 0], ['b', 'r'])}] = sum;")
+        body.line(f"for (int k_ = {whole if parts > 1 else 0}; k_ < {count}; ++k_) sum_ = {both('k_')}, sum_);")
+    body.line(f"{body.name(node)}[{body.index((i * m + j)[..., 0], ['b_', 'r_'])}] = sum_;")
     body.closed()
     body.closed()

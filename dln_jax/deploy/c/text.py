@@ -39,7 +39,7 @@ _RESERVED = frozenset(
 
 def check_name(name: str, what: str = "name") -> str:
     """A name that may stand in C; InputError otherwise."""
-    taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|s|x|i|table|elementary|bounded)_?\d\w*", name)
+    taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table)_?\d\w*|elementary_.*|.*_", name)
     if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
             f"{what} is {name!r:.60}; expected a C name: a letter, then letters, digits or _, at most 40, no keyword of "
