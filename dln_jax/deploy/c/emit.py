@@ -272,7 +272,7 @@ class Body:
             (a,) = node.args
             count = a.shape[1]
             terms = [self.read(a, np.array(k * count + each)) for each in range(count)]
-            return kernels.combined(self, node.op, terms)
+            return kernels.combined(self, node, k, terms)
         if node.op == "take":
             return f"{self.name(node.args[0])}[{self.read(node.args[1], np.array(k))}]"
         return self.expression(node, [self.read(each, np.array(k if each.size > 1 else 0)) for each in node.args])
@@ -395,14 +395,14 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
     if node.op != "arrange" or node.value is None:
         return [index]
     starts = np.cumsum([0, *(each.size for each in node.args)])
-    # A gap between the sources, so that no step leads from one to the next.
-    apart = node.value + (np.searchsorted(starts, node.value, side="right") - 1) * (1 << 40)
+    owner = (np.searchsorted(starts, node.value, side="right") - 1).ravel()
+    flat = node.value.ravel()
 
     def split(box: np.ndarray) -> list[np.ndarray]:
-        at = apart.ravel()[box]
-        if strides(at) is not None:
+        at, of = flat[box], owner[box]
+        if strides(at) is not None and (of == of.flat[0]).all():
             return [box]
-        cuts = {axis: _runs(np.moveaxis(at, axis, 0)) for axis in range(at.ndim)}
+        cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
         axis = min((each for each in cuts if len(cuts[each]) > 2), key=lambda each: len(cuts[each]), default=None)
         if axis is None:
             axis = next(each for each in range(at.ndim) if at.shape[each] > 1)
@@ -416,18 +416,15 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
     return split(index)
 
 
-def _runs(rows: np.ndarray) -> list[int]:
-    """Where runs of rows with equal steps begin, and the end."""
-    steps, cuts = np.diff(rows, axis=0), [0]
-    for row in range(1, len(rows)):
+def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:
+    """Where runs of rows from the same sources with equal steps begin, and the end."""
+    steps, cuts = np.diff(at, axis=0), [0]
+    for row in range(1, len(at)):
         first = cuts[-1]
-        if row == first + 1:
-            # A jump between sources is no step.
-            if np.abs(steps[first]).max() >= 1 << 39:
-                cuts.append(row)
-        elif not np.array_equal(steps[row - 1], steps[first]):
+        uneven = row > first + 1 and not np.array_equal(steps[row - 1], steps[first])
+        if uneven or not np.array_equal(owner[row], owner[first]):
             cuts.append(row)
-    return [*cuts, len(rows)]
+    return [*cuts, len(at)]
 
 
 def body_of(source: Source, program: Program, results: Sequence[Node], inputs, targets: Sequence[str | None]) -> Body:

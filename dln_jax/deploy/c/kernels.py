@@ -85,13 +85,18 @@ def definitions(names: set[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
-def combined(body, op: str, terms: list[str]) -> str:
-    """A reduction of few terms; a sum in two halves, for its latency."""
-    pattern, cost = _REDUCE[op]
+def combined(body, node: Node, k: int, terms: list[str]) -> str:
+    """A reduction of few terms, written out."""
+    pattern, cost = _REDUCE[node.op]
     body.spend(cost * (len(terms) - 1))
     text = terms[0]
-    for term in terms[1:]:
+    for place, term in enumerate(terms[1:]):
         text = f"({pattern.format(text, term)})"
+        # A choice names what it compares twice: without a name of its own, its text doubles with each term.
+        if node.op in ("reduce_max", "reduce_min") and place < len(terms) - 2:
+            name = f"v{node.number}_{k}_{place}"
+            body.line(f"const {body.c_type(node.dtype)} {name} = {text};")
+            text = name
     return text
 
 
@@ -244,11 +249,12 @@ def _repeat(body, node: Node) -> None:
     for name, start in zip(names, node.args, strict=True):
         body.copied(start, name)
     stacked = loop.results[carried:]
+    turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     for index, each in enumerate(stacked):
         body.declared(f"c{number}_{carried + index}", each.dtype, max(each.size * length, 1))
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
-    body.line(f"const long long i_{number} = {turn};")
+    if stacked or any(each.op == "counter" and each.attribute == number for each in body.plan.needed):
+        body.line(f"const long long i_{number} = {turn};")
     body.region((*node.region, number))
     for index, each in enumerate(stacked):
         body.opened("")

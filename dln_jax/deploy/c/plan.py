@@ -62,12 +62,11 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root = _fused(nodes, readers, whole, written_out, arrays)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels = _levels(program, nodes)
+    levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}
     for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
-        if node in written_out or root.get(node, node) is node:
+        if needed[root.get(node, node)].any() and (node in written_out or root.get(node, node) is node):
             order.setdefault(node.region, []).append(node)
-    needed = _needed(nodes, written_out, arrays, results)
     reads = _reads(program, nodes, arrays, root)
     steps: dict[Node, set[Node | None]] = {}
     for step, read in [*reads.items(), (None, {source for node in results for source in sources(node, arrays)})]:
@@ -198,21 +197,34 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
     return reads
 
 
-def _needed(nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
-    needed = {node: np.full(node.size, node in arrays or node.size == 1) for node in nodes}
+def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
+    """Elements that something reads, of each node."""
+    needed = {node: np.zeros(node.size, bool) for node in nodes}
     for node in results:
         needed[node][:] = True
     for node in reversed(nodes):
         mask = needed[node]
+        if not mask.any():
+            continue
+        if node in arrays:
+            mask[:] = True
+        for loop in inner(program, node):
+            for each in (*loop.results, *loop.conditions, *loop.carries):
+                needed[each][:] = True
         if node.op == "arrange":
             starts = np.cumsum([0, *(each.size for each in node.args)])
             positions = np.asarray(node.value).ravel()[mask]
             for each, start in zip(node.args, starts, strict=False):
-                inside = positions[(positions >= start) & (positions < start + each.size)] - start
-                needed[each][inside] = True
+                needed[each][positions[(positions >= start) & (positions < start + each.size)] - start] = True
         elif node in written_out and node.op in OPERATIONS:
             for each in node.args:
                 needed[each][...] |= mask if each.size == node.size else mask.any()
+        elif node in written_out and node.op == "contract":
+            rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
+            for each, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
+                needed[each][...] |= np.broadcast_to(used, each.shape).ravel()
+        elif node in written_out and node.op.startswith("reduce_"):
+            needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
             for each in node.args:
                 needed[each][:] = True
