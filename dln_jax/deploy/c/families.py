@@ -23,7 +23,7 @@ step of x also x_next, and A and B; of a scalar it is NAME_gradient. What a syst
 import functools
 import inspect
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -60,19 +60,22 @@ SCALARS = ("energy", "hamiltonian")
 """Functions with one number as their result, whose derivative is a gradient."""
 
 
-def functions_of_run(run: Run, *, precision: str, names: Iterable[str] | None = None) -> Functions:
+def functions_of_run(
+    run: Run, *, precision: str, names: Iterable[str] | None = None, iterations: int = ITERATIONS
+) -> Functions:
     """The functions of a trained model.
 
     Args:
         run: loaded.
         precision: f32 or f64, to which the parameters are converted.
         names: of those wanted; all by default.
+        iterations: as for `functions_of_system`.
 
     Raises:
         InputError: a name that the model has no function of, parameters that the precision cannot hold, or a model of
             one's own in another precision than its training's, or without needs.
     """
-    functions = _of_run(run, precision)
+    functions = _of_run(run, precision, iterations)
     chosen = list(functions) if names is None else list(names)
     if unknown := [name for name in chosen if name not in functions]:
         raise InputError(
@@ -110,7 +113,7 @@ def functions_of_system(
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
 
 
-def _of_run(run: Run, precision: str) -> Functions:
+def _of_run(run: Run, precision: str, iterations: int) -> Functions:
     description, model, dtype = run.description, run.model, data_type(precision)
     if precision != description["precision"]:
         if description["name"] not in CATALOGUE:
@@ -121,13 +124,13 @@ def _of_run(run: Run, precision: str) -> Functions:
         functions = _of_layers(parameters, activation(description["activation"]))
         return _with_examples(functions, dtype, description["sizes"][0])
     if isinstance(model, PictureModel):
-        functions = _of_pictures(model.pictures(parameters))
+        functions = _of_pictures(model.pictures(parameters), iterations)
         return _with_examples(functions, dtype, 1, frames=(2 * description["pixels"],))
     if description.get("needs") is None:
         raise InputError("the model states no needs; export functions_of_system of its energies")
     needs = needs_from_json(description["needs"])
-    energies, d = model.energies(parameters), needs.degrees_of_freedom
-    return functions_of_system(energies, d, dtype=dtype, actuation=needs.actuation)
+    energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
+    return functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
 
 
 def _converted(dtype: Any, leaf: Array) -> Array:
@@ -182,12 +185,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         if getattr(system, "dissipation", None) is not None:
             functions |= _with_derivatives("friction", _named(motion.friction, "tau_friction"))
     implicit = discrete.implicit_midpoint(system, d, actuation=actuation, iterations=iterations)
-    for name, step in (
-        ("step_rk4", discrete.rk4(system, d, actuation=actuation)),
-        ("step_implicit_midpoint", implicit),
-    ):
-        functions[name] = _named(step, "x_next")
-        functions[f"{name}_jacobian"] = _named(discrete.linearised(step), "x_next", "A", "B")
+    for name, step in {"rk4": discrete.rk4(system, d, actuation=actuation), "implicit_midpoint": implicit}.items():
+        functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
     return functions
 
 
@@ -195,23 +194,16 @@ def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
     functions = _with_derivatives("rates", _named(system.rates, "qd", "pd"))
     if isinstance(system, Flow):
         functions |= _with_derivatives("hamiltonian", _named(system.energy, "H"))
-    steps = {
-        "phase_step_rk4": discrete.phase_rk4(system.rates),
-        "phase_step_implicit_midpoint": discrete.phase_implicit_midpoint(system.rates, iterations=iterations),
-    }
+    implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
     slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
-    for name, step in steps.items():
-        functions[name] = _named(step, "q_next", "p_next")
-        functions[f"{name}_jacobian"] = _named(discrete.linearised(step), "q_next", "p_next", *slopes)
+    for name, step in {"rk4": discrete.phase_rk4(system.rates), "implicit_midpoint": implicit}.items():
+        functions |= _linearised(f"phase_step_{name}", step, ("q_next", "p_next"), slopes)
     return functions
 
 
-def _of_pictures(system: LatentPhase) -> Named:
-    functions = {
-        "encode": _named(lambda frames: system.encode(frames), "q", "p"),
-        "decode": _named(lambda q, p: system.decode(q, p), "frames"),
-    }
-    return functions | _of_flow(system.field, ITERATIONS)
+def _of_pictures(system: LatentPhase, iterations: int) -> Named:
+    networks = {"encode": _named(system.encode, "q", "p"), "decode": _named(system.decode, "frames")}
+    return networks | _of_flow(system.field, iterations)
 
 
 def _of_layers(layers: Layers, activation: Activation) -> Named:
@@ -242,17 +234,27 @@ def _named(function: Callable[..., Any], *results: str) -> Function:
     return call
 
 
+def _linearised(name: str, step: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]) -> Named:
+    return {
+        name: _named(step, *results),
+        f"{name}_jacobian": _named(discrete.linearised(step), *results, *slopes),
+    }
+
+
 def _with_derivatives(name: str, function: Function) -> Named:
-    """The function, and the derivatives of its results by its arguments; each apart, since what does not depend on one
-    then passes nothing."""
+    """The function, and the derivatives of its results by its arguments."""
     arguments = list(inspect.signature(function).parameters)
+    places = range(len(arguments))
 
     @functools.wraps(function)
-    def derivatives(*state: Array) -> dict[str, Array]:
+    def derivatives(*state: Array) -> Mapping[str, Array]:
         rows = sum(each.size for each in jax.tree.leaves(jax.eval_shape(function, *state)))
-        differentiate = jax.jacrev if rows < sum(each.size for each in state) else jax.jacfwd
-        by = {key: differentiate(function, argnums=k)(*state) for k, key in enumerate(arguments)}
-        results = by[arguments[0]]
-        return OrderedDict((f"{result}_{key}", by[key][result]) for result in results for key in arguments)
+        if rows < sum(each.size for each in state):
+            slopes = jax.jacrev(function, argnums=tuple(places))(*state)
+        else:
+            # By each apart: what does not depend on it passes nothing.
+            each = [jax.jacfwd(function, argnums=place)(*state) for place in places]
+            slopes = {result: [slope[result] for slope in each] for result in each[0]}
+        return OrderedDict((f"{result}_{arguments[k]}", by[k]) for result, by in slopes.items() for k in places)
 
     return {name: function, f"{name}_{'gradient' if name in SCALARS else 'jacobian'}": derivatives}
