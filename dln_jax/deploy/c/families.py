@@ -1,0 +1,260 @@
+"""What is exported of a run or of a system: pure functions of one state with examples of their arguments, by name.
+
+In coordinates and velocities, x = (q, qd), of every system on which forces act:
+
+| name | arguments | results |
+|---|---|---|
+| `inverse_dynamics` | q, qd, qdd | tau |
+| `forward_dynamics` | q, qd, tau | qdd |
+| `energy` | q, qd | energy |
+| `mass_matrix` | q, and qd where M depends on it | M |
+| `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
+| `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
+
+In a phase space, of rates and of Hamiltonians, without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p;
+`phase_step_rk4`, `phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. Of a differential network `value`,
+`value_and_jacobian`, `value_jacobian_hessian` (y, jacobian, hessian) of x. Of pictures those of their latent phase, and
+`encode` (q, p) of two frames, and `decode` (frames) of q, p.
+
+NAME_jacobian has the derivative of each result by each argument, as tau_q [d, d], with the argument's axes last; for a
+step of x also x_next, and A and B; of a scalar it is NAME_gradient. What a system lacks is not there.
+"""
+
+import functools
+import inspect
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.data.schema import needs_from_json
+from dln_jax.mechanics import discrete, jacobians
+from dln_jax.mechanics.discrete import ITERATIONS, Actuation
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainFlow
+from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
+from dln_jax.mechanics.jacobians import Natural
+from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.nn import differential_mlp
+from dln_jax.nn.activations import Activation, activation
+from dln_jax.nn.differential_mlp import Layers
+from dln_jax.precision import data_type
+from dln_jax.types import InputError
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.differential_network import FunctionModel
+from dln_jax.zoo.pictures import PictureModel
+from dln_jax.zoo.run import Run
+
+Function = Callable[..., Mapping[str, Array]]
+"""Arrays, by the names of its parameters -> arrays by name."""
+Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
+"""By name, a function and one example of each argument, of its shape and type."""
+Named = dict[str, Function]
+SCALARS = ("energy", "hamiltonian")
+"""Functions with one number as their result, whose derivative is a gradient."""
+
+
+def functions_of_run(
+    run: Run, *, precision: str, names: Iterable[str] | None = None, iterations: int = ITERATIONS
+) -> Functions:
+    """The functions of a trained model.
+
+    Args:
+        run: loaded.
+        precision: f32 or f64, to which the parameters are converted.
+        names: of those wanted; all by default.
+        iterations: as for `functions_of_system`.
+
+    Raises:
+        InputError: a name that the model has no function of, parameters that the precision cannot hold, or a model of
+            one's own in another precision than its training's, or without needs.
+    """
+    functions = _of_run(run, precision, iterations)
+    chosen = list(functions) if names is None else list(names)
+    if unknown := [name for name in chosen if name not in functions]:
+        raise InputError(
+            f"a {run.description['name']} has no {', '.join(unknown)[:200]}; choose from {', '.join(functions)}"
+        )
+    return {name: functions[name] for name in chosen}
+
+
+def functions_of_system(
+    system: System,
+    degrees_of_freedom: int,
+    *,
+    dtype: DTypeLike,
+    actuation: Actuation = None,
+    iterations: int = ITERATIONS,
+) -> Functions:
+    """The functions of a system, known or learned.
+
+    Args:
+        system: a record of energies, or of what is known in their place: for a scene its `closed_form`.
+        degrees_of_freedom: d.
+        dtype: of the arguments.
+        actuation: matrix [d, u] of the steps, tau = actuation u; by default u is tau.
+        iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
+    """
+    d = degrees_of_freedom
+    # Networks take long to trace: each once, and not for every function that it occurs in.
+    system = system._replace(**{name: jax.jit(each) for name, each in system._asdict().items() if callable(each)})
+    functions: Named = {}
+    if not isinstance(system, PhaseRates):
+        functions |= _of_dynamics(system, d, actuation, iterations)
+    if isinstance(system, Canonical | PhaseRates):
+        functions |= _of_flow(flow(system, degrees_of_freedom=d), iterations)
+    controls = d if actuation is None else np.shape(actuation)[1]
+    return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
+
+
+def _of_run(run: Run, precision: str, iterations: int) -> Functions:
+    description, model, dtype = run.description, run.model, data_type(precision)
+    if precision != description["precision"]:
+        if description["name"] not in CATALOGUE:
+            raise InputError(f"a model of one's own is exported in {description['precision']}, that of its training")
+        model = build({**description, "precision": precision})
+    parameters = jax.tree.map(functools.partial(_converted, dtype), run.parameters)
+    if isinstance(model, FunctionModel):
+        functions = _of_layers(parameters, activation(description["activation"]))
+        return _with_examples(functions, dtype, description["sizes"][0])
+    if isinstance(model, PictureModel):
+        functions = _of_pictures(model.pictures(parameters), iterations)
+        return _with_examples(functions, dtype, 1, frames=(2 * description["pixels"],))
+    if description.get("needs") is None:
+        raise InputError("the model states no needs; export functions_of_system of its energies")
+    needs = needs_from_json(description["needs"])
+    energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
+    return functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+
+
+def _converted(dtype: Any, leaf: Array) -> Array:
+    converted = leaf.astype(dtype)
+    if not (finite := jnp.isfinite(converted)).all():
+        raise InputError(
+            f"a parameter is {leaf[~finite][0]}, which {dtype.__name__} cannot hold; train again, or export in f64"
+        )
+    return converted
+
+
+def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:
+    """Every argument is a vector of this size, but for those of other shapes."""
+    shapes["dt"] = ()
+    return {
+        name: (each, tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(each).parameters))
+        for name, each in functions.items()
+    }
+
+
+def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
+    motion = dynamics(system, degrees_of_freedom=d)
+    forward = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
+    inverse_jacobians, coriolis_jacobians = (
+        functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
+    )
+    natural = isinstance(system, Natural)
+
+    def at_rest(q: Array) -> Array:
+        return motion.decompose(q, jnp.zeros_like(q), jnp.zeros_like(q)).gravity
+
+    def coriolis(q: Array, qd: Array) -> Array:
+        return motion.decompose(q, qd, jnp.zeros_like(q)).coriolis
+
+    def forward_jacobians(q: Array, qd: Array, tau: Array) -> tuple[Array, ...]:
+        return jacobians.forward_dynamics_jacobians(system, q, qd, tau)[1]
+
+    functions = {
+        "inverse_dynamics": _named(motion.inverse_dynamics, "tau"),
+        "inverse_dynamics_jacobian": _named(inverse_jacobians, "tau_q", "tau_qd", "tau_qdd"),
+        "forward_dynamics": _named(forward, "qdd"),
+        "forward_dynamics_jacobian": _named(forward_jacobians, "qdd_q", "qdd_qd", "qdd_tau"),
+        "coriolis": _named(coriolis, "c"),
+        "coriolis_jacobian": _named(coriolis_jacobians, "c_q", "c_qd"),
+    }
+    if not natural or system.potential is not None:
+        functions |= _with_derivatives("gravity", _named(at_rest, "g"))
+    if isinstance(motion, Dynamics):
+        mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else (lambda q, qd: motion.mass_matrix(q, qd))
+        functions |= _with_derivatives("energy", _named(motion.energy, "energy"))
+        functions |= _with_derivatives("mass_matrix", _named(mass_matrix, "M"))
+        if getattr(system, "dissipation", None) is not None:
+            functions |= _with_derivatives("friction", _named(motion.friction, "tau_friction"))
+    implicit = discrete.implicit_midpoint(system, d, actuation=actuation, iterations=iterations)
+    for name, step in {"rk4": discrete.rk4(system, d, actuation=actuation), "implicit_midpoint": implicit}.items():
+        functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
+    return functions
+
+
+def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
+    functions = _with_derivatives("rates", _named(system.rates, "qd", "pd"))
+    if isinstance(system, Flow):
+        functions |= _with_derivatives("hamiltonian", _named(system.energy, "H"))
+    implicit = discrete.phase_implicit_midpoint(system.rates, iterations=iterations)
+    slopes = ("q_next_q", "q_next_p", "p_next_q", "p_next_p")
+    for name, step in {"rk4": discrete.phase_rk4(system.rates), "implicit_midpoint": implicit}.items():
+        functions |= _linearised(f"phase_step_{name}", step, ("q_next", "p_next"), slopes)
+    return functions
+
+
+def _of_pictures(system: LatentPhase, iterations: int) -> Named:
+    networks = {"encode": _named(system.encode, "q", "p"), "decode": _named(system.decode, "frames")}
+    return networks | _of_flow(system.field, iterations)
+
+
+def _of_layers(layers: Layers, activation: Activation) -> Named:
+    members = [[(weight[k], bias[k]) for weight, bias in layers] for k in range(len(layers[0][1]))]
+
+    def mean(derivatives: Callable[..., Any]) -> Function:
+        def function(x: Array) -> Any:
+            every = [derivatives(tuple(member), x, activation=activation) for member in members]
+            return jax.tree.map(lambda *each: sum(each) / len(members), *every)
+
+        return function
+
+    return {
+        "value": _named(mean(differential_mlp.value), "y"),
+        "value_and_jacobian": _named(mean(differential_mlp.value_and_jacobian), "y", "jacobian"),
+        "value_jacobian_hessian": _named(mean(differential_mlp.value_jacobian_and_hessian), "y", "jacobian", "hessian"),
+    }
+
+
+def _named(function: Callable[..., Any], *results: str) -> Function:
+    """The same with its results by name, and the same parameters."""
+
+    @functools.wraps(function)
+    def call(*state: Array) -> dict[str, Array]:
+        # Of this sort, since JAX sorts the names of others.
+        return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=True))
+
+    return call
+
+
+def _linearised(name: str, step: Callable[..., Any], results: Sequence[str], slopes: Sequence[str]) -> Named:
+    return {
+        name: _named(step, *results),
+        f"{name}_jacobian": _named(discrete.linearised(step), *results, *slopes),
+    }
+
+
+def _with_derivatives(name: str, function: Function) -> Named:
+    """The function, and the derivatives of its results by its arguments."""
+    arguments = list(inspect.signature(function).parameters)
+    places = range(len(arguments))
+
+    @functools.wraps(function)
+    def derivatives(*state: Array) -> Mapping[str, Array]:
+        rows = sum(each.size for each in jax.tree.leaves(jax.eval_shape(function, *state)))
+        if rows < sum(each.size for each in state):
+            slopes = jax.jacrev(function, argnums=tuple(places))(*state)
+        else:
+            # By each apart: what does not depend on it passes nothing.
+            each = [jax.jacfwd(function, argnums=place)(*state) for place in places]
+            slopes = {result: [slope[result] for slope in each] for result in each[0]}
+        return OrderedDict((f"{result}_{arguments[k]}", by[k]) for result, by in slopes.items() for k in places)
+
+    return {name: function, f"{name}_{'gradient' if name in SCALARS else 'jacobian'}": derivatives}

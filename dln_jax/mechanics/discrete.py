@@ -1,0 +1,143 @@
+"""Dynamics in discrete time, x_next = F(x, u, dt), with A = dF/dx and B = dF/du: what a controller calls.
+
+    x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
+    x = (q, p) [2 d] in a phase space, without u
+
+A step takes a number of operations that is known beforehand: the implicit midpoint rule takes a fixed number of Newton
+steps, where that of `mechanics.integrators` iterates until it has converged. Derivatives are exact, of the implicit
+step by the implicit function theorem at the last iterate, and share the Jacobians of `mechanics.jacobians`.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.mechanics import integrators
+from dln_jax.mechanics.dynamics import Rates
+from dln_jax.mechanics.equations import Driven
+from dln_jax.mechanics.jacobians import differentiable_forward_dynamics
+from dln_jax.solvers.elimination import solve
+from dln_jax.types import require_positive
+
+ITERATIONS = 3
+"""Newton steps of the implicit midpoint rule."""
+Step = Callable[[Any, Any, Any], Any]
+"""(x, u, dt) -> x_next."""
+PhaseStep = Callable[[Any, Any, Any], Any]
+"""(q, p, dt) -> (q, p) after it."""
+Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
+"""Of `types.Needs`; by `None` u is tau."""
+
+
+def rk4(system: Driven, degrees_of_freedom: int, *, actuation: Actuation = None) -> Step:
+    """Runge-Kutta's classical step, of order 4."""
+    forward_dynamics = differentiable_forward_dynamics(system, degrees_of_freedom=degrees_of_freedom)
+
+    def step(x: Array, u: Array, dt: Array) -> Array:
+        tau = _force(actuation, u)
+        field = integrators.second_order(lambda t, q, qd: forward_dynamics(q, qd, tau))
+        return jnp.concatenate(integrators.rk4(field)(0.0, tuple(jnp.split(x, 2)), dt))
+
+    return step
+
+
+def implicit_midpoint(
+    system: Driven, degrees_of_freedom: int, *, actuation: Actuation = None, iterations: int = ITERATIONS
+) -> Step:
+    """The implicit midpoint rule, of order 2, by Newton's method for qdd at the midpoint.
+
+        qdd = forward_dynamics(q + dt/2 v, v, tau),   v = qd + dt/2 qdd;   (q, qd) <- (q + dt v, qd + dt qdd)
+
+    Args:
+        system: whose forward dynamics is stepped.
+        degrees_of_freedom: d.
+        actuation: u -> tau.
+        iterations: Newton steps, from the acceleration at x. Where the last one still moves the state by more than
+            sqrt(eps) (1 + |x|), after which the error is that squared, the step is NaN: take a smaller dt.
+
+    Raises:
+        InputError: iterations that are not positive.
+    """
+    require_positive(iterations=iterations)
+    forward_dynamics = differentiable_forward_dynamics(system, degrees_of_freedom=degrees_of_freedom)
+
+    def step(x: Array, u: Array, dt: Array) -> Array:
+        q, qd = jnp.split(x, 2)
+        tau = _force(actuation, u)
+
+        def equations(qdd: Array) -> Array:
+            velocity = qd + dt / 2 * qdd
+            return qdd - forward_dynamics(q + dt / 2 * velocity, velocity, tau)
+
+        qdd = _root(equations, forward_dynamics(q, qd, tau), x, dt, iterations)
+        return jnp.concatenate([q + dt * (qd + dt / 2 * qdd), qd + dt * qdd])
+
+    return step
+
+
+def phase_rk4(rates: Rates) -> PhaseStep:
+    """As `rk4`, of (q, p) -> (qd, pd)."""
+    return lambda q, p, dt: integrators.rk4(lambda t, state: rates(*state))(0.0, (q, p), dt)
+
+
+def phase_implicit_midpoint(rates: Rates, *, iterations: int = ITERATIONS) -> PhaseStep:
+    """As `implicit_midpoint`, of (q, p) -> (qd, pd); symplectic where they are those of a Hamiltonian."""
+    require_positive(iterations=iterations)
+
+    def field(x: Array) -> Array:
+        return jnp.concatenate(rates(*jnp.split(x, 2)))
+
+    def step(q: Array, p: Array, dt: Array) -> tuple[Array, Array]:
+        x = jnp.concatenate([q, p])
+        rate = _root(lambda rate: rate - field(x + dt / 2 * rate), field(x), x, dt, iterations)
+        q_next, p_next = jnp.split(x + dt * rate, 2)
+        return q_next, p_next
+
+    return step
+
+
+def linearised(step: Callable[[Any, Any, Any], Any]) -> Callable[[Array, Array, Array], tuple[Any, Any]]:
+    """(x, u, dt) -> x_next and (A, B) of a step, in one pass; (q, p, dt) likewise of a `PhaseStep`."""
+
+    @functools.wraps(step)
+    def function(x: Array, u: Array, dt: Array) -> tuple[Any, Any]:
+        def twice(x: Array, u: Array) -> tuple[Any, Any]:
+            x_next = step(x, u, dt)
+            return x_next, x_next
+
+        derivatives, x_next = jax.jacfwd(twice, argnums=(0, 1), has_aux=True)(x, u)
+        return x_next, derivatives
+
+    return function
+
+
+def _force(actuation: Actuation, u: Array) -> Array:
+    return u if actuation is None else jnp.asarray(actuation, u.dtype) @ u
+
+
+def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array, iterations: int) -> Array:
+    """The rate of a state x that solves the equations after so many Newton steps, or NaN."""
+    identity = jnp.eye(start.shape[0], dtype=start.dtype)
+
+    def solve_linear(product: Callable[[Array], Array], right: Array) -> Array:
+        # The inverse, since derivatives of a step bring many right-hand sides, each of which would be eliminated anew.
+        return solve(jax.vmap(product, out_axes=1)(identity), identity) @ right
+
+    def search(equations: Callable[[Array], Array], start: Array) -> tuple[Array, Array]:
+        def turn(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+            value, product = jax.linearize(equations, state[0])
+            change = solve_linear(product, value)
+            return (state[0] - change, jnp.max(jnp.abs(change))), None
+
+        return jax.lax.scan(turn, (start, jnp.zeros_like(start[0])), length=iterations)[0]
+
+    rate, change = jax.lax.custom_root(equations, start, search, solve_linear, has_aux=True)
+    settled = jnp.abs(dt) * change <= jnp.sqrt(jnp.finfo(x.dtype).eps) * (1 + jnp.max(jnp.abs(x)))
+    # A factor, and not a choice: derivatives become NaN as well.
+    return rate * jnp.where(settled, jnp.ones_like(dt), jnp.nan)

@@ -1,0 +1,125 @@
+"""Jacobians of the equations of motion, by the way that costs least, for one state.
+
+Of a natural system, tau = M qdd + c + g + dD/dqd with p = M(q) qd and A = dp/dq,
+
+    dtau/dqdd = M,   dtau/dqd = dM/dt + A - Aᵀ + d²D/dqd²,   dtau/dq by d tangents of tau and p together
+
+(the second from dL/dq = ½ d(qdᵀ M qd)/dq, whose slope in qd is Aᵀ), so that no velocity and no acceleration is pushed
+through a network. Of another system all come from one reverse sweep of d rows. The forward model is the inverse one's
+implicit function:
+
+    dqdd/dq = -M⁻¹ dtau/dq,   dqdd/dqd = -M⁻¹ dtau/dqd,   dqdd/dtau = M⁻¹        at qdd
+
+M⁻¹ is formed: it is a result, and one factorisation serves the acceleration and all columns. Where the forward model is
+given, by a Hamiltonian or a network of its own, a reverse sweep of that takes the place.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import friction_force
+from dln_jax.mechanics.equations import Driven, Energies, dynamics
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.plain import InverseForward
+from dln_jax.solvers.elimination import solve, solve_lower
+from dln_jax.types import Matrix, Vector
+
+Natural = NaturalSystem | ClosedForm | NaturalHamiltonian
+"""Energies whose mass matrix depends on q alone."""
+Jacobians = tuple[Array, Array, Array]
+"""By each of three arguments [d, d]; row i is of the i-th result."""
+
+
+def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vector) -> Jacobians:
+    """dtau/dq, dtau/dqd and dtau/dqdd = M, at a motion; friction included."""
+    motion = dynamics(system)
+    if not isinstance(system, Natural):
+        return jax.jacrev(motion.inverse_dynamics, argnums=(0, 1, 2))(q, qd, qdd)
+    tau_q, tau_qd, mass = _natural_jacobians(system, lambda q: motion.inverse_dynamics(q, qd, qdd), q, qd)
+    if system.dissipation is not None:
+        D = system.dissipation
+        tau_qd += jax.jacfwd(lambda velocity: friction_force(D, q, velocity))(qd)
+    return tau_q, tau_qd, mass
+
+
+def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Array]:
+    """dc/dq and dc/dqd, each [d, d], of the Coriolis force of `decompose`."""
+    decompose = dynamics(system).decompose
+
+    def coriolis(q: Vector, qd: Vector) -> Vector:
+        return decompose(q, qd, jnp.zeros_like(q)).coriolis
+
+    if not isinstance(system, Natural):
+        return jax.jacrev(coriolis, argnums=(0, 1))(q, qd)
+    return _natural_jacobians(system, lambda q: coriolis(q, qd), q, qd)[:2]
+
+
+def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vector) -> tuple[Vector, Jacobians]:
+    """qdd [d] under a generalised force; and dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
+    motion = dynamics(system)
+    if isinstance(system, HamiltonianSystem | InverseForward):
+
+        def accelerate(*state: Vector) -> tuple[Vector, Vector]:
+            qdd = motion.forward_dynamics(*state)
+            return qdd, qdd
+
+        jacobians, qdd = jax.jacrev(accelerate, argnums=(0, 1, 2), has_aux=True)(q, qd, tau)
+        return qdd, jacobians
+    inverse_mass = _inverse_mass(system, q, qd)
+    qdd = inverse_mass @ (tau - motion.inverse_dynamics(q, qd, jnp.zeros_like(qd)))
+    tau_q, tau_qd, _ = inverse_dynamics_jacobians(system, q, qd, qdd)
+    return qdd, (-inverse_mass @ tau_q, -inverse_mass @ tau_qd, inverse_mass)
+
+
+def differentiable_forward_dynamics(system: Driven, *, degrees_of_freedom: int) -> Callable[..., Array]:
+    """(q, qd, tau) -> qdd [d], whose derivatives are products with `forward_dynamics_jacobians`.
+
+    For derivatives in many directions, as those of a step by all of its state, which then share one Jacobian.
+    """
+    forward_dynamics = jax.custom_jvp(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics)
+
+    @forward_dynamics.defjvp
+    def rule(state: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+        qdd, (by_q, by_qd, by_tau) = forward_dynamics_jacobians(system, *state)
+        q_dot, qd_dot, tau_dot = tangents
+        return qdd, by_q @ q_dot + by_qd @ qd_dot + by_tau @ tau_dot
+
+    return forward_dynamics
+
+
+def _natural_jacobians(system: Natural, force: Callable[[Vector], Vector], q: Vector, qd: Vector) -> Jacobians:
+    """Of a force by q, of the Coriolis force by qd, and M."""
+    mass_matrix = dynamics(system).mass_matrix
+
+    def force_and_momentum(q: Vector) -> tuple[Vector, Vector]:
+        return force(q), _momentum(system, q, qd)
+
+    # Together, since both push the same tangents through the mass matrix.
+    force_q, momentum_q = jax.jacfwd(force_and_momentum)(q)
+    mass, mass_rate = jax.jvp(mass_matrix, (q,), (qd,))
+    return force_q, mass_rate + momentum_q - momentum_q.T, mass
+
+
+def _momentum(system: Natural, q: Vector, qd: Vector) -> Vector:
+    if isinstance(system, NaturalSystem):
+        factor = system.cholesky(q)
+        return factor @ (factor.T @ qd)  # two small products, where M takes a large one
+    return dynamics(system).decompose(q, jnp.zeros_like(qd), qd).inertial
+
+
+def _inverse_mass(system: Energies, q: Vector, qd: Vector) -> Matrix:
+    identity = jnp.eye(q.shape[0], dtype=q.dtype)
+    if isinstance(system, NaturalHamiltonian):
+        factor = system.inverse_factor(q)
+        return factor @ factor.T
+    if isinstance(system, NaturalSystem):
+        factor = system.cholesky(q)
+        columns = jax.vmap(lambda column: solve_lower(factor, column))(identity)
+        return columns @ columns.T
+    return solve(dynamics(system).mass_matrix(q, qd), identity)
