@@ -3,20 +3,24 @@
 Subjects: one-step (microseconds of single calls against test error, for every model and call path), throughput (batched
 states per second), scaling (cost against the number of joints), training (error against seconds), integrators (steps
 per second against energy drift and trajectory error), precision (float32 against float64), softbody (steps per second
-of soft bodies, their gradients and time steps), and all of them. Compilation is timed apart, results are waited for,
-inputs vary, programs that are compared take turns, and medians count.
+of soft bodies, their gradients and time steps), c (exported C: warm and cold calls, calls from Python, Jacobians, and
+Pinocchio where it is installed), and all of them. Compilation is timed apart, results are waited for, inputs vary,
+programs that are compared take turns, and medians count.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import tyro
 
+from dln_jax.command_line.arguments import Unstated
 from dln_jax.command_line.options import Folder
 from dln_jax.files import write_bytes
 from dln_jax.studies.case import Done, draw, measure
 from dln_jax.studies.report import Row, conditions, markdown, publish
 from dln_jax.studies.speed.subjects import cases
+from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import run_folder
 
 
@@ -25,16 +29,23 @@ class Arguments(Folder):
     """What to measure, and for how long."""
 
     subject: tyro.conf.Positional[
-        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "softbody", "all"]
+        Literal["one-step", "throughput", "scaling", "training", "integrators", "precision", "softbody", "c", "all"]
     ] = "all"
     """What is measured."""
     quick: bool = False
     """Fewer cases and repetitions: a look at whether everything runs, in two minutes."""
+    against: Unstated[Path] = None
+    """With subject c: folder of the same models' exports by another release, which take turns with these (default:
+    these alone)."""
 
 
 def main(given: Arguments) -> None:
     """Measures, prints and writes; what is measured is kept even if a later subject is interrupted."""
-    chosen = [case for case in cases(quick=given.quick) if given.subject in (case.name, "all")]
+    if given.against and given.subject != "c":
+        raise InputError(f"--against is for subject c; {given.subject} does not use it")
+    chosen = [
+        case for case in cases(quick=given.quick, c={"against": given.against}) if given.subject in (case.name, "all")
+    ]
     every: list[Row] = []
     with run_folder(given.out, "benchmark") as folder:
 

@@ -1,7 +1,7 @@
 """Pictures of data, models and motions; each function returns a Matplotlib figure or writes a GIF."""
 
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
-from dln_jax.figures.benchmarks import cost_curves, cost_panels, cost_points, error_against_time
+from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time
 from dln_jax.figures.dynamics import force_decomposition, tip_paths
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
 from dln_jax.figures.phase_space import injection_figure, motion_figure
@@ -11,6 +11,7 @@ from dln_jax.figures.training import training_curve
 
 __all__ = [
     "Moments",
+    "call_times",
     "cost_curves",
     "cost_panels",
     "cost_points",

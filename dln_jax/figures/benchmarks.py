@@ -112,6 +112,41 @@ def cost_points(
     return figure
 
 
+def call_times(panels: Mapping[str, Mapping[str, Mapping[str, Mapping[str, float]]]], *, x: str) -> Figure:
+    """Times by title, model, whose code and way to call it: a line for each model, which rivals stand below.
+
+    The first owner is ours; each has a colour, and each way a marker.
+    """
+    sizes = [len(models) for models in panels.values()]
+    height = 0.42 * sum(sizes) + 0.55 * len(sizes) + 0.9
+    figure, axes = style.figure(len(sizes), 1, height=height, sharex=True, gridspec_kw={"height_ratios": sizes})
+    each = [
+        (owner, way)
+        for models in panels.values()
+        for model in models.values()
+        for owner in model
+        for way in model[owner]
+    ]
+    owners, ways = (list(dict.fromkeys(pair[part] for pair in each)) for part in range(2))
+    colours, markers = style.colours_of(owners), dict(zip(ways, style.MARKERS, strict=False))
+    for axis, (title, models) in zip(axes[:, 0], panels.items(), strict=True):
+        for line, model in enumerate(models.values()):
+            for owner, times in model.items():
+                place = line + 0.25 * owners.index(owner)
+                axis.plot(list(times.values()), [place] * len(times), color=colours[owner], linewidth=0.6)
+                for way, value in times.items():
+                    axis.plot(value, place, markers[way], color=colours[owner], markersize=5)
+        axis.set_yticks(range(len(models)), list(models))
+        axis.set_ylim(len(models) - 0.3, -0.5)
+        axis.set_xscale("log")
+        style.title(axis, title)
+    axes[-1, 0].set_xlabel(x)
+    handles = [Line2D([], [], color=colours[owner], label=owner) for owner in owners]
+    handles += [Line2D([], [], linestyle="", marker=markers[way], color="0.4", label=way) for way in ways]
+    style.legend(figure, handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
 def error_against_time(curves: Mapping[str, Line]) -> Figure:
     """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
 

@@ -1,7 +1,7 @@
-"""Speed against error: single calls, batches, training, integrators, precision, soft bodies."""
+"""Speed against error: single calls, batches, training, integrators, precision, soft bodies, exported C."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -11,7 +11,7 @@ from dln_jax.studies import soft_bodies
 from dln_jax.studies.case import Case, Findings, named
 from dln_jax.studies.soft_bodies.figures import speed_against_error
 from dln_jax.studies.soft_bodies.speed import LANES
-from dln_jax.studies.speed import costs, integrators, one_step, precision, training
+from dln_jax.studies.speed import costs, exported_c, integrators, one_step, precision, training
 
 __all__ = ["SUBJECTS", "cases"]
 
@@ -32,7 +32,7 @@ def draw_soft_bodies(lines: dict[str, Any]) -> Figure:
     return speed_against_error(lines)
 
 
-SUBJECTS: dict[str, tuple[Callable[[bool], Findings], Callable[[dict[str, Any]], Figure]]] = {
+SUBJECTS: dict[str, tuple[Callable[..., Findings], Callable[[dict[str, Any]], Figure]]] = {
     "one-step": (one_step.measure, one_step.draw),
     "throughput": (costs.measure_throughput, costs.draw_throughput),
     "scaling": (costs.measure_scaling, costs.draw_scaling),
@@ -40,15 +40,22 @@ SUBJECTS: dict[str, tuple[Callable[[bool], Findings], Callable[[dict[str, Any]],
     "integrators": (integrators.measure, integrators.draw),
     "precision": (precision.measure, precision.draw),
     "softbody": (measure_soft_bodies, draw_soft_bodies),
+    "c": (exported_c.measure, exported_c.draw),
 }
 """What measures each, by quick, and what draws it."""
 
 
-def cases(*, quick: bool = False) -> list[Case]:
-    """All subjects; their rows are named SUBJECT/..., and quick ones have fewer of them and fewer repetitions."""
-    return [Case(name, functools.partial(_measured, name, quick), draw=draw) for name, (_, draw) in SUBJECTS.items()]
+def cases(*, quick: bool = False, **options: Mapping[str, Any]) -> list[Case]:
+    """All subjects; their rows are named SUBJECT/..., and quick ones have fewer of them and fewer repetitions.
+
+    `options` are more keywords of what measures, by subject.
+    """
+    return [
+        Case(name, functools.partial(_measured, name, quick, options.get(name, {})), draw=draw)
+        for name, (_, draw) in SUBJECTS.items()
+    ]
 
 
-def _measured(name: str, quick: bool) -> Findings:
-    found = SUBJECTS[name][0](quick)
+def _measured(name: str, quick: bool, options: Mapping[str, Any]) -> Findings:
+    found = SUBJECTS[name][0](quick, **options)
     return found._replace(rows=[row._replace(case=f"{name}/{row.case}") for row in found.rows])

@@ -1,0 +1,242 @@
+"""Times of single functions of exported C, measured in C: loops of warm calls, and calls after caches were emptied.
+
+What a control loop sees is the cold call: it comes once a millisecond, and other code has had the caches meanwhile. The
+program that times is written from the header of an export, so that it fits whatever wrote it: declarations are
+`void NAME_function(const real q[2], real dt, real tau[2]);`, and a function that returns a number returns its result.
+"""
+
+import json
+import math
+import re
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from string import Template
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.deploy.c.load import FLAGS, WARNINGS, compile_c
+from dln_jax.types import InputError
+
+SMALLEST, LARGEST = 8, 64
+"""MiB that are read to empty the caches: twice the last level within these."""
+
+_PROGRAM = """\
+#define _POSIX_C_SOURCE 199309L
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "$name.h"
+
+#ifdef __clang__
+#define COMPILER __VERSION__
+#elif defined __GNUC__
+#define COMPILER "gcc " __VERSION__
+#else
+#define COMPILER "an unknown compiler"
+#endif
+
+enum { STATES = 64, INPUTS = $inputs, RESULTS = $results, LINE = 64, PAIRS = 1001 };
+
+static $real states[STATES][INPUTS], results[RESULTS];
+
+static void call(const $real *x, $real *y)
+{
+    $call;
+}
+
+static long long now(void)
+{
+    struct timespec time;
+    clock_gettime(CLOCK_MONOTONIC, &time);
+    return 1000000000LL * time.tv_sec + time.tv_nsec;
+}
+
+static int compare(const void *one, const void *other)
+{
+    const long long a = *(const long long *)one, b = *(const long long *)other;
+    return (a > b) - (a < b);
+}
+
+/* What a pair of readings takes by itself, the median */
+static long long timer(void)
+{
+    static long long pairs[PAIRS];
+    for (int k = 0; k < PAIRS; ++k) {
+        const long long start = now();
+        pairs[k] = now() - start;
+    }
+    qsort(pairs, PAIRS, sizeof pairs[0], compare);
+    return pairs[PAIRS / 2];
+}
+
+int main(int arguments, char **argument)
+{
+    const long repeats = arguments == 5 ? atol(argument[1]) : 0, calls = arguments == 5 ? atol(argument[2]) : 0;
+    const long cold = arguments == 5 ? atol(argument[3]) : 0, bytes = arguments == 5 ? atol(argument[4]) : 0;
+    volatile unsigned char *evicting = malloc((size_t)bytes + 1);
+    unsigned long seed = 1;
+    const long long reading = timer();
+    double sum = 0;
+    if (arguments != 5 || !evicting) return 1;
+    /* Pages that were never written are all one. */
+    memset((void *)evicting, 1, (size_t)bytes + 1);
+    for (int k = 0; k < STATES; ++k)
+        for (int i = 0; i < INPUTS; ++i) {
+            seed = (1103515245UL * seed + 12345UL) & 0x7fffffffUL;
+            states[k][i] = ($real)seed / ($real)0x20000000UL - 2;
+        }
+    for (int k = 0; k < STATES; ++k) {
+        call(states[k], results);
+        for (int i = 0; i < RESULTS; ++i) sum += (double)(results[i] < 0 ? -results[i] : results[i]);
+    }
+    printf("{\\"timer_ns\\": %lld, \\"hot_ns\\": [", reading);
+    for (long repeat = -1; repeat < repeats; ++repeat) {
+        const long long start = now();
+        for (long k = 0; k < calls; ++k) call(states[k % STATES], results);
+        /* The first repeat warms up. */
+        const double each = (double)(now() - start - reading) / (double)calls;
+        if (repeat >= 0) printf("%s%.3f", repeat ? ", " : "", each);
+    }
+    printf("], \\"cold_ns\\": [");
+    for (long k = 0; k < cold; ++k) {
+        const volatile $real *state = states[k % STATES];
+        unsigned char read = 0;
+        for (long i = 0; i < bytes; i += LINE) read ^= evicting[i];
+        /* A loop has just made the state, and its clock is at hand. */
+        for (int i = 0; i < INPUTS; ++i) (void)state[i];
+        evicting[0] = read;
+        (void)now();
+        const long long start = now();
+        call(states[k % STATES], results);
+        const long long stop = now();
+        printf("%s%lld", k ? ", " : "", stop - start - reading);
+    }
+    printf("], \\"compiler\\": \\"%s\\", \\"sum\\": ", COMPILER);
+    if (sum - sum == 0) printf("%.17g}\\n", sum);
+    else printf("null}\\n");
+    return 0;
+}
+"""
+_PROTOTYPE = r"^(void|double|float)\s+{name}_(\w+)\(([^)]*)\);"
+_ARGUMENT = re.compile(r"\s*(const\s+)?(double|float)\s+(\w+)(?:\[([\d* ]+)\])?\s*")
+
+
+class Prototype(NamedTuple):
+    """A declared function: its C type of numbers, and names and sizes of its arguments."""
+
+    real: str
+    inputs: dict[str, int]
+    """0 is the size of a number that is passed by value."""
+    results: dict[str, int]
+    returns: bool
+    """Whether a number is returned."""
+
+
+class Times(NamedTuple):
+    """Nanoseconds of calls of one function in one process."""
+
+    hot: np.ndarray
+    """Means over a loop of calls, one each repeat."""
+    cold: np.ndarray
+    """Single calls, the clock's own time subtracted."""
+    timer: float
+    """That time."""
+    sum: float
+    """Of the sizes of the results over the states, by which exports of one model are compared; NaN if not finite."""
+    compiler: str
+    """Name and version."""
+
+
+def prototypes(header: str, name: str) -> dict[str, Prototype]:
+    """The functions NAME_... that a header declares and that take and give numbers of one type, without NAME_."""
+    found = {}
+    for returned, function, text in re.findall(_PROTOTYPE.format(name=re.escape(name)), header, re.MULTILINE):
+        arguments = [match for each in text.split(",") if (match := _ARGUMENT.fullmatch(each))]
+        reals = {match[2] for match in arguments} | {returned} - {"void"}
+        if len(arguments) <= text.count(",") or len(reals) != 1:
+            continue
+        sizes = {match[3]: math.prod(map(int, match[4].split("*"))) if match[4] else 0 for match in arguments}
+        written = {match[3] for match in arguments if match[4] and not match[1]}
+        inputs = {key: size for key, size in sizes.items() if key not in written}
+        results = {key: sizes[key] for key in sizes if key in written}
+        found[function] = Prototype(reals.pop(), inputs, results, returned != "void")
+    return found
+
+
+def program(name: str, function: str, prototype: Prototype) -> str:
+    """C text of what times one function; it takes REPEATS CALLS COLD BYTES and prints JSON, in nanoseconds."""
+    inputs, results, arguments = 0, 0, []
+    for size in prototype.inputs.values():
+        arguments.append(f"&x[{inputs}]" if size else f"x[{inputs}]")
+        inputs += size or 1
+    for size in prototype.results.values():
+        arguments.append(f"&y[{results}]")
+        results += size
+    call = f"{f'y[{results}] = ' * prototype.returns}{name}_{function}({', '.join(arguments)})"
+    sizes = {"inputs": inputs, "results": results + prototype.returns}
+    return Template(_PROGRAM).substitute(sizes, name=name, real=prototype.real, call=call)
+
+
+def compiled(export: Path, place: Path, *, name: str = "model") -> Path:
+    """The object file of an export's source, compiled as `load_c` does; `InputError` where that fails."""
+    built = place / f"{name}.o"
+    compile_c([*WARNINGS, *FLAGS, "-c", str(export / f"{name}.c"), "-o", str(built)])
+    return built
+
+
+def programs(export: Path, model: Path, functions: Iterable[str], *, name: str = "model") -> dict[str, Path]:
+    """What times each of those functions that an export declares, beside the object file `model` of its source.
+
+    Raises:
+        InputError: the export declares none of them, or the header does not compile.
+    """
+    declared, found = prototypes((export / f"{name}.h").read_text(), name), {}
+    for function in functions:
+        if function in declared:
+            source = model.with_name(f"time_{function}.c")
+            source.write_text(program(name, function, declared[function]))
+            found[function] = source.with_suffix("")
+            # Apart from the model's source, so that no call is folded into the loop.
+            compile_c([*WARNINGS, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(found[function])])
+    if not found:
+        raise InputError(f"{export / f'{name}.h'} declares none of {', '.join(functions)}; export it again")
+    return found
+
+
+def timed(program: Path, *, repeats: int, calls: int, cold: int, mebibytes: int) -> Times:
+    """Runs a program that `programs` built.
+
+    Args:
+        program: of one function.
+        repeats: loops of warm calls.
+        calls: of each loop.
+        cold: single calls, before each of which the caches are emptied.
+        mebibytes: that are read for it.
+
+    Raises:
+        InputError: it ends by an error.
+    """
+    command = [program, *map(str, (repeats, calls, cold, mebibytes << 20))]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise InputError(f"{program.name} ended with status {done.returncode}; does the model's demo run?")
+    found = json.loads(done.stdout)
+    hot, cold_calls = (np.asarray(found[key], float) for key in ("hot_ns", "cold_ns"))
+    total = math.nan if found["sum"] is None else found["sum"]
+    return Times(hot, cold_calls, found["timer_ns"], total, found["compiler"])
+
+
+def last_level_cache() -> int | None:
+    """MiB of the processor's largest cache; `None` where the system does not say (it is no Linux)."""
+    units = {"K": 2**10, "M": 2**20}
+    sizes = [path.read_text().strip() for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size")]
+    return max((int(size[:-1]) * units[size[-1]] >> 20 for size in sizes if size[-1:] in units), default=None)
+
+
+def evicting() -> int:
+    """MiB to read so that caches are emptied."""
+    return min(max(2 * (last_level_cache() or LARGEST), SMALLEST), LARGEST)
