@@ -35,6 +35,12 @@ STACK = 256 * 1024
 """Bytes of the stack that a function may take."""
 LENGTH = 10_000_000
 """Bytes of a source."""
+
+
+class TooLargeError(InputError):
+    """A function that would take more of the stack, or of a source, than generated C suits."""
+
+
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
 Results may overlap arguments: all of these are read before. What is not finite in a state is not hidden."""
 _NEEDED = """C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);
@@ -49,6 +55,7 @@ def export_c(
     precision: str | None = None,
     libm: bool = False,
     casadi: bool = False,
+    leave_out_large: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
@@ -61,18 +68,27 @@ def export_c(
         precision: f32 or f64 of all real numbers; by default that of the examples.
         libm: call the C library's exp, tanh, sin, cos and log1p, in place of ones that vectorise.
         casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
+        leave_out_large: leave functions out that would be refused for their stack or length; the header names them.
         overwrite: replace files that exist.
 
     Raises:
         InputError: what has no C, a name that is none in C, more stack than 256 KiB or source than 10 MB, files that
             exist, or the folder of a run, whose files are never replaced.
     """
-    texts = source_files(functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi)
+    texts = source_files(
+        functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi, leave_out_large=leave_out_large
+    )
     return write_exports(Path(directory), texts, overwrite=overwrite)
 
 
 def source_files(
-    functions: Functions, *, name: str, precision: str | None = None, libm: bool = False, casadi: bool = False
+    functions: Functions,
+    *,
+    name: str,
+    precision: str | None = None,
+    libm: bool = False,
+    casadi: bool = False,
+    leave_out_large: bool = False,
 ) -> dict[str, bytes]:
     """Content of each file, by its name."""
     if not functions:
@@ -80,9 +96,18 @@ def source_files(
     precision = precision or _precision(functions)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
-    source, signatures, texts = Source(precision, libm), {}, []
+    source, signatures, texts, left_out = Source(precision, libm), {}, [], []
     for key, (function, examples) in functions.items():
-        signature, text = _function(source, f"{name}_{check_name(key, 'a function')}", function, examples)
+        before = dict(source.tables)
+        try:
+            with jax.enable_x64(precision == "f64"):
+                signature, text = _function(source, name, check_name(key, "the name of a function"), function, examples)
+        except TooLargeError as error:
+            if not leave_out_large:
+                raise
+            left_out.append(str(error))
+            source.tables = before
+            continue
         signatures[key] = signature
         texts.append(text)
     version, real = importlib.metadata.version("dln-jax"), PRECISIONS[precision][1]
@@ -101,30 +126,30 @@ def source_files(
 
 
 def _function(
-    source: Source, name: str, function: Callable[..., Any], examples: Sequence[Any]
+    source: Source, name: str, key: str, function: Callable[..., Any], examples: Sequence[Any]
 ) -> tuple[Signature, str]:
     """Signature and C text of one function."""
-    numpy_type, real, _ = PRECISIONS[source.precision]
+    numpy_type = PRECISIONS[source.precision][0]
     examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
     try:
         arguments = argument_leaves(function, examples)
         program, inputs, results, shapes = program_of(function, examples)
+        signature = Signature(tuple(arguments), tuple(result_leaves(shapes, arguments)))
+        named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(arguments)}
+        targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
+        body = body_of(source, program, results, named, targets)
     except InputError as error:
-        raise InputError(f"{name}: {error}") from error
-    signature = Signature(tuple(arguments), tuple(result_leaves(shapes, arguments)))
-    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(arguments)}
-    targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
-    body = body_of(source, program, results, named, targets)
+        raise InputError(f"{key}: {error}") from error
     if body.bytes > STACK:
-        raise InputError(
-            f"{name} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
+        raise TooLargeError(
+            f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
-    used = {inputs[k].number for k in range(len(inputs))} & {node.number for node in body.plan.needed}
     unused = [
-        f"    (void){leaf.name};" for leaf, node in zip(arguments, inputs, strict=True) if node.number not in used
+        f"    (void){leaf.name};"
+        for leaf, node in zip(arguments, inputs, strict=True)
+        if node not in body.plan.needed or not body.plan.needed[node].any()
     ]
-    key = name.partition("_")[2]
-    head = declaration(name.partition("_")[0], key, signature, "real")
+    head = declaration(name, key, signature, "real")
     text = "\n" + head + "\n{\n" + "\n".join([*unused, *body.lines]) + "\n}\n"
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text
 
