@@ -20,8 +20,6 @@ from jaxtyping import Float
 
 from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Rates
-from dln_jax.mechanics.equations import Driven
-from dln_jax.mechanics.jacobians import differentiable_forward_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import require_positive
 
@@ -35,9 +33,8 @@ Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
 """Of `types.Needs`; by `None` u is tau."""
 
 
-def rk4(system: Driven, degrees_of_freedom: int, *, actuation: Actuation = None) -> Step:
-    """Runge-Kutta's classical step, of order 4."""
-    forward_dynamics = differentiable_forward_dynamics(system, degrees_of_freedom=degrees_of_freedom)
+def rk4(forward_dynamics: Callable[..., Array], *, actuation: Actuation = None) -> Step:
+    """Runge-Kutta's classical step, of order 4, of (q, qd, tau) -> qdd."""
 
     def step(x: Array, u: Array, dt: Array) -> Array:
         tau = _force(actuation, u)
@@ -48,15 +45,14 @@ def rk4(system: Driven, degrees_of_freedom: int, *, actuation: Actuation = None)
 
 
 def implicit_midpoint(
-    system: Driven, degrees_of_freedom: int, *, actuation: Actuation = None, iterations: int = ITERATIONS
+    forward_dynamics: Callable[..., Array], *, actuation: Actuation = None, iterations: int = ITERATIONS
 ) -> Step:
     """The implicit midpoint rule, of order 2, by Newton's method for qdd at the midpoint.
 
         qdd = forward_dynamics(q + dt/2 v, v, tau),   v = qd + dt/2 qdd;   (q, qd) <- (q + dt v, qd + dt qdd)
 
     Args:
-        system: whose forward dynamics is stepped.
-        degrees_of_freedom: d.
+        forward_dynamics: (q, qd, tau) -> qdd; for derivatives of the step, `jacobians.differentiable_forward_dynamics`.
         actuation: u -> tau.
         iterations: Newton steps, from the acceleration at x. Where the last one still moves the state by more than
             sqrt(eps) (1 + |x|), after which the error is that squared, the step is NaN: take a smaller dt.
@@ -65,7 +61,6 @@ def implicit_midpoint(
         InputError: iterations that are not positive.
     """
     require_positive(iterations=iterations)
-    forward_dynamics = differentiable_forward_dynamics(system, degrees_of_freedom=degrees_of_freedom)
 
     def step(x: Array, u: Array, dt: Array) -> Array:
         q, qd = jnp.split(x, 2)

@@ -14,6 +14,7 @@ M⁻¹ is formed: it is a result, and one factorisation serves the acceleration 
 given, by a Hamiltonian or a network of its own, a reverse sweep of that takes the place.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -77,20 +78,24 @@ def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vecto
     return qdd, (-inverse_mass @ tau_q, -inverse_mass @ tau_qd, inverse_mass)
 
 
-def differentiable_forward_dynamics(system: Driven, *, degrees_of_freedom: int) -> Callable[..., Array]:
-    """(q, qd, tau) -> qdd [d], whose derivatives are products with `forward_dynamics_jacobians`.
+def differentiable_forward_dynamics(
+    system: Driven, *, degrees_of_freedom: int
+) -> tuple[Callable[..., Array], Callable[..., tuple[Vector, Jacobians]]]:
+    """(q, qd, tau) -> qdd [d], whose derivatives are products with its Jacobians; and `forward_dynamics_jacobians`.
 
-    For derivatives in many directions, as those of a step by all of its state, which then share one Jacobian.
+    For derivatives in many directions, as those of a step by all of its state, which then share one Jacobian. Both are
+    jitted: a step that calls them several times traces, compiles and exports them once.
     """
-    forward_dynamics = jax.custom_jvp(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics)
+    forward_dynamics = jax.custom_jvp(jax.jit(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics))
+    jacobians = jax.jit(functools.partial(forward_dynamics_jacobians, system))
 
     @forward_dynamics.defjvp
     def rule(state: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
-        qdd, (by_q, by_qd, by_tau) = forward_dynamics_jacobians(system, *state)
+        qdd, (by_q, by_qd, by_tau) = jacobians(*state)
         q_dot, qd_dot, tau_dot = tangents
         return qdd, by_q @ q_dot + by_qd @ qd_dot + by_tau @ tau_dot
 
-    return forward_dynamics
+    return forward_dynamics, jacobians
 
 
 def _natural_jacobians(system: Natural, force: Callable[[Vector], Vector], q: Vector, qd: Vector) -> Jacobians:

@@ -7,6 +7,7 @@ What moves elements then is indexing of that array, and a constant is stored in 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,16 @@ _CHOICES = {
 """In loops without a branch, which would keep them from being vectorised."""
 
 
+class Called(NamedTuple):
+    """A function that others call."""
+
+    name: str
+    results: list[Node]
+    text: str
+    operations: int
+    bytes: int
+
+
 @dataclass
 class Source:
     """What the functions of one source share."""
@@ -38,6 +49,10 @@ class Source:
     arrays: set[str] = field(default_factory=set)
     """Elementary functions of arrays that are called."""
     kernels: set[str] = field(default_factory=set)
+    parts: dict[Any, "Called"] = field(default_factory=dict)
+    """Functions that others call."""
+    names: dict[str, str] = field(default_factory=dict)
+    """Their names, by what they do."""
 
     @property
     def suffix(self) -> str:
@@ -65,6 +80,8 @@ class Body:
     lines: list[str] = field(default_factory=list)
     operations: int = 0
     bytes: int = 0
+    called: int = 0
+    """Bytes of the largest function that it calls."""
     names: dict[Node, str] = field(default_factory=dict)
     """Arrays that nodes are kept in."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
@@ -134,8 +151,9 @@ class Body:
             return "c{}_{}".format(*node.attribute)
         if node.op == "project":
             (loop,) = node.args
-            number = loop.number if loop.op == "lu" else np.ravel(loop.attribute)[0]
-            return f"{'v' if loop.op == 'lu' else 'c'}{number}_{node.attribute}"
+            if loop.op in ("lu", "call"):
+                return f"v{loop.number}_{node.attribute}"
+            return f"c{np.ravel(loop.attribute)[0]}_{node.attribute}"
         return f"i_{node.attribute}" if node.op == "counter" else self.names.get(node, f"v{node.number}")
 
     def read(self, node: Node, positions: np.ndarray, names: Sequence[str] = ()) -> str:
@@ -199,6 +217,29 @@ class Body:
         return C_TYPES[dtype]
 
     # Writing
+
+    def part(self, key: Any) -> Called:
+        """A function that is called, written where it was not yet."""
+        if key not in self.source.parts:
+            program, results = self.program.parts[key]
+            inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda each: each.attribute)
+            named = {each.attribute: (f"a{each.attribute}_", False) for each in inputs}
+            targets = [f"r{k}_" for k in range(len(results))]
+            body = body_of(self.source, program, results, named, targets)
+            parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
+            parameters += [f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)]
+            unused = [f"    (void)a{each.attribute}_;" for each in inputs if not body.uses(each)]
+            lines = "\n".join([*unused, *body.lines])
+            text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
+            name = self.source.names.setdefault(text, f"part_{len(self.source.names)}")
+            text = f"\nstatic void {name}{text}"
+            self.source.parts[key] = Called(name, results, text, body.operations, body.bytes)
+        self.called = max(self.called, self.source.parts[key].bytes)
+        return self.source.parts[key]
+
+    def uses(self, node: Node) -> bool:
+        """Whether anything reads an input."""
+        return node in self.plan.needed and bool(self.plan.needed[node].any())
 
     def copied(self, node: Node, target: str) -> None:
         """Copies all elements of a node to an array."""
@@ -437,4 +478,5 @@ def body_of(source: Source, program: Program, results: Sequence[Node], inputs, t
             body.line(f"return {body.read(node, np.array(0))};")
         else:
             copied(body, node, target)
+    body.bytes += body.called
     return body

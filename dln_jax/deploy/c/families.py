@@ -153,7 +153,7 @@ def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tupl
 
 def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) -> Named:
     motion = dynamics(system, degrees_of_freedom=d)
-    forward = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
+    forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
     inverse_jacobians, coriolis_jacobians = (
         functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
     )
@@ -166,7 +166,7 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         return motion.decompose(q, qd, jnp.zeros_like(q)).coriolis
 
     def forward_jacobians(q: Array, qd: Array, tau: Array) -> tuple[Array, ...]:
-        return jacobians.forward_dynamics_jacobians(system, q, qd, tau)[1]
+        return with_jacobians(q, qd, tau)[1]
 
     functions = {
         "inverse_dynamics": _named(motion.inverse_dynamics, "tau"),
@@ -184,8 +184,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         functions |= _with_derivatives("mass_matrix", _named(mass_matrix, "M"))
         if getattr(system, "dissipation", None) is not None:
             functions |= _with_derivatives("friction", _named(motion.friction, "tau_friction"))
-    implicit = discrete.implicit_midpoint(system, d, actuation=actuation, iterations=iterations)
-    for name, step in {"rk4": discrete.rk4(system, d, actuation=actuation), "implicit_midpoint": implicit}.items():
+    implicit = discrete.implicit_midpoint(forward, actuation=actuation, iterations=iterations)
+    for name, step in {"rk4": discrete.rk4(forward, actuation=actuation), "implicit_midpoint": implicit}.items():
         functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
     return functions
 

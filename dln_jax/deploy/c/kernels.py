@@ -208,6 +208,15 @@ def _lu(body, node: Node) -> None:
     body.spend(2 * n * n * m // 3)
 
 
+def _call(body, node: Node) -> None:
+    part = body.part(node.attribute)
+    names = [f"v{node.number}_{k}" for k in range(len(part.results))]
+    for name, result in zip(names, part.results, strict=True):
+        body.declared(name, result.dtype, max(result.size, 1))
+    body.line(f"{part.name}({', '.join([*map(body.pointer, node.args), *names])});")
+    body.spend(part.operations)
+
+
 def _stored(body, prefix: str, nodes: list[Node]) -> list[str]:
     """Declares what control flow hands on."""
     names = [f"{prefix}_{index}" for index in range(len(nodes))]
@@ -290,6 +299,7 @@ _WRITERS = {
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
     "lu": _lu,
+    "call": _call,
     "while": _while,
     "repeat": _repeat,
     "branch": _branch,

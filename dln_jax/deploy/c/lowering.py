@@ -1,13 +1,14 @@
 """A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from dln_jax.deploy.c import indexing, linear_algebra, primitives
-from dln_jax.deploy.c.program import Loop, Node, Program
+from dln_jax.deploy.c.program import Loop, Node, Part, Program, is_constant, values
 from dln_jax.types import InputError
 
 _KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int8": "int", "int16": "int", "int32": "int"}
@@ -25,27 +26,76 @@ _REFUSED = {
     "callback": "a callback into Python, which a robot has not",
     "debug_print": "printing, a side effect",
 }
+_LARGE_CALL = 600
+"""Equations from which on a jitted function that is called several times is a C function of its own."""
 _RULES = {**primitives.RULES, **indexing.RULES, **linear_algebra.RULES}
 
 
-def program_of(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Program, list[Node], list[Node], Any]:
-    """The program of a function for arguments like the examples: with its inputs, its results, and their tree.
+def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
+    """The closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: what has no C: an unsupported primitive, with the line that made it, a side effect, random numbers,
-            another type of number, a shape that is not known.
+        InputError: side effects, or whole numbers beyond 64 bits.
     """
-    flat, _ = jax.tree.flatten(tuple(examples))
-    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
-    program = Program()
-    inputs = [
-        program.make("input", np.shape(leaf), kind_of(np.asarray(leaf).dtype), attribute=number)
-        for number, leaf in enumerate(flat)
-    ]
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except OverflowError as error:
+        raise InputError(f"a whole number is out of range ({error}); C has those of 64 bits") from error
     if closed.effects:
         raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
-    results = _inline(program, closed, inputs)
-    return program, inputs, results, shapes
+    return closed, shapes
+
+
+def program_of(closed: Any, repeated: Mapping[int, str]) -> tuple[Program, list[Node], list[Node]]:
+    """The program of a closed jaxpr, its inputs and its results.
+
+    Args:
+        closed: as `traced`.
+        repeated: calls of these jaxprs, by `id`, are calls in the program too.
+
+    Raises:
+        InputError: what has no C: an unsupported primitive, with the line that made it, random numbers, another type of
+            number, a shape that is not known.
+    """
+    program = Program(repeated=repeated)
+    inputs = [
+        program.make("input", variable.aval.shape, kind_of(variable.aval.dtype), attribute=number)
+        for number, variable in enumerate(closed.jaxpr.invars)
+    ]
+    return program, inputs, _inline(program, closed, inputs)
+
+
+def repeated_calls(every: Sequence[Any]) -> dict[int, str]:
+    """Jaxprs, by `id`, of jitted functions that are large and called several times by these closed ones; their text.
+
+    Equal texts are equal functions.
+    """
+    texts: dict[int, str] = {}
+    counts: Counter[str] = Counter()
+
+    def visit(jaxpr: Any) -> int:
+        """Number of equations, those of calls included."""
+        size = 0
+        for equation in jaxpr.eqns:
+            within = sum(visit(each) for value in equation.params.values() for each in _jaxprs(value))
+            size += max(1, within)
+            if equation.primitive.name in ("jit", "pjit") and within >= _LARGE_CALL:
+                closed = equation.params["jaxpr"]
+                if id(closed) not in texts:
+                    texts[id(closed)] = str(closed)
+                counts[texts[id(closed)]] += 1
+        return size
+
+    for closed in every:
+        visit(closed.jaxpr)
+    return {each: text for each, text in texts.items() if counts[text] > 1}
+
+
+def _jaxprs(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [each for one in value for each in _jaxprs(one)]
+    value = getattr(value, "jaxpr", value)
+    return [value] if hasattr(value, "eqns") else []
 
 
 def kind_of(dtype: Any) -> str:
@@ -93,7 +143,8 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
             raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
     if name in _CALLS:
-        return _inline(program, _closed(parameters[_CALLS[name]]), args)
+        inner = parameters[_CALLS[name]]
+        return _call(program, inner, args) if id(inner) in program.repeated else _inline(program, _closed(inner), args)
     if name in _CONTROL:
         return _CONTROL[name](program, parameters, args)
     if name in primitives.TYPED_RULES:
@@ -104,6 +155,26 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
     results = _RULES[name](program, parameters, *args)
     return list(results) if isinstance(results, list | tuple) else [results]
+
+
+def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
+    """A call of a function of its own, which has the constants among its arguments inside."""
+    fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
+    consts = tuple(np.asarray(each).tobytes() for each in closed.consts)
+    key = (program.repeated[id(closed)], consts, tuple((k, values(arg).tobytes()) for k, arg in fixed.items()))
+    if key not in program.parts:
+        part = Program(repeated=program.repeated, parts=program.parts)
+        inside = [
+            part.constant(values(arg), arg.dtype)
+            if k in fixed
+            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(each < k for each in fixed))
+            for k, arg in enumerate(args)
+        ]
+        program.parts[key] = Part(part, _inline(part, closed, inside))
+    shapes = [(each.shape, each.dtype) for each in program.parts[key].results]
+    passed = [arg for k, arg in enumerate(args) if k not in fixed]
+    call = program.make("call", (), "int", passed, attribute=key)
+    return [program.make("project", shape, dtype, [call], k) for k, (shape, dtype) in enumerate(shapes)]
 
 
 def _closed(jaxpr: Any) -> Any:

@@ -14,12 +14,13 @@ source it is. Arranges of arranges are one arrange.
 | `take` | flat elements of the first argument at the second's indices |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
+| `call` | a function of its own |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
 
 Simplifications keep what IEEE arithmetic gives: 1 x = x and 0 + x = x, but never 0 x = 0, which hides a NaN.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -69,6 +70,13 @@ class Loop(NamedTuple):
     reverse: bool = False
 
 
+class Part(NamedTuple):
+    """A function that others call."""
+
+    program: "Program"
+    results: list[Node]
+
+
 @dataclass
 class Program:
     """Nodes in an order in which each follows its arguments."""
@@ -77,6 +85,10 @@ class Program:
     loops: dict[int, Loop] = field(default_factory=dict)
     floor: Region = ()
     """The branch that is being built: nodes stay in it even if they need nothing that is computed there."""
+    repeated: Mapping[int, str] = field(default_factory=dict)
+    """Jaxprs, by `id`, whose calls are calls here too, and their text, which tells equal ones."""
+    parts: dict[Any, Part] = field(default_factory=dict)
+    """Functions that are called, by the attribute of a `call`."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
 
     def make(

@@ -7,7 +7,7 @@ library but <math.h>. The same functions, name and precision give the same files
 import importlib.metadata
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,13 +18,14 @@ from dln_jax.deploy.c.elementary import definitions
 from dln_jax.deploy.c.emit import Source, body_of
 from dln_jax.deploy.c.interface import (
     FORMAT,
+    Leaf,
     Signature,
     argument_leaves,
     declaration,
     description,
     result_leaves,
 )
-from dln_jax.deploy.c.lowering import program_of
+from dln_jax.deploy.c.lowering import program_of, repeated_calls, traced
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
 from dln_jax.types import InputError
@@ -97,11 +98,15 @@ def source_files(
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     source, signatures, texts, left_out = Source(precision, libm), {}, [], []
-    for key, (function, examples) in functions.items():
+    with jax.enable_x64(precision == "f64"):
+        every = {
+            check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
+        }
+    repeated = repeated_calls([each.closed for each in every.values()])
+    for key, each in every.items():
         before = dict(source.tables)
         try:
-            with jax.enable_x64(precision == "f64"):
-                signature, text = _function(source, name, check_name(key, "the name of a function"), function, examples)
+            signature, text = _function(source, name, key, each, repeated)
         except TooLargeError as error:
             if not leave_out_large:
                 raise
@@ -114,7 +119,9 @@ def source_files(
     written_by = f"Written by dln-jax {version}, C format {FORMAT}."
     files = {
         f"{name}.h": _header(name, written_by, signatures, real),
-        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + _preamble(source, name) + "".join(texts),
+        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + _preamble(source, name)
+        + "".join(dict.fromkeys(part.text for part in source.parts.values()))
+        + "".join(texts),
         f"{name}_demo.c": demo(name, signatures, precision),
         "CMakeLists.txt": cmake(name),
     }
@@ -125,18 +132,30 @@ def source_files(
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
 
 
-def _function(
-    source: Source, name: str, key: str, function: Callable[..., Any], examples: Sequence[Any]
-) -> tuple[Signature, str]:
-    """Signature and C text of one function."""
-    numpy_type = PRECISIONS[source.precision][0]
+class _Traced(NamedTuple):
+    arguments: list[Leaf]
+    results: list[Leaf]
+    closed: Any
+
+
+def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> _Traced:
+    numpy_type = PRECISIONS[precision][0]
     examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
     try:
         arguments = argument_leaves(function, examples)
-        program, inputs, results, shapes = program_of(function, examples)
-        signature = Signature(tuple(arguments), tuple(result_leaves(shapes, arguments)))
-        named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(arguments)}
-        targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
+        closed, shapes = traced(function, examples)
+        return _Traced(arguments, result_leaves(shapes, arguments), closed)
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from error
+
+
+def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]) -> tuple[Signature, str]:
+    """Signature and C text of one function."""
+    signature = Signature(tuple(each.arguments), tuple(each.results))
+    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
+    targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
+    try:
+        program, inputs, results = program_of(each.closed, repeated)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -144,13 +163,9 @@ def _function(
         raise TooLargeError(
             f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
-    unused = [
-        f"    (void){leaf.name};"
-        for leaf, node in zip(arguments, inputs, strict=True)
-        if node not in body.plan.needed or not body.plan.needed[node].any()
-    ]
-    head = declaration(name, key, signature, "real")
-    text = "\n" + head + "\n{\n" + "\n".join([*unused, *body.lines]) + "\n}\n"
+    unused = [f"    (void){leaf.name};" for leaf, node in zip(each.arguments, inputs, strict=True) if not body.uses(node)]
+    lines = "\n".join([*unused, *body.lines])
+    text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text
 
 
