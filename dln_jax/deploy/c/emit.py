@@ -160,15 +160,15 @@ class Body:
         """C expression of the elements at positions, over loops with these variables."""
         if node.op == "arrange" and node not in self.plan.arrays:
             if is_constant(node):
-                return self.literal(values(node).ravel()[positions], node.dtype, names)
-            positions = np.asarray(node.value).ravel()[positions]
+                return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
+            positions = np.asarray(np.asarray(node.value).ravel()[positions])
             starts = np.cumsum([0, *(each.size for each in node.args)])
             owner = np.searchsorted(starts, positions, side="right") - 1
             first = int(owner.flat[0])
             assert (owner == first).all(), "a loop reads from several arrays"
-            return self.read(node.args[first], positions - starts[first], names)
+            return self.read(node.args[first], np.asarray(positions - starts[first]), names)
         if node.op == "const":
-            return self.literal(np.asarray(node.value).ravel()[positions], node.dtype, names)
+            return self.literal(np.asarray(np.asarray(node.value).ravel()[positions]), node.dtype, names)
         name = self.name(node)
         if node.op == "input":
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
@@ -190,7 +190,7 @@ class Body:
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
         """C expression of numbers over the box of loops with these variables."""
-        if same(numbers).all():
+        if numbers.size and same(numbers).all():
             return self.number(numbers.flat[0], dtype)
         # Axes along which nothing changes are not stored.
         kept = [axis for axis in range(numbers.ndim) if not (numbers == numbers.take([0], axis=axis)).all()]
@@ -236,6 +236,10 @@ class Body:
             self.source.parts[key] = Called(name, results, text, body.operations, body.bytes)
         self.called = max(self.called, self.source.parts[key].bytes)
         return self.source.parts[key]
+
+    def projected(self, loop: Node) -> set[int]:
+        """Which results of a loop are read."""
+        return {each.attribute for each in self.plan.needed if each.op == "project" and each.args[0] is loop}
 
     def uses(self, node: Node) -> bool:
         """Whether anything reads an input."""
@@ -372,7 +376,7 @@ class Body:
     def _steps(self, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
         """How far a reading moves along each axis; None where it is a table."""
         if node.op == "arrange" and node not in self.plan.arrays:
-            positions = np.asarray(node.value).ravel()[positions]
+            positions = np.asarray(np.asarray(node.value).ravel()[positions])
             if is_constant(node):
                 return None if strides(positions) is None else strides(positions)[1]
         found = strides(positions)
@@ -382,7 +386,7 @@ class Body:
 def same(numbers: np.ndarray) -> np.ndarray:
     """Whether each is the first, NaN or not."""
     first = numbers.flat[0]
-    return (numbers == first) | ((numbers != numbers) & bool(first != first))
+    return np.asarray((numbers == first) | ((numbers != numbers) & bool(first != first)))
 
 
 def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
@@ -426,9 +430,9 @@ def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequ
     if not (own and node.op == "arrange"):
         return body.read(node, positions, names)
     starts = np.cumsum([0, *(each.size for each in node.args)])
-    inside = np.asarray(node.value).ravel()[positions]
+    inside = np.asarray(np.asarray(node.value).ravel()[positions])
     first = int(np.searchsorted(starts, inside.flat[0], side="right")) - 1
-    return body.read(node.args[first], inside - starts[first], names)
+    return body.read(node.args[first], np.asarray(inside - starts[first]), names)
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:

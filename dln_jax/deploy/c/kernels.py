@@ -257,20 +257,21 @@ def _repeat(body, node: Node) -> None:
     names = _stored(body, f"c{number}", loop.carries)
     for name, start in zip(names, node.args, strict=True):
         body.copied(start, name)
-    stacked = loop.results[carried:]
+    read = body.projected(node)
+    stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
-    for index, each in enumerate(stacked):
-        body.declared(f"c{number}_{carried + index}", each.dtype, max(each.size * length, 1))
+    for index, each in stacked.items():
+        body.declared(f"c{number}_{index}", each.dtype, max(each.size * length, 1))
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
     if stacked or any(each.op == "counter" and each.attribute == number for each in body.plan.needed):
         body.line(f"const long long i_{number} = {turn};")
     body.region((*node.region, number))
-    for index, each in enumerate(stacked):
+    for index, each in stacked.items():
         body.opened("")
-        body.declared(f"n{number}_{carried + index}", each.dtype, max(each.size, 1))
-        body.copied(each, f"n{number}_{carried + index}")
-        target = f"c{number}_{carried + index}[i_{number} * {each.size} + k_]"
-        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{carried + index}[k_];")
+        body.declared(f"n{number}_{index}", each.dtype, max(each.size, 1))
+        body.copied(each, f"n{number}_{index}")
+        target = f"c{number}_{index}[i_{number} * {each.size} + k_]"
+        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{index}[k_];")
         body.closed()
     _handed_on(body, loop, names, number)
     body.closed(max(length, 1))

@@ -18,7 +18,7 @@ _KINDS |= {"int64": "long", "uint8": "unsigned", "uint16": "unsigned", "uint32":
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
     "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr", "custom_lin": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr",
 }  # fmt: skip
 _REFUSED = {
     "random": "random numbers; draw them outside and pass them as arguments",

@@ -216,6 +216,9 @@ def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node,
             positions = np.asarray(node.value).ravel()[mask]
             for each, start in zip(node.args, starts, strict=False):
                 needed[each][positions[(positions >= start) & (positions < start + each.size)] - start] = True
+        elif node in written_out and node.op == "take":
+            needed[node.args[0]][:] = True
+            needed[node.args[1]][...] |= mask
         elif node in written_out and node.op in OPERATIONS:
             for each in node.args:
                 needed[each][...] |= mask if each.size == node.size else mask.any()

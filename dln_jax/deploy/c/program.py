@@ -132,7 +132,7 @@ class Program:
             inner += parts
             flat.append(within + start)
             start += sum(part.size for part in parts)
-        positions = np.concatenate(flat)[np.asarray(positions, np.int64)]
+        positions = np.asarray(np.concatenate(flat)[np.asarray(positions, np.int64)])
         inner, positions = _without_unused(inner, positions)
         if not inner or positions.size == 0:
             dtype = sources[0].dtype
@@ -256,7 +256,7 @@ def values(node: Node) -> np.ndarray:
     """Numbers of a node that is known beforehand."""
     if node.op == "const":
         return np.asarray(node.value)
-    return np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)]
+    return np.asarray(np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)])
 
 
 def _is_all(node: Node, number: Any) -> bool:
@@ -281,4 +281,4 @@ def _without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[No
             kept[source] = start
             start += source.size
         moved[index] = kept[source] - starts[index]
-    return list(kept), positions + moved[owner]
+    return list(kept), np.asarray(positions + moved[owner])

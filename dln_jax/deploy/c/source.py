@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from dln_jax.deploy.c import casadi as external
 from dln_jax.deploy.c import kernels
 from dln_jax.deploy.c.demo import cmake, demo
 from dln_jax.deploy.c.elementary import definitions
@@ -125,11 +126,25 @@ def source_files(
         f"{name}_demo.c": demo(name, signatures, precision),
         "CMakeLists.txt": cmake(name),
     }
-    if len(files[f"{name}.c"]) > LENGTH:
-        size = len(files[f"{name}.c"]) / 1e6
+    if casadi:
+        files |= _for_casadi(functions, name, libm, precision, written_by)
+    if (longest := max(map(len, files.values()))) > LENGTH:
+        size = longest / 1e6
         raise InputError(f"the source would take {size:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
+
+
+def _for_casadi(functions: Functions, name: str, libm: bool, precision: str, written_by: str) -> dict[str, str]:
+    if precision != "f64":
+        raise InputError("CasADi computes in double; export with precision f64")
+    with jax.enable_x64(True):
+        source, text = external.external_functions(name, functions, libm=libm, stack=STACK)
+    about = comment(external.ABOUT.format(name=name, written_by=written_by))
+    return {
+        f"{name}_casadi.c": about + _preamble(source, name) + text,
+        "CMakeLists.txt": cmake(name) + external.BUILD.format(name=name),
+    }
 
 
 class _Traced(NamedTuple):
