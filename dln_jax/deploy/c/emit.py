@@ -80,8 +80,8 @@ class Body:
     lines: list[str] = field(default_factory=list)
     operations: int = 0
     bytes: int = 0
-    called: int = 0
-    """Bytes of the largest function that it calls."""
+    calls: set[Any] = field(default_factory=set)
+    """Functions that it calls, by their keys in the source."""
     names: dict[Node, str] = field(default_factory=dict)
     """Arrays that nodes are kept in."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)
@@ -234,7 +234,7 @@ class Body:
             name = self.source.names.setdefault(text, f"part_{len(self.source.names)}")
             text = f"\nstatic void {name}{text}"
             self.source.parts[key] = Called(name, results, text, body.operations, body.bytes)
-        self.called = max(self.called, self.source.parts[key].bytes)
+        self.calls.add(key)
         return self.source.parts[key]
 
     def projected(self, loop: Node) -> set[int]:
@@ -482,5 +482,5 @@ def body_of(source: Source, program: Program, results: Sequence[Node], inputs, t
             body.line(f"return {body.read(node, np.array(0))};")
         else:
             copied(body, node, target)
-    body.bytes += body.called
+    body.bytes += max((source.parts[key].bytes for key in body.calls), default=0)
     return body

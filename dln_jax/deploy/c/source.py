@@ -37,6 +37,8 @@ STACK = 256 * 1024
 """Bytes of the stack that a function may take."""
 LENGTH = 10_000_000
 """Bytes of a source."""
+LINES = 2500
+"""Of a function, with those that it calls, up to which it is exported without being asked for."""
 
 
 class TooLargeError(InputError):
@@ -70,7 +72,8 @@ def export_c(
         precision: f32 or f64 of all real numbers; by default that of the examples.
         libm: call the C library's exp, tanh, sin, cos and log1p, in place of ones that vectorise.
         casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
-        leave_out_large: leave functions out that would be refused for their stack or length; the header names them.
+        leave_out_large: leave functions out that would be refused for their stack, or take more than 2,500 lines, which
+            compile for seconds each; the header names them.
         overwrite: replace files that exist.
 
     Raises:
@@ -105,22 +108,25 @@ def source_files(
         }
     repeated = repeated_calls([each.closed for each in every.values()])
     for key, each in every.items():
-        before = dict(source.tables)
+        tables, parts = dict(source.tables), dict(source.parts)
         try:
-            signature, text = _function(source, name, key, each, repeated)
+            signature, text, lines = _function(source, name, key, each, repeated)
+            if leave_out_large and lines > LINES:
+                raise TooLargeError(f"{key}, of {lines} lines")
         except TooLargeError as error:
             if not leave_out_large:
                 raise
             left_out.append(str(error))
-            source.tables = before
+            source.tables, source.parts = tables, parts
             continue
         signatures[key] = signature
         texts.append(text)
     version, real = importlib.metadata.version("dln-jax"), PRECISIONS[precision][1]
     written_by = f"Written by dln-jax {version}, C format {FORMAT}."
     files = {
-        f"{name}.h": _header(name, written_by, signatures, real),
-        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED) + _preamble(source, name)
+        f"{name}.h": _header(name, written_by, signatures, real, left_out),
+        f"{name}.c": comment(f"{name}.c", written_by, _NEEDED)
+        + _preamble(source, name)
         + "".join(dict.fromkeys(part.text for part in source.parts.values()))
         + "".join(texts),
         f"{name}_demo.c": demo(name, signatures, precision),
@@ -129,8 +135,7 @@ def source_files(
     if casadi:
         files |= _for_casadi(functions, name, libm, precision, written_by)
     if (longest := max(map(len, files.values()))) > LENGTH:
-        size = longest / 1e6
-        raise InputError(f"the source would take {size:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
+        raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
 
@@ -164,8 +169,8 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
         raise InputError(f"{key}: {error}") from error
 
 
-def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]) -> tuple[Signature, str]:
-    """Signature and C text of one function."""
+def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]) -> tuple[Signature, str, int]:
+    """Signature, C text and lines of one function, those of functions that it calls included."""
     signature = Signature(tuple(each.arguments), tuple(each.results))
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
@@ -181,7 +186,8 @@ def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapp
     unused = [f"    (void){leaf.name};" for leaf, node in zip(each.arguments, inputs, strict=True) if not body.uses(node)]
     lines = "\n".join([*unused, *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
-    return signature._replace(stack_bytes=body.bytes, operations=body.operations), text
+    total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
+    return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total
 
 
 def _at(leaf: Any, numpy_type: Any) -> np.ndarray:
@@ -202,6 +208,9 @@ def _preamble(source: Source, name: str) -> str:
     upper = suffix.upper()
     return (
         f'#include <math.h>\n\n#include "{name}.h"\n\ntypedef {real} real;\n\n'
+        "/* Passes of gcc that take as long as all others here, and find nothing */\n"
+        "#if defined(__GNUC__) && !defined(__clang__)\n"
+        '#pragma GCC optimize("no-gcse", "no-gcse-after-reload")\n#endif\n\n'
         f"/* Of two operations or of one, whichever the processor has */\n#ifdef FP_FAST_FMA{upper}\n"
         f"#define MULTIPLY_ADD(a, b, c) fma{suffix}(a, b, c)\n#else\n"
         f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
@@ -211,8 +220,11 @@ def _preamble(source: Source, name: str) -> str:
     )
 
 
-def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str) -> str:
-    about, guard = comment(f"{name}.h", written_by, _PROMISES), f"{name.upper()}_H"
+def _header(
+    name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]
+) -> str:
+    absent = "\n".join(f"Left out: {each}; ask for it by name." for each in left_out)
+    about, guard = comment(f"{name}.h", written_by, _PROMISES, *[absent] * bool(absent)), f"{name.upper()}_H"
     declared = ""
     for key, each in signatures.items():
         shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in each.results if leaf.shape)
