@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dln_jax import describe, dynamics, export_c, load_c
+from dln_jax import dynamics, export_c, load_c
 from dln_jax.datasets.generators import uniform
 from dln_jax.learning.linear import fit_linear
 from dln_jax.models.trigonometric import make_trigonometric
@@ -38,16 +38,18 @@ print(f"{fitted.parameter_count} parameters, rank {fitted.rank}, torque MSE {fit
 # %%
 # The C
 # -----
-# A header and a source that need `<math.h>` alone, a demo, and a CMake file. `load_c` compiles them with the compiler
-# at hand and calls them from Python; on a robot you compile them into your controller.
+# Any function of small arrays becomes a header and a source that need `<math.h>` alone, with a demo and a CMake file:
+# here the inverse model, and its derivative by the angles. `load_c` compiles them with the compiler at hand and calls
+# them from Python; on a robot you compile them into your controller.
 
+state = np.array([0.3, 1.2]), np.array([0.5, -1.0]), np.array([2.0, 0.1])
+inverse = dynamics(model.energies(fitted.parameters)).inverse_dynamics
 folder = Path(tempfile.mkdtemp()) / "c"
-description = describe("trigonometric", precision="f64", needs=scene.needs)
-files = export_c(description, fitted.parameters, folder)
+files = export_c({"inverse_dynamics": (inverse, state), "stiffness": (jax.jacfwd(inverse), state)}, folder)
 print("files:", ", ".join(path.name for path in files))
 arm = load_c(folder)
 
-state = np.array([0.3, 1.2]), np.array([0.5, -1.0]), np.array([2.0, 0.1])
+assert np.abs(arm.stiffness(*state) - jax.jacfwd(inverse)(*state)).max() < 1e-12
 exact = dynamics(scene.energies).inverse_dynamics(*state)
 assert np.abs(arm.inverse_dynamics(*state) - exact).max() < 1e-9
 

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from dln_jax.deploy.c.families import functions_of_system
 from dln_jax.deploy.c.load import FLAGS, load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.figures.benchmarks import call_times
@@ -74,8 +75,11 @@ def export(arm: Arm, folder: Path) -> None:
     description = describe("structured-delan", precision=arm.precision, needs=needs, width=arm.width, depth=2)
     random = np.random.default_rng(0)
     shapes = jax.eval_shape(build(description).init, jax.random.key(0))
-    parameters = jax.tree.map(lambda leaf: random.normal(size=leaf.shape) / np.sqrt(leaf.shape[0]), shapes)
-    export_c(description, parameters, folder, precision=arm.precision)
+    drawn = jax.tree.map(lambda leaf: random.normal(size=leaf.shape) / np.sqrt(leaf.shape[0]), shapes)
+    dtype = data_type(arm.precision)
+    energies = build(description).energies(jax.tree.map(lambda leaf: leaf.astype(dtype), drawn))
+    functions = functions_of_system(energies, arm.d, dtype=dtype)
+    export_c(functions, folder, precision=arm.precision, leave_out_large=True)
 
 
 def export_all(folder: Path) -> None:
