@@ -142,15 +142,15 @@ class Body:
         """C expression of the elements at positions, over loops with these variables."""
         if node.op == "arrange" and node not in self.plan.arrays:
             if is_constant(node):
-                return self.literal(values(node).ravel()[positions], node.dtype, names)
-            positions = np.asarray(node.value).ravel()[positions]
+                return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
+            positions = np.asarray(np.asarray(node.value).ravel()[positions])
             starts = np.cumsum([0, *(each.size for each in node.args)])
             owner = np.searchsorted(starts, positions, side="right") - 1
             first = int(owner.flat[0])
             assert (owner == first).all(), "a loop reads from several arrays"
-            return self.read(node.args[first], positions - starts[first], names)
+            return self.read(node.args[first], np.asarray(positions - starts[first]), names)
         if node.op == "const":
-            return self.literal(np.asarray(node.value).ravel()[positions], node.dtype, names)
+            return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
         name = self.name(node)
         if node.op == "input":
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"
@@ -341,7 +341,7 @@ class Body:
 def same(numbers: np.ndarray) -> np.ndarray:
     """Whether each is the first, NaN or not."""
     first = numbers.flat[0]
-    return (numbers == first) | ((numbers != numbers) & bool(first != first))
+    return np.asarray((numbers == first) | ((numbers != numbers) & bool(first != first)))
 
 
 def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
@@ -385,9 +385,9 @@ def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequ
     if not (own and node.op == "arrange"):
         return body.read(node, positions, names)
     starts = np.cumsum([0, *(each.size for each in node.args)])
-    inside = np.asarray(node.value).ravel()[positions]
+    inside = np.asarray(np.asarray(node.value).ravel()[positions])
     first = int(np.searchsorted(starts, inside.flat[0], side="right")) - 1
-    return body.read(node.args[first], inside - starts[first], names)
+    return body.read(node.args[first], np.asarray(inside - starts[first]), names)
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:

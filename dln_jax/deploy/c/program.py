@@ -111,7 +111,7 @@ class Program:
         array = np.asarray(value)
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
-    def arrange(self, sources: Sequence[Node], positions: np.ndarray) -> Node:
+    def arrange(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
         """Elements of the sources, laid end to end, at the positions [shape]."""
         inner, flat, start = [], [], 0
         for source in sources:
@@ -120,7 +120,7 @@ class Program:
             inner += parts
             flat.append(within + start)
             start += sum(part.size for part in parts)
-        positions = np.concatenate(flat)[np.asarray(positions, np.int64)]
+        positions = np.asarray(np.concatenate(flat)[np.asarray(positions, np.int64)])
         inner, positions = _without_unused(inner, positions)
         if not inner or positions.size == 0:
             dtype = sources[0].dtype
@@ -269,4 +269,4 @@ def _without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[No
             kept[source] = start
             start += source.size
         moved[index] = kept[source] - starts[index]
-    return list(kept), positions + moved[owner]
+    return list(kept), np.asarray(positions + moved[owner])

@@ -120,9 +120,9 @@ def _function(
             f"{name} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
     used = {inputs[k].number for k in range(len(inputs))} & {node.number for node in body.plan.needed}
-    unused = [
-        f"    (void){leaf.name};" for leaf, node in zip(arguments, inputs, strict=True) if node.number not in used
-    ]
+    unread = [leaf for leaf, node in zip(arguments, inputs, strict=True) if node.number not in used or node.size == 0]
+    unread += [leaf for leaf in signature.results if 0 in leaf.shape]
+    unused = [f"    (void){leaf.name};" for leaf in unread]
     key = name.partition("_")[2]
     head = declaration(name.partition("_")[0], key, signature, "real")
     text = "\n" + head + "\n{\n" + "\n".join([*unused, *body.lines]) + "\n}\n"
