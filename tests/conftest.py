@@ -36,6 +36,7 @@ if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at wh
 
 def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
+    parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
 
 
 def pytest_configure(config):

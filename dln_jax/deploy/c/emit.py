@@ -168,7 +168,7 @@ class Body:
             assert (owner == first).all(), "a loop reads from several arrays"
             return self.read(node.args[first], np.asarray(positions - starts[first]), names)
         if node.op == "const":
-            return self.literal(np.asarray(np.asarray(node.value).ravel()[positions]), node.dtype, names)
+            return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
         name = self.name(node)
         if node.op == "input":
             return name if self.inputs[node.attribute][1] else f"{name}[{self.index(positions, names)}]"

@@ -7,9 +7,8 @@ import numpy as np
 from dln_jax.deploy.c.primitives import convert
 from dln_jax.deploy.c.program import Node, Program, is_constant, values
 
-_UPDATES = {"scatter": "put_set", "scatter-add": "put_add", "scatter_add": "put_add", "scatter-mul": "put_mul"}
-_UPDATES |= {"scatter_mul": "put_mul", "scatter_min": "put_min", "scatter_max": "put_max"}
-_ELEMENTWISE = {"put_add": "add", "put_mul": "mul", "put_min": "min", "put_max": "max"}
+_ELEMENTWISE = {f"put_{name}": name for name in ("add", "sub", "mul", "min", "max")}
+_UPDATES = {"scatter": "put_set", **{f"scatter-{name}": op for op, name in _ELEMENTWISE.items()}}
 
 
 def gather(program: Program, parameters: dict[str, Any], operand: Node, indices: Node) -> Node:
@@ -31,7 +30,7 @@ def gather(program: Program, parameters: dict[str, Any], operand: Node, indices:
     def placed(array: np.ndarray) -> np.ndarray:
         return np.broadcast_to(array, (*batch, *window)).transpose(order)
 
-    each = np.arange(int(np.prod(batch, dtype=int))).reshape(*batch, *[1] * len(window))
+    each = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
     positions = program.elementwise(
         "add", program.arrange([start], placed(each)), program.constant(placed(offsets), "long")
     )
@@ -60,7 +59,7 @@ def scatter(name: str):
         )  # fmt: skip
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         arranged = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
-        each = np.arange(start.size).reshape(*start.shape, *[1] * len(window))
+        each = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
         shape = arranged.shape
         offsets = program.constant(np.broadcast_to(_offsets(operand.shape, kept, window), shape), "long")
         targets = program.elementwise("add", program.arrange([start], np.broadcast_to(each, shape)), offsets)
@@ -157,7 +156,7 @@ def _plus(program: Program, flat: Node, start: Node, stride: int) -> Node:
     return program.elementwise("add", flat, program.elementwise("mul", start, program.constant(stride, "long")))
 
 
-def _stride(shape, axis: int) -> int:
+def _stride(shape, axis: int | np.integer) -> int:
     return int(np.prod(shape[axis + 1 :], dtype=np.int64))
 
 

@@ -87,15 +87,20 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
     """The prototype of a function, without its semicolon."""
     kinds = {**KINDS, "real": real}
     parameters = [
-        f"{kinds[kind]} {each}" if shape == () else f"const {kinds[kind]} {each}[{int(np.prod(shape))}]"
+        f"{kinds[kind]} {each}" if shape == () else f"const {kinds[kind]} {each}[{_length(shape)}]"
         for each, kind, shape in signature.arguments
     ]
     result = "void"
     if signature.returns:
         result = str(kinds[signature.results[0].kind])
     else:
-        parameters += [f"{kinds[kind]} {each}[{int(np.prod(shape))}]" for each, kind, shape in signature.results]
+        parameters += [f"{kinds[kind]} {each}[{_length(shape)}]" for each, kind, shape in signature.results]
     return f"{result} {name}_{function}({', '.join(parameters) or 'void'})"
+
+
+def _length(shape: tuple[int, ...]) -> int:
+    """Of an array in C, which has no empty ones."""
+    return max(int(np.prod(shape)), 1)
 
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:

@@ -14,13 +14,15 @@ _REDUCE = {
     "reduce_and": ("{0} & {1}", 0),
     "reduce_or": ("{0} | {1}", 0),
 }
-_PUT = {"put_set": "{1}", "put_add": "{0} + {1}", "put_mul": "{0} * {1}"}
+_OF_INTEGERS = {"reduce_max": "({0} > {1} ? {0} : {1})", "reduce_min": "({0} < {1} ? {0} : {1})"}
+_PUT = {"put_set": "{1}", "put_add": "{0} + {1}", "put_sub": "{0} - {1}", "put_mul": "{0} * {1}"}
 _PUT |= {f"put_{name}": _REDUCE[f"reduce_{name}"][0] for name in ("min", "max")}
 FUNCTIONS = {
     "cholesky": """
-    /* Lower triangular l with l l^T = a [n, n]; not a number where a is not positive definite */
+    /* Lower triangular l with l l^T = a [n, n]; all NaN where a is not positive definite */
     static void cholesky(int n, const real *a, real *l)
     {
+        int definite = 1; /* a NaN reaches what depends on it */
         for (int i = 0; i < n; ++i)
             for (int j = 0; j < n; ++j) {
                 real rest = a[i * n + j];
@@ -30,7 +32,9 @@ FUNCTIONS = {
                 }
                 for (int k = 0; k < j; ++k) rest -= l[i * n + k] * l[j * n + k];
                 l[i * n + j] = i == j ? SQRT(rest) : rest / l[j * n + j];
+                definite &= i != j || !(rest <= 0);
             }
+        for (int i = 0; !definite && i < n * n; ++i) l[i] = (real)NAN;
     }
     """,
     "triangular_solve": """
@@ -85,9 +89,15 @@ def definitions(names: set[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
+def _pattern(node: Node) -> tuple[str, int]:
+    """C of two terms of a reduction, and what it costs; integers are never NaN, as compilers know."""
+    pattern, cost = _REDUCE[node.op]
+    return (pattern, cost) if node.dtype == "real" else (_OF_INTEGERS.get(node.op, pattern), cost)
+
+
 def combined(body, node: Node, k: int, terms: list[str]) -> str:
     """A reduction of few terms, written out."""
-    pattern, cost = _REDUCE[node.op]
+    pattern, cost = _pattern(node)
     body.spend(cost * (len(terms) - 1))
     text = terms[0]
     for place, term in enumerate(terms[1:]):
@@ -116,7 +126,7 @@ def _kept(body, node: Node) -> str:
 def _reduction(body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
-    pattern, cost = _REDUCE[node.op]
+    pattern, cost = _pattern(node)
     body.spend(cost * rows * (count - 1))
     at, scalar = np.arange(a.size).reshape(a.shape), node not in body.plan.arrays
     name = _kept(body, node)
@@ -129,7 +139,9 @@ def _reduction(body, node: Node) -> None:
         text = body.read(a, at, ["r_", "(k_ + c_)"])
         body.line(f"for (int k_ = 0; k_ < {whole}; k_ += {parts})")
         body.line(f"    for (int c_ = 0; c_ < {parts}; ++c_) part_[c_] += {text};")
-        body.line("real sum_ = (part_[0] + part_[4]) + (part_[1] + part_[5]) + ((part_[2] + part_[6]) + (part_[3] + part_[7]));")
+        body.line(
+            "real sum_ = (part_[0] + part_[4]) + (part_[1] + part_[5]) + ((part_[2] + part_[6]) + (part_[3] + part_[7]));"
+        )
         if whole < count:
             body.line(f"for (int k_ = {whole}; k_ < {count}; ++k_) sum_ += {body.read(a, at, ['r_', 'k_'])};")
     else:
@@ -154,7 +166,8 @@ def _arg(body, node: Node) -> None:
     body.opened(f"for (int k_ = 1; k_ < {count}; ++k_)")
     body.line(f"const {kind} x_ = {body.read(a, at, ['r_', 'k_'])};")
     symbol = ">" if node.op == "argmax" else "<"
-    body.opened(f"if ((x_ {symbol} best_ || x_ != x_) && best_ == best_)")
+    unordered = a.dtype == "real"  # where the first NaN is the one
+    body.opened(f"if ((x_ {symbol} best_ || x_ != x_) && best_ == best_)" if unordered else f"if (x_ {symbol} best_)")
     body.line("best_ = x_;")
     body.line("chosen_ = k_;")
     body.closed()
@@ -173,7 +186,9 @@ def _put(body, node: Node) -> None:
     body.line(f"const long long target_ = {body.read(targets, index, ['k_'])};")
     body.line(f"const {body.c_type(node.dtype)} update_ = {body.read(updates, index, ['k_'])};")
     at = f"{name}[target_]"
-    body.line(f"if (target_ >= 0) {at} = {_PUT[node.op].format(at, 'update_')};")
+    extreme = node.op.replace("put", "reduce") if node.dtype != "real" else ""
+    pattern = _OF_INTEGERS.get(extreme, _PUT[node.op])
+    body.line(f"if (target_ >= 0) {at} = {pattern.format(at, 'update_')};")
     body.closed()
 
 
@@ -217,11 +232,15 @@ def _call(body, node: Node) -> None:
     body.spend(part.operations)
 
 
-def _stored(body, prefix: str, nodes: list[Node]) -> list[str]:
-    """Declares what control flow hands on."""
-    names = [f"{prefix}_{index}" for index in range(len(nodes))]
-    for name, node in zip(names, nodes, strict=True):
-        body.declared(name, node.dtype, max(node.size, 1))
+def _stored(body, node: Node, handed_on: list[Node], turns: list[int] | None = None) -> list[str]:
+    """Declares what control flow hands on, and each of its turns leaves, whether it is read or not."""
+    number = np.ravel(node.attribute)[0]
+    read = body.projected(node)
+    names = [f"c{number}_{index}" for index in range(len(handed_on))]
+    for name, each, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
+        body.declared(name, each.dtype, max(each.size * count, 1))
+    for name in (name for index, name in enumerate(names) if index not in read):
+        body.line(f"(void){name};")
     return names
 
 
@@ -238,7 +257,7 @@ def _handed_on(body, loop: Loop, names: list[str], number: int) -> None:
 
 def _while(body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
-    names = _stored(body, f"c{number}", loop.carries)
+    names = _stored(body, node, loop.carries)
     for name, start in zip(names, node.args, strict=True):
         body.copied(start, name)
     region = (*node.region, number)
@@ -254,14 +273,13 @@ def _while(body, node: Node) -> None:
 def _repeat(body, node: Node) -> None:
     number, loop = node.attribute, body.program.loops[node.attribute]
     length, carried = int(loop.length or 0), len(loop.carries)
-    names = _stored(body, f"c{number}", loop.carries)
+    stacked = loop.results[carried:]
+    names = _stored(body, node, [*loop.carries, *stacked], [1] * carried + [length] * len(stacked))[:carried]
     for name, start in zip(names, node.args, strict=True):
         body.copied(start, name)
     read = body.projected(node)
     stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
-    for index, each in stacked.items():
-        body.declared(f"c{number}_{index}", each.dtype, max(each.size * length, 1))
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
     if stacked or any(each.op == "counter" and each.attribute == number for each in body.plan.needed):
         body.line(f"const long long i_{number} = {turn};")
@@ -279,8 +297,7 @@ def _repeat(body, node: Node) -> None:
 
 def _branch(body, node: Node) -> None:
     numbers = node.attribute
-    first = body.program.loops[numbers[0]].results
-    names = _stored(body, f"c{numbers[0]}", first)
+    names = _stored(body, node, body.program.loops[numbers[0]].results)
     which = body.read(node.args[0], np.array(0))
     for place, number in enumerate(numbers):
         last = place == len(numbers) - 1

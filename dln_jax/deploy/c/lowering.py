@@ -124,7 +124,7 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
         except InputError as error:
             text = str(error)
-            where = "" if " (made at " in text else f" (made at {_line(equation)})"
+            where = "" if " (made at " in text else _line(equation)
             raise InputError(text + where) from error
         known.update(zip(equation.outvars, results, strict=True))
     return [read(variable) for variable in jaxpr.outvars]
@@ -182,11 +182,11 @@ def _closed(jaxpr: Any) -> Any:
 
 
 def _line(equation: Any) -> str:
-    """File and line of the user's code that made an equation."""
+    """File and line of the user's code that made an equation, nothing where the call around it knows."""
     traceback = equation.source_info.traceback
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/deploy/" not in frame.file_name]
-    return f"{users[0].file_name}:{users[0].line_num}" if users else "an unknown line"
+    return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
 
 
 def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -233,6 +233,9 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     constants, count = parameters["num_consts"], parameters["num_carry"]
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
     length, reverse = parameters["length"], parameters["reverse"]
+    if length == 0:
+        left = parameters["jaxpr"].out_avals[count:]
+        return [*start, *(program.constant(np.zeros((0, *each.shape)), kind_of(each.dtype)) for each in left)]
     outer, number = _region(program, args)
     carries = _carries(program, number, outer, start)
     turn = program.make("counter", (), "long", attribute=number, region=(*outer, number))
@@ -270,4 +273,11 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
 
 
-_CONTROL = {"while": _while, "scan": _scan, "cond": _cond, "custom_linear_solve": _custom_linear_solve}
+def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
+    """Which branch is that of a processor: the one for all others, where none is its own."""
+    places = [k for k, each in enumerate(parameters["platforms"]) if each is None or "cpu" in each]
+    return [program.constant(np.int32(places[0]), "int")]
+
+
+_CONTROL = {"platform_index": _platform, "while": _while, "scan": _scan, "cond": _cond}
+_CONTROL["custom_linear_solve"] = _custom_linear_solve

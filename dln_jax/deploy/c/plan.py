@@ -57,7 +57,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
         elif node.op == "arrange":
             arrays.add(node)
             (written_out if node.size <= WRITTEN_OUT else followed).add(node)
-        elif node.size > 1 and (looped or node in whole or node not in written_out):
+        elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
     root = _fused(nodes, readers, whole, written_out, arrays)
@@ -140,6 +140,11 @@ def _is_written_out(node: Node) -> bool:
         return True
     scattered = any(each.op == "arrange" and not is_direct(each) for each in node.args)
     return node.size <= WRITTEN_OUT and scattered and node.op not in TRANSCENDENTAL
+
+
+def _is_scalar(node: Node) -> bool:
+    """Whether what computes it can leave it without memory."""
+    return node.size == 1 and node.op not in ("contract", "cholesky", "triangular_solve") and node.op[:4] != "put_"
 
 
 def _is_product(node: Node, written_out: set[Node]) -> bool:

@@ -123,7 +123,7 @@ class Program:
         array = np.asarray(value)
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
-    def arrange(self, sources: Sequence[Node], positions: np.ndarray) -> Node:
+    def arrange(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
         """Elements of the sources, laid end to end, at the positions [shape]."""
         inner, flat, start = [], [], 0
         for source in sources:

@@ -183,8 +183,9 @@ def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapp
         raise TooLargeError(
             f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
-    unused = [f"    (void){leaf.name};" for leaf, node in zip(each.arguments, inputs, strict=True) if not body.uses(node)]
-    lines = "\n".join([*unused, *body.lines])
+    unread = [leaf for leaf, node in zip(each.arguments, inputs, strict=True) if not body.uses(node) or node.size == 0]
+    unread += [leaf for leaf in signature.results if 0 in leaf.shape]
+    lines = "\n".join([*(f"    (void){leaf.name};" for leaf in unread), *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total
