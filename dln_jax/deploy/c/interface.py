@@ -69,7 +69,7 @@ def _leaves(name: str, tree: Any) -> list[Leaf]:
         whole = "_".join(part for part in (name, *parts) if part)
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
-        found.append(Leaf(whole, kind_of(array.dtype), tuple(map(int, array.shape))))
+        found.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
     return found
 
 
