@@ -185,7 +185,7 @@ def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
 
 def _reduction(name: str, op: str, start: Any) -> Rule:
     def rule(program: Program, parameters, node: Node) -> Node:
-        axes = tuple(parameters["axes"])
+        axes = tuple(map(int, parameters["axes"]))
         shape = [size for axis, size in enumerate(node.shape) if axis not in axes]
         if node.size == 0:
             return program.broadcast(program.constant(start, node.dtype), shape)
@@ -202,7 +202,7 @@ def _reduction(name: str, op: str, start: Any) -> Rule:
 
 def _arg(name: str) -> Rule:
     def rule(program: Program, parameters, node: Node, *, dtype: str) -> Node:
-        (axis,) = parameters["axes"]
+        (axis,) = map(int, parameters["axes"])
         shape = node.shape[:axis] + node.shape[axis + 1 :]
         rows = rows_of(program, node, (axis,))
         return program.reshape(program.make(name, rows.shape[:1], dtype, [rows]), shape)
