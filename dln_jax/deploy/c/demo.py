@@ -13,23 +13,23 @@ _START = """#include <stdio.h>
 #include "{name}.h"
 
 /* Uniform in [-1, 1), the same on every machine */
-static unsigned long seed = 1;
+static unsigned long seed_ = 1;
 
-static {real} uniform(void)
+static {real} uniform_(void)
 {{
-    seed = (1103515245UL * seed + 12345UL) & 0x7fffffffUL;
-    return ({real})seed / ({real})0x40000000UL - 1;
+    seed_ = (1103515245UL * seed_ + 12345UL) & 0x7fffffffUL;
+    return ({real})seed_ / ({real})0x40000000UL - 1;
 }}
 
-int main(int arguments, char **argument)
+int main(int arguments_, char **argument_)
 {{
-    const long calls = arguments > 1 ? atol(argument[1]) : 0;
+    const long calls_ = arguments_ > 1 ? atol(argument_[1]) : 0;
 """
-_TIMED = """        if (calls > 0) {{
-            const clock_t start = clock();
-            for (long k = 0; k < calls; ++k) {{ {moved}{call}; }}
-            const double seconds = (double)(clock() - start) / CLOCKS_PER_SEC;
-            printf("{function}: %.0f calls/s, %.3f us each\\n", (double)calls / seconds, 1e6 * seconds / (double)calls);
+_TIMED = """        if (calls_ > 0) {{
+            const clock_t start_ = clock();
+            for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
+            const double seconds_ = (double)(clock() - start_) / CLOCKS_PER_SEC;
+            printf("{function}: %.0f calls/s, %.3f us each\\n", (double)calls_ / seconds_, 1e6 * seconds_ / (double)calls_);
         }}
 """
 
@@ -52,12 +52,14 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
             f"        static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];\n" for leaf in leaves
         )
         for leaf in each.arguments:
-            value = "uniform()" if leaf.kind == "real" else "0"
-            text += f"        for (int i = 0; i < {prod(leaf.shape)}; ++i) {leaf.name}[i] = {value};\n"
+            value = "uniform_()" if leaf.kind == "real" else "0"
+            text += f"        for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};\n"
         text += f"        {call};\n"
         for leaf in each.results:
             text += f'        printf("{key} {leaf.name}:");\n'
-            text += f'        for (int i = 0; i < {prod(leaf.shape)}; ++i) printf(" %.9g", (double){leaf.name}[i]);\n'
+            text += (
+                f'        for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) printf(" %.9g", (double){leaf.name}[i_]);\n'
+            )
             text += '        printf("\\n");\n'
         # Each call's state is another, so that none is left out.
         first = next((leaf.name for leaf in each.arguments if leaf.kind == "real"), None)

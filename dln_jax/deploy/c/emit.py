@@ -15,7 +15,7 @@ from dln_jax.deploy.c import kernels, products
 from dln_jax.deploy.c.operations import OPERATIONS, VECTORISED
 from dln_jax.deploy.c.plan import WRITTEN_OUT, Plan, plan_of, strides
 from dln_jax.deploy.c.program import Node, Program, Region, is_constant, values
-from dln_jax.deploy.c.text import literal
+from dln_jax.deploy.c.text import integer, literal
 
 C_TYPES = {"real": "real", "bool": "int", "int": "int", "long": "long long", "unsigned": "unsigned"}
 C_TYPES |= {"unsigned_long": "unsigned long long"}
@@ -202,7 +202,7 @@ class Body:
         """A literal."""
         if dtype == "real":
             return literal(value, self.source.precision)
-        text = str(int(value)) if value >= 0 else f"({int(value)})"
+        text = integer(int(value)) if value >= 0 else f"({integer(int(value))})"
         return text + {"unsigned": "U", "unsigned_long": "ULL"}.get(dtype, "")
 
     def pointer(self, node: Node) -> str:

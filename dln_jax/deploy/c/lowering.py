@@ -11,10 +11,10 @@ from dln_jax.deploy.c import indexing, linear_algebra, primitives
 from dln_jax.deploy.c.program import Loop, Node, Part, Program, is_constant, values
 from dln_jax.types import InputError
 
-_KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int8": "int", "int16": "int", "int32": "int"}
+_KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int32": "int"}
 # The type of what has no derivative: nothing is computed with it.
 _KINDS |= {str(jax.dtypes.float0): "bool"}
-_KINDS |= {"int64": "long", "uint8": "unsigned", "uint16": "unsigned", "uint32": "unsigned", "uint64": "unsigned_long"}
+_KINDS |= {"int64": "long", "uint32": "unsigned", "uint64": "unsigned_long"}
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
     "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
@@ -101,7 +101,7 @@ def _jaxprs(value: Any) -> list[Any]:
 def kind_of(dtype: Any) -> str:
     """What a type is in a program; InputError for one that has no C."""
     if str(dtype) not in _KINDS:
-        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to float32 or float64"
+        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
         raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
     return _KINDS[str(dtype)]
 

@@ -202,7 +202,7 @@ def _reduction(name: str, op: str, start: Any) -> Rule:
 
 def _arg(name: str) -> Rule:
     def rule(program: Program, parameters, node: Node, *, dtype: str) -> Node:
-        axis = int(parameters["axes"][0])
+        (axis,) = map(int, parameters["axes"])
         shape = node.shape[:axis] + node.shape[axis + 1 :]
         rows = rows_of(program, node, (axis,))
         return program.reshape(program.make(name, rows.shape[:1], dtype, [rows]), shape)

@@ -26,7 +26,7 @@ from dln_jax.deploy.c.interface import (
     description,
     result_leaves,
 )
-from dln_jax.deploy.c.lowering import program_of, repeated_calls, traced
+from dln_jax.deploy.c.lowering import kind_of, program_of, repeated_calls, traced
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
 from dln_jax.types import InputError
@@ -160,8 +160,8 @@ class _Traced(NamedTuple):
 
 def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], precision: str) -> _Traced:
     numpy_type = PRECISIONS[precision][0]
-    examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
     try:
+        examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
         arguments = argument_leaves(function, examples)
         closed, shapes = traced(function, examples)
         return _Traced(arguments, result_leaves(shapes, arguments), closed)
@@ -192,13 +192,16 @@ def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapp
 
 
 def _at(leaf: Any, numpy_type: Any) -> np.ndarray:
-    array = np.asarray(leaf)
-    return array.astype(numpy_type) if array.dtype.kind == "f" else array
+    return np.asarray(leaf, numpy_type if kind_of(_type(leaf)) == "real" else None)
+
+
+def _type(leaf: Any) -> Any:
+    return leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
 
 
 def _precision(functions: Functions) -> str:
     leaves = jax.tree.leaves([examples for _, examples in functions.values()])
-    sizes = {np.asarray(leaf).dtype.itemsize for leaf in leaves if np.asarray(leaf).dtype.kind == "f"}
+    sizes = {_type(leaf).itemsize for leaf in leaves if jax.numpy.issubdtype(_type(leaf), np.floating)}
     return "f64" if max(sizes, default=8) == 8 else "f32"
 
 

@@ -27,8 +27,8 @@ _RESERVED = frozenset(
         namespace new noexcept not nullptr operator or private protected public register restrict return short signed
         sizeof static struct switch template this thread_local throw true try typedef typeid typename union unsigned
         using virtual void volatile while xor
-        abort abs assert complex ctype div errno exit fenv free gamma index inttypes iso646 j0 j1 jn limits locale main
-        malloc math printf rand real setjmp signal stdarg stdbool stddef stdint stdio stdlib string tgmath time wchar
+        abort abs assert atol bufsiz clock complex ctype div eof errno exit fenv free gamma index infinity inttypes iso646 j0 j1 jn limits locale main
+        malloc math null printf rand real setjmp signal stdarg stdbool stddef stdint stdio stdlib string tgmath time wchar
         wctype y0 y1 yn all clean demo install test cholesky lu triangular_solve
         """
         + _FUNCTIONS
@@ -78,9 +78,14 @@ def table(name: str, array: np.ndarray, precision: str) -> str:
     """A constant array."""
     real = array.dtype.kind == "f"
     kind = "real" if real else "int" if array.dtype.itemsize <= 4 or array.dtype == bool else "long long"
-    texts = (number(each, precision) if real else str(int(each)) for each in array.ravel())
+    texts = (number(each, precision) if real else integer(int(each)) for each in array.ravel())
     lines = "\n".join(_wrapper.wrap(" ".join(f"{each}," for each in texts)))
     return f"static const {kind} {name}[{array.size}] = {{\n{lines}\n}};\n"
+
+
+def integer(value: int) -> str:
+    """A literal; C has none for the least number of 64 bits."""
+    return str(value) if value > -(2**63) else f"{value + 1} - 1"
 
 
 def comment(*paragraphs: str) -> str:
