@@ -172,7 +172,7 @@ def differences(got, expected):
             finite = np.isfinite(theirs)
             assert finite[:STATES].mean() > 0.99
             # Of what cancels exactly, round-off is left.
-            scale = np.abs(theirs[:STATES][finite[:STATES]]).max(initial=0.01)
+            scale = np.abs(theirs[:STATES][finite[:STATES]]).max(initial=0.1)
             apart = np.abs(ours - theirs)[finite] / np.maximum(scale, np.abs(theirs[finite]))
             # NaN where C is not finite, and JAX is.
             worst[name, place] = apart.max(initial=0), np.argwhere(np.isfinite(ours) & ~finite)[:, 0]

@@ -73,10 +73,40 @@ def root(x):
 UNARY = {
     **{
         name: getattr(jnp, name)
-        for name in (
-            "abs negative exp exp2 expm1 log log1p sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh "
-            "arctanh sqrt cbrt floor ceil round trunc sign square isfinite isnan isinf logical_not reciprocal"
-        ).split()
+        for name in [
+            "abs",
+            "negative",
+            "exp",
+            "exp2",
+            "expm1",
+            "log",
+            "log1p",
+            "sin",
+            "cos",
+            "tan",
+            "arcsin",
+            "arccos",
+            "arctan",
+            "sinh",
+            "cosh",
+            "tanh",
+            "arcsinh",
+            "arccosh",
+            "arctanh",
+            "sqrt",
+            "cbrt",
+            "floor",
+            "ceil",
+            "round",
+            "trunc",
+            "sign",
+            "square",
+            "isfinite",
+            "isnan",
+            "isinf",
+            "logical_not",
+            "reciprocal",
+        ]
     },
     **{name: getattr(lax, name) for name in ("rsqrt", "logistic", "erf", "erfc", "lgamma")},
     **{name: getattr(jax.nn, name) for name in ("softplus", "silu", "gelu", "relu", "elu")},
@@ -146,6 +176,13 @@ MOVES = {
         *(lax.cummax(x, 1), lax.cummin(x, 0, reverse=True), lax.cummax(x, 0, reverse=True), lax.cummin(x, 1)),
     ),
     "gradients": lambda x: jax.grad(lambda x: jnp.sum(jnp.sin(x[::2]) ** 2) * x[0, 0])(x),
+    "sort": lambda x: (
+        jnp.sort(x[0]),
+        jnp.argsort(x[1]),
+        jnp.argsort(x[0] > 0),
+        jnp.median(x[2]),
+        x[0, jnp.argsort(x[3])],
+    ),
     "gradient_of_max": lambda x: jax.grad(lambda x: x.max() * jnp.prod(x.min(1)))(x),
     "hessian": lambda x: jax.hessian(lambda x: jnp.prod(jnp.cos(x)) + x @ x)(x[0]),
 }
@@ -251,6 +288,7 @@ FACTORED = {
     "gradients_of_factors": lambda a, b: jax.grad(
         lambda a: jnp.sum(jnp.linalg.cholesky(definite(a))) + jnp.sum(scipy_linalg.solve(definite(a), b, assume_a="pos"))
     )(a),
+    "gradient_of_solve": lambda a, b: jax.grad(lambda a: jnp.sum(jnp.linalg.solve(a, b)) + jnp.linalg.det(a))(a),
     "tangent_of_solve": lambda a, b: jax.jvp(jnp.linalg.solve, (a, b), (a.T, 2 * b))[1],
     "cholesky_of_any": lambda a, b: jnp.linalg.cholesky(a + a.T),
     "custom_linear_solve": lambda a, b: (matrix_free(a, b[:, 0]), jax.jacobian(matrix_free, 1)(a, b[:, 0])),
