@@ -268,7 +268,7 @@ def test_no_field_of_a_description_is_believed(exported, tmp_path):
             load_c(tmp_path)
         # The same with digests that fit.
         (tmp_path / "model.json").write_bytes(described({**facts, key: value}, files))
-        with pytest.raises(InputError, match="contradicts itself|C format") as caught:
+        with pytest.raises(InputError, match=r"contradicts itself|C format") as caught:
             load_c(tmp_path)
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="expected a C name"):
