@@ -117,7 +117,7 @@ def dynamic_update_slice(program: Program, _, operand: Node, update: Node, *star
 
 
 def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
-    """`lax.sort` of a short vector, as solving with a matrix does of its permutation: each element moves to its rank."""
+    """`lax.sort` of a short vector, as solving does of a permutation: each element moves to its rank."""
     key, n = nodes[0], nodes[0].size
     if key.shape != (n,) or n > SORTED or parameters["num_keys"] != 1:
         raise InputError(f"the primitive 'sort' has C for one vector of up to {SORTED} numbers; this is {key.shape}")

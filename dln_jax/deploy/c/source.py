@@ -5,6 +5,7 @@ library but <math.h>. The same functions, name and precision give the same files
 """
 
 import importlib.metadata
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,7 @@ def _function(
     try:
         examples = jax.tree.map(lambda leaf: _at(leaf, numpy_type), tuple(examples))
         arguments = argument_leaves(function, examples)
-        program, inputs, results, shapes = program_of(function, examples)
+        program, _, results, shapes = program_of(function, examples)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     signature = Signature(tuple(arguments), tuple(result_leaves(shapes, arguments)))
@@ -119,10 +120,9 @@ def _function(
         raise InputError(
             f"{name} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
-    used = {inputs[k].number for k in range(len(inputs))} & {node.number for node in body.plan.needed}
-    unread = [leaf for leaf, node in zip(arguments, inputs, strict=True) if node.number not in used or node.size == 0]
-    unread += [leaf for leaf in signature.results if 0 in leaf.shape]
-    unused = [f"    (void){leaf.name};" for leaf in unread]
+    words = set(re.findall(r"\w+", "\n".join(body.lines)))
+    leaves = [*signature.arguments, *(() if signature.returns else signature.results)]
+    unused = [f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words]
     key = name.partition("_")[2]
     head = declaration(name.partition("_")[0], key, signature, "real")
     text = "\n" + head + "\n{\n" + "\n".join([*unused, *body.lines]) + "\n}\n"
