@@ -67,7 +67,15 @@ LONGEST = (
         "test_train_diffnet",
         "test_readme",
     ),
-    *("test_minimise", "test_soft_steps", "test_soft_energies", "test_simulate", "test_export_c", "test_delan"),
+    *(
+        "test_minimise",
+        "test_soft_steps",
+        "test_soft_energies",
+        "test_simulate",
+        "test_agreement",
+        "test_families",
+        "test_delan",
+    ),
     "test_arm_table",
     *("test_mechanics", "test_n_body"),
 )

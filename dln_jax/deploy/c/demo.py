@@ -29,7 +29,8 @@ _TIMED = """        if (calls_ > 0) {{
             const clock_t start_ = clock();
             for (long k_ = 0; k_ < calls_; ++k_) {{ {moved}{call}; }}
             const double seconds_ = (double)(clock() - start_) / CLOCKS_PER_SEC;
-            printf("{function}: %.0f calls/s, %.3f us each\\n", (double)calls_ / seconds_, 1e6 * seconds_ / (double)calls_);
+            const double each_ = seconds_ / (double)calls_;
+            printf("{function}: %.0f calls/s, %.3f us each\\n", 1 / each_, 1e6 * each_);
         }}
 """
 

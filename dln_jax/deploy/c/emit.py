@@ -64,6 +64,7 @@ class Source:
         array = np.ascontiguousarray(numbers)
         if dtype == "real":
             array = array.astype(np.float32 if self.precision == "f32" else np.float64)
+        array = array.astype(np.int32) if dtype == "int" else array
         key = dtype, array.tobytes() + str(array.size).encode()
         return self.tables.setdefault(key, (f"table_{len(self.tables)}", array))[0]
 

@@ -4,9 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.deploy.c.primitives import RULES as REDUCE
 from dln_jax.deploy.c.primitives import convert
 from dln_jax.deploy.c.program import Node, Program, is_constant, values
+from dln_jax.types import InputError
 
+SORTED = 64
+"""Numbers of a vector that is sorted by counting."""
 _ELEMENTWISE = {f"put_{name}": name for name in ("add", "sub", "mul", "min", "max")}
 _UPDATES = {"scatter": "put_set", **{f"scatter-{name}": op for op, name in _ELEMENTWISE.items()}}
 
@@ -112,6 +116,30 @@ def dynamic_update_slice(program: Program, _, operand: Node, update: Node, *star
     return put(program, "put_set", operand, _window(program, operand.shape, update.shape, starts), update)
 
 
+def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
+    """`lax.sort` of a short vector, as solving does of a permutation: each element moves to its rank."""
+    key, n = nodes[0], nodes[0].size
+    if key.shape != (n,) or n > SORTED or parameters["num_keys"] != 1:
+        raise InputError(f"the primitive 'sort' has C for one vector of up to {SORTED} numbers; this is {key.shape}")
+    if n < 2:
+        return list(nodes)
+    index = np.broadcast_to(np.arange(n), (n, n))
+    own, other = program.arrange([key], index.T), program.arrange([key], index)
+
+    def before(first: Node, second: Node) -> Node:
+        less = program.elementwise("lt", first, second)
+        if key.dtype != "real":
+            return less
+        numbers = program.elementwise("eq", first, first), program.elementwise("ne", second, second)
+        return program.elementwise("or", less, program.elementwise("and", *numbers))  # NaN comes last
+
+    tied = program.elementwise("not", program.elementwise("or", before(own, other), before(other, own)))
+    earlier = program.elementwise("and", tied, program.constant(index < index.T, "bool"))
+    counted = convert(program, program.elementwise("or", before(other, own), earlier), "int")
+    rank = REDUCE["reduce_sum"](program, {"axes": (1,)}, counted)
+    return [put(program, "put_set", program.constant(np.zeros(n, np.int64), each.dtype), rank, each) for each in nodes]
+
+
 def _window(program: Program, shape, sizes, starts) -> Node:
     """Flat positions of a window whose corner is clamped into the operand."""
     flat = program.constant(0, "long")
@@ -173,6 +201,7 @@ RULES = {
     "gather": gather,
     "dynamic_slice": dynamic_slice,
     "dynamic_update_slice": dynamic_update_slice,
+    "sort": sort,
     **{name: scatter(name) for name in _UPDATES},
 }
 """By the primitive's name."""

@@ -5,6 +5,7 @@ library but <math.h>. The same functions, name and precision give the same files
 """
 
 import importlib.metadata
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -175,7 +176,7 @@ def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapp
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, inputs, results = program_of(each.closed, repeated)
+        program, _, results = program_of(each.closed, repeated)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -183,9 +184,9 @@ def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapp
         raise TooLargeError(
             f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
         )
-    unread = [leaf for leaf, node in zip(each.arguments, inputs, strict=True) if not body.uses(node) or node.size == 0]
-    unread += [leaf for leaf in signature.results if 0 in leaf.shape]
-    lines = "\n".join([*(f"    (void){leaf.name};" for leaf in unread), *body.lines])
+    words = set(re.findall(r"\w+", "\n".join(body.lines)))
+    leaves = [*signature.arguments, *(() if signature.returns else signature.results)]
+    lines = "\n".join([*(f"    (void){leaf.name};" for leaf in leaves if leaf.name not in words), *body.lines])
     text = f"\n{declaration(name, key, signature, 'real')}\n{{\n{lines}\n}}\n"
     total = len(body.lines) + sum(source.parts[part].text.count("\n") for part in body.calls)
     return signature._replace(stack_bytes=body.bytes, operations=body.operations), text, total

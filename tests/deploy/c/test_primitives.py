@@ -27,6 +27,10 @@ def normal(*shape):
     return RANDOM.normal(size=shape)
 
 
+SQUARE = {n: normal(n, n) / n**0.5 for n in SIZES}
+WIDE = {n: normal(5, n) / n**0.5 for n in SIZES}
+
+
 def of(x, w):
     """Constants at the precision of the arguments."""
     return jnp.asarray(w, x.dtype)
@@ -73,10 +77,40 @@ def root(x):
 UNARY = {
     **{
         name: getattr(jnp, name)
-        for name in (
-            "abs negative exp exp2 expm1 log log1p sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh "
-            "arctanh sqrt cbrt floor ceil round trunc sign square isfinite isnan isinf logical_not reciprocal"
-        ).split()
+        for name in [
+            "abs",
+            "negative",
+            "exp",
+            "exp2",
+            "expm1",
+            "log",
+            "log1p",
+            "sin",
+            "cos",
+            "tan",
+            "arcsin",
+            "arccos",
+            "arctan",
+            "sinh",
+            "cosh",
+            "tanh",
+            "arcsinh",
+            "arccosh",
+            "arctanh",
+            "sqrt",
+            "cbrt",
+            "floor",
+            "ceil",
+            "round",
+            "trunc",
+            "sign",
+            "square",
+            "isfinite",
+            "isnan",
+            "isinf",
+            "logical_not",
+            "reciprocal",
+        ]
     },
     **{name: getattr(lax, name) for name in ("rsqrt", "logistic", "erf", "erfc", "lgamma")},
     **{name: getattr(jax.nn, name) for name in ("softplus", "silu", "gelu", "relu", "elu")},
@@ -146,6 +180,13 @@ MOVES = {
         *(lax.cummax(x, 1), lax.cummin(x, 0, reverse=True), lax.cummax(x, 0, reverse=True), lax.cummin(x, 1)),
     ),
     "gradients": lambda x: jax.grad(lambda x: jnp.sum(jnp.sin(x[::2]) ** 2) * x[0, 0])(x),
+    "sort": lambda x: (
+        jnp.sort(x[0]),
+        jnp.argsort(x[1]),
+        jnp.argsort(x[0] > 0),
+        jnp.median(x[2]),
+        x[0, jnp.argsort(x[3])],
+    ),
     "gradient_of_max": lambda x: jax.grad(lambda x: x.max() * jnp.prod(x.min(1)))(x),
     "hessian": lambda x: jax.hessian(lambda x: jnp.prod(jnp.cos(x)) + x @ x)(x[0]),
 }
@@ -236,7 +277,7 @@ CONTROL = {
 FACTORED = {
     "cholesky": lambda a, b: jnp.linalg.cholesky(definite(a)),
     **{
-        f"triangular_solve_{''.join('ny'[flag] for flag in flags)}": lambda a, b, flags=flags: lax.linalg.triangular_solve(
+        f"triangular_solve_{''.join('ny'[flag] for flag in flags)}": lambda a, b, flags=flags: lax.linalg.triangular_solve(  # noqa: E501
             upper(a).T if flags[1] else upper(a),
             b if flags[0] else b.T,
             left_side=flags[0], lower=flags[1], transpose_a=flags[2], unit_diagonal=flags[3],
@@ -249,8 +290,9 @@ FACTORED = {
     "solve_triangular": lambda a, b: scipy_linalg.solve_triangular(upper(a), b[:, 0], trans=1),
     "solve_definite": lambda a, b: scipy_linalg.cho_solve(scipy_linalg.cho_factor(definite(a)), b),
     "gradients_of_factors": lambda a, b: jax.grad(
-        lambda a: jnp.sum(jnp.linalg.cholesky(definite(a))) + jnp.sum(scipy_linalg.solve(definite(a), b, assume_a="pos"))
+        lambda a: jnp.sum(jnp.linalg.cholesky(definite(a))) + jnp.sum(scipy_linalg.solve(definite(a), b, assume_a="pos"))  # noqa: E501
     )(a),
+    "gradient_of_solve": lambda a, b: jax.grad(lambda a: jnp.sum(jnp.linalg.solve(a, b)) + jnp.linalg.det(a))(a),
     "tangent_of_solve": lambda a, b: jax.jvp(jnp.linalg.solve, (a, b), (a.T, 2 * b))[1],
     "cholesky_of_any": lambda a, b: jnp.linalg.cholesky(a + a.T),
     "custom_linear_solve": lambda a, b: (matrix_free(a, b[:, 0]), jax.jacobian(matrix_free, 1)(a, b[:, 0])),
@@ -278,12 +320,12 @@ PRODUCTS = {
     },
     **{
         f"constant_matrix_{n}": (
-            lambda x, w=normal(n, n) / n**0.5: jax.jvp(lambda x: jnp.tanh(x @ of(x, w)) @ of(x, w), (x,), (x[::-1],)),
+            lambda x, w=SQUARE[n]: jax.jvp(lambda x: jnp.tanh(x @ of(x, w)) @ of(x, w), (x,), (x[::-1],)),
             (normal(n),),
         )
         for n in SIZES
     },
-    **{f"wide_{n}": (lambda x, w=normal(5, n) / n**0.5: (x @ of(x, w)) @ of(x, w).T, (normal(3, 5),)) for n in SIZES},
+    **{f"wide_{n}": (lambda x, w=WIDE[n]: (x @ of(x, w)) @ of(x, w).T, (normal(3, 5),)) for n in SIZES},
     **{
         f"vector_{n}": (
             lambda x, y: (jnp.sin(x) * y + 1, x.sum(), x.max(), x @ y, jnp.where(x > y, x, y), jnp.exp(-x * x).sum()),
@@ -308,7 +350,7 @@ INTERFACES = {
     "returned_integer": (lambda x: jnp.argmax(x), (normal(3),)),
     "returned_bool": (lambda x: jnp.all(x > 0), (normal(3),)),
     "trees": (
-        lambda state, layers: {"next": {"q": state["q"] + state["qd"], "qd": -state["qd"]}, "y": layers[0][0] @ state["q"]},
+        lambda state, layers: {"next": {"q": state["q"] + state["qd"], "qd": -state["qd"]}, "y": layers[0][0] @ state["q"]},  # noqa: E501
         ({"q": normal(2), "qd": normal(2)}, [(normal(2, 2), normal(2))]),
     ),
     "empty": (lambda x, y: (x, y.sum(), jnp.concatenate([x, y]), y @ x), (normal(0), normal(0))),
@@ -341,8 +383,8 @@ NOT_FINITE = {
     **{f"{name}_{n}": (np.nan,) * ("cholesky" in name) for name in FACTORED for n in (1, 2, 3, 7, 9)},
     "gradient_of_max": (),
 }
-"""What some cases are tried on; others on NaN and infinities. LAPACK makes finite numbers of infinities, and of NaN by LU,
-and XLA of 0 times NaN where 0 is a truth value that is false: C does not."""
+"""What some cases are tried on; others on NaN and infinities. LAPACK makes finite numbers of infinities, and of
+NaN by LU, and XLA of 0 times NaN where 0 is a truth value that is false: C does not."""
 
 
 def states_of(name, examples):
