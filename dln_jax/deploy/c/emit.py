@@ -228,7 +228,9 @@ class Body:
             targets = [f"r{k}_" for k in range(len(results))]
             body = body_of(self.source, program, results, named, targets)
             parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
-            parameters += [f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)]
+            parameters += [
+                f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)
+            ]
             unused = [f"    (void)a{each.attribute}_;" for each in inputs if not body.uses(each)]
             lines = "\n".join([*unused, *body.lines])
             text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"

@@ -170,7 +170,9 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
         raise InputError(f"{key}: {error}") from error
 
 
-def _function(source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]) -> tuple[Signature, str, int]:
+def _function(
+    source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]
+) -> tuple[Signature, str, int]:
     """Signature, C text and lines of one function, those of functions that it calls included."""
     signature = Signature(tuple(each.arguments), tuple(each.results))
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
@@ -225,9 +227,7 @@ def _preamble(source: Source, name: str) -> str:
     )
 
 
-def _header(
-    name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]
-) -> str:
+def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]) -> str:
     absent = "\n".join(f"Left out: {each}; ask for it by name." for each in left_out)
     about, guard = comment(f"{name}.h", written_by, _PROMISES, *[absent] * bool(absent)), f"{name.upper()}_H"
     declared = ""
