@@ -242,7 +242,11 @@ class Body:
 
     def projected(self, loop: Node) -> set[int]:
         """Which results of a loop are read."""
-        return {each.attribute for each in self.plan.needed if each.op == "project" and each.args[0] is loop}
+        return {
+            each.attribute
+            for each, mask in self.plan.needed.items()
+            if each.op == "project" and each.args[0] is loop and mask.any()
+        }
 
     def uses(self, node: Node) -> bool:
         """Whether anything reads an input."""

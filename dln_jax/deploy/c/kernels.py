@@ -304,8 +304,9 @@ def _branch(body, node: Node) -> None:
         test = f"if ({which} {'<=' if place == 0 else '=='} {place})"
         body.opened(("else " if place else "") + ("" if last else test))
         body.region((*node.region, number))
-        for name, result in zip(names, body.program.loops[number].results, strict=True):
-            body.copied(result, name)
+        for index, (name, result) in enumerate(zip(names, body.program.loops[number].results, strict=True)):
+            if index in body.projected(node):
+                body.copied(result, name)
         body.closed()
 
 

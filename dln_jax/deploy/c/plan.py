@@ -205,6 +205,7 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
 def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
     """Elements that something reads, of each node."""
     needed = {node: np.zeros(node.size, bool) for node in nodes}
+    projected: dict[Node, set[int]] = {}
     for node in results:
         needed[node][:] = True
     for node in reversed(nodes):
@@ -214,8 +215,13 @@ def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node,
         if node in arrays:
             mask[:] = True
         for loop in inner(program, node):
-            for each in (*loop.results, *loop.conditions, *loop.carries):
+            for k, each in enumerate(loop.results):
+                if k < len(loop.carries) or k in projected.get(node, ()):
+                    needed[each][:] = True
+            for each in (*loop.conditions, *loop.carries):
                 needed[each][:] = True
+        if node.op == "project":
+            projected.setdefault(node.args[0], set()).add(node.attribute)
         if node.op == "arrange":
             starts = np.cumsum([0, *(each.size for each in node.args)])
             positions = np.asarray(node.value).ravel()[mask]
