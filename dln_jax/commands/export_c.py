@@ -3,9 +3,9 @@
 The run is one of the training commands'. Functions of one state, in SI units: inverse and forward dynamics, gravity,
 Coriolis force, friction, mass matrix and energy of a model of dynamics, an integrator's step x_next = F(x, u, dt), and
 the exact derivatives of each; rates and steps of a model of a phase space; value, Jacobian and Hessian of a
-differential network. Without --functions all that the model has, but for what is too large for generated C. There is no
-allocation and no state outside the stack. dln_jax.load_c compiles and calls the result from Python, and dln_jax.export_c
-exports any other JAX function.
+differential network. Without --functions all that the model has, but for what takes long to compile. There is no
+allocation and no state outside the stack. dln_jax.load_c compiles and calls the result from Python;
+dln_jax.export_c exports any other JAX function.
 """
 
 from dataclasses import dataclass

@@ -25,9 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.deploy.c import sensitivities
-from dln_jax.deploy.c.emit import Body, Source, copied
+from dln_jax.deploy.c.body import Body, Source
+from dln_jax.deploy.c.emit import region
 from dln_jax.deploy.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.deploy.c.lowering import program_of, traced
+from dln_jax.deploy.c.moves import copied
 from dln_jax.deploy.c.plan import plan_of
 from dln_jax.types import InputError
 
@@ -241,7 +243,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
         if body.uses(node):
             body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
     body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
-    body.region(())
+    region(body, ())
     # All results are written after all arguments are read, so that they may overlap.
     for j, node in zip((j for j, each in enumerate(outputs) if each.dense), results, strict=True):
         body.opened(f"if (res[{j}])")

@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.deploy.c.primitives import RULES as REDUCE
+from dln_jax.deploy.c.nodes import Node, is_constant, values
 from dln_jax.deploy.c.primitives import convert
-from dln_jax.deploy.c.program import Node, Program, is_constant, values
+from dln_jax.deploy.c.program import Program
+from dln_jax.deploy.c.reductions import RULES as REDUCE
 from dln_jax.types import InputError
 
 SORTED = 64

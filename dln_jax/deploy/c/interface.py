@@ -136,7 +136,7 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
             if f"{declaration(name, check_name(key), each, PRECISIONS[precision][1])};" not in header:
                 raise InputError(f"{key} is not declared so in {name}.h")
     except (InputError, TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: contradicts itself ({str(error):.200}); {AGAIN}") from error
+        raise InputError(f"{path}: contradicts itself ({error!s:.200}); {AGAIN}") from error
     return precision, functions, files
 
 

@@ -4,7 +4,9 @@ from textwrap import dedent
 
 import numpy as np
 
-from dln_jax.deploy.c.program import Loop, Node
+from dln_jax.deploy.c.body import Body
+from dln_jax.deploy.c.moves import copied
+from dln_jax.deploy.c.nodes import Node
 
 _REDUCE = {
     "reduce_sum": ("{0} + {1}", 1),
@@ -95,7 +97,7 @@ def _pattern(node: Node) -> tuple[str, int]:
     return (pattern, cost) if node.dtype == "real" else (_OF_INTEGERS.get(node.op, pattern), cost)
 
 
-def combined(body, node: Node, k: int, terms: list[str]) -> str:
+def combined(body: Body, node: Node, k: int, terms: list[str]) -> str:
     """A reduction of few terms, written out."""
     pattern, cost = _pattern(node)
     body.spend(cost * (len(terms) - 1))
@@ -110,12 +112,7 @@ def combined(body, node: Node, k: int, terms: list[str]) -> str:
     return text
 
 
-def written(body, node: Node) -> None:
-    """The C of a node."""
-    _WRITERS[node.op](body, node)
-
-
-def _kept(body, node: Node) -> str:
+def _kept(body: Body, node: Node) -> str:
     """Name of the array or scalar that is to hold a node."""
     if node in body.plan.arrays:
         return body.kept(node)
@@ -123,7 +120,7 @@ def _kept(body, node: Node) -> str:
     return body.name(node)
 
 
-def _reduction(body, node: Node) -> None:
+def _reduction(body: Body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
     pattern, cost = _pattern(node)
@@ -139,9 +136,8 @@ def _reduction(body, node: Node) -> None:
         text = body.read(a, at, ["r_", "(k_ + c_)"])
         body.line(f"for (int k_ = 0; k_ < {whole}; k_ += {parts})")
         body.line(f"    for (int c_ = 0; c_ < {parts}; ++c_) part_[c_] += {text};")
-        body.line(
-            "real sum_ = (part_[0] + part_[4]) + (part_[1] + part_[5]) + ((part_[2] + part_[6]) + (part_[3] + part_[7]));"
-        )
+        body.line("for (int c_ = 0; c_ < 4; ++c_) part_[c_] += part_[c_ + 4];")
+        body.line("real sum_ = (part_[0] + part_[1]) + (part_[2] + part_[3]);")
         if whole < count:
             body.line(f"for (int k_ = {whole}; k_ < {count}; ++k_) sum_ += {body.read(a, at, ['r_', 'k_'])};")
     else:
@@ -154,7 +150,7 @@ def _reduction(body, node: Node) -> None:
     body.closed()
 
 
-def _arg(body, node: Node) -> None:
+def _arg(body: Body, node: Node) -> None:
     """The first of the largest or smallest; what is not a number comes before all."""
     (a,) = node.args
     rows, count = a.shape
@@ -176,10 +172,10 @@ def _arg(body, node: Node) -> None:
     body.closed()
 
 
-def _put(body, node: Node) -> None:
+def _put(body: Body, node: Node) -> None:
     operand, targets, updates = node.args
     name, count = body.kept(node), updates.size
-    body.copied(operand, name)
+    copied(body, operand, name)
     body.spend(count)
     index = np.arange(count)
     body.opened(f"for (int k_ = 0; k_ < {count}; ++k_)")
@@ -192,7 +188,7 @@ def _put(body, node: Node) -> None:
     body.closed()
 
 
-def _cholesky(body, node: Node) -> None:
+def _cholesky(body: Body, node: Node) -> None:
     (a,) = node.args
     n = a.shape[0]
     body.source.kernels.add("cholesky")
@@ -201,7 +197,7 @@ def _cholesky(body, node: Node) -> None:
     body.spend(n * (n + 1) * (n + 2) // 3)
 
 
-def _triangular_solve(body, node: Node) -> None:
+def _triangular_solve(body: Body, node: Node) -> None:
     a, b = node.args
     n, columns = b.shape
     lower, unit = map(int, node.attribute)
@@ -212,7 +208,7 @@ def _triangular_solve(body, node: Node) -> None:
     body.spend(n * n * columns)
 
 
-def _lu(body, node: Node) -> None:
+def _lu(body: Body, node: Node) -> None:
     (a,) = node.args
     n, m = a.shape
     body.source.kernels.add("lu")
@@ -223,94 +219,7 @@ def _lu(body, node: Node) -> None:
     body.spend(2 * n * n * m // 3)
 
 
-def _call(body, node: Node) -> None:
-    part = body.part(node.attribute)
-    names = [f"v{node.number}_{k}" for k in range(len(part.results))]
-    for name, result in zip(names, part.results, strict=True):
-        body.declared(name, result.dtype, max(result.size, 1))
-    body.line(f"{part.name}({', '.join([*map(body.pointer, node.args), *names])});")
-    body.spend(part.operations)
-
-
-def _stored(body, node: Node, handed_on: list[Node], turns: list[int] | None = None) -> list[str]:
-    """Declares what control flow hands on, and each of its turns leaves, whether it is read or not."""
-    number = np.ravel(node.attribute)[0]
-    read = body.projected(node)
-    names = [f"c{number}_{index}" for index in range(len(handed_on))]
-    for name, each, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
-        body.declared(name, each.dtype, max(each.size * count, 1))
-    for name in (name for index, name in enumerate(names) if index not in read):
-        body.line(f"(void){name};")
-    return names
-
-
-def _handed_on(body, loop: Loop, names: list[str], number: int) -> None:
-    """New carries from the results of a turn, which may be old carries."""
-    moved = loop.results[: len(names)]
-    temporary = [f"n{number}_{index}" for index in range(len(moved))]
-    for name, node in zip(temporary, moved, strict=True):
-        body.declared(name, node.dtype, max(node.size, 1))
-        body.copied(node, name)
-    for name, old, node in zip(names, temporary, moved, strict=True):
-        body.line(f"for (int k_ = 0; k_ < {node.size}; ++k_) {name}[k_] = {old}[k_];")
-
-
-def _while(body, node: Node) -> None:
-    number, loop = node.attribute, body.program.loops[node.attribute]
-    names = _stored(body, node, loop.carries)
-    for name, start in zip(names, node.args, strict=True):
-        body.copied(start, name)
-    region = (*node.region, number)
-    body.opened("for (;;)")
-    done: set[Node] = set()
-    body.region(region, done, body.ancestors(loop.conditions))
-    body.line(f"if (!{body.read(loop.conditions[0], np.array(0))}) break;")
-    body.region(region, done)
-    _handed_on(body, loop, names, number)
-    body.closed()
-
-
-def _repeat(body, node: Node) -> None:
-    number, loop = node.attribute, body.program.loops[node.attribute]
-    length, carried = int(loop.length or 0), len(loop.carries)
-    stacked = loop.results[carried:]
-    names = _stored(body, node, [*loop.carries, *stacked], [1] * carried + [length] * len(stacked))[:carried]
-    for name, start in zip(names, node.args, strict=True):
-        body.copied(start, name)
-    read = body.projected(node)
-    stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
-    turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
-    body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    if stacked or any(each.op == "counter" and each.attribute == number for each in body.plan.needed):
-        body.line(f"const long long i_{number} = {turn};")
-    body.region((*node.region, number))
-    for index, each in stacked.items():
-        body.opened("")
-        body.declared(f"n{number}_{index}", each.dtype, max(each.size, 1))
-        body.copied(each, f"n{number}_{index}")
-        target = f"c{number}_{index}[i_{number} * {each.size} + k_]"
-        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{index}[k_];")
-        body.closed()
-    _handed_on(body, loop, names, number)
-    body.closed(max(length, 1))
-
-
-def _branch(body, node: Node) -> None:
-    numbers = node.attribute
-    names = _stored(body, node, body.program.loops[numbers[0]].results)
-    which = body.read(node.args[0], np.array(0))
-    for place, number in enumerate(numbers):
-        last = place == len(numbers) - 1
-        test = f"if ({which} {'<=' if place == 0 else '=='} {place})"
-        body.opened(("else " if place else "") + ("" if last else test))
-        body.region((*node.region, number))
-        for index, (name, result) in enumerate(zip(names, body.program.loops[number].results, strict=True)):
-            if index in body.projected(node):
-                body.copied(result, name)
-        body.closed()
-
-
-_WRITERS = {
+WRITERS = {
     **dict.fromkeys(_REDUCE, _reduction),
     **dict.fromkeys(_PUT, _put),
     "argmax": _arg,
@@ -318,8 +227,4 @@ _WRITERS = {
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
     "lu": _lu,
-    "call": _call,
-    "while": _while,
-    "repeat": _repeat,
-    "branch": _branch,
 }

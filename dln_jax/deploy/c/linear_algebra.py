@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.deploy.c.program import Node, Program
+from dln_jax.deploy.c.nodes import Node
+from dln_jax.deploy.c.program import Program
 
 
 def _matrices(program: Program, node: Node) -> list[Node]:

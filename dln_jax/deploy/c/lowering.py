@@ -6,9 +6,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.extend import core
 
-from dln_jax.deploy.c import indexing, linear_algebra, primitives
-from dln_jax.deploy.c.program import Loop, Node, Part, Program, is_constant, values
+from dln_jax.deploy.c import indexing, linear_algebra, primitives, reductions
+from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
+from dln_jax.deploy.c.program import Part, Program
 from dln_jax.types import InputError
 
 _KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int32": "int"}
@@ -28,7 +30,8 @@ _REFUSED = {
 }
 _LARGE_CALL = 600
 """Equations from which on a jitted function that is called several times is a C function of its own."""
-_RULES = {**primitives.RULES, **indexing.RULES, **linear_algebra.RULES}
+_RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
+_TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
 
 
 def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
@@ -147,9 +150,9 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return _call(program, inner, args) if id(inner) in program.repeated else _inline(program, _closed(inner), args)
     if name in _CONTROL:
         return _CONTROL[name](program, parameters, args)
-    if name in primitives.TYPED_RULES:
+    if name in _TYPED_RULES:
         dtype = kind_of(equation.outvars[0].aval.dtype)
-        return [primitives.TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
+        return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
     if name not in _RULES:
         why = next((reason for part, reason in _REFUSED.items() if part in name), None)
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
@@ -178,7 +181,7 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
 
 
 def _closed(jaxpr: Any) -> Any:
-    return jaxpr if hasattr(jaxpr, "consts") else jax.extend.core.ClosedJaxpr(jaxpr, ())
+    return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
 
 
 def _line(equation: Any) -> str:

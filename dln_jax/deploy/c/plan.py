@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dln_jax.deploy.c.nodes import Loop, Node, Region, is_constant
 from dln_jax.deploy.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
-from dln_jax.deploy.c.program import Loop, Node, Program, Region, is_constant
+from dln_jax.deploy.c.program import Program
 
 WRITTEN_OUT = 64
 """Elements of a result, or products of a sum, up to which they may be written out one by one."""
@@ -60,16 +61,18 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
         elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
-    root = _fused(nodes, readers, whole, written_out, arrays)
+    root: dict[Node, Node] = _fused(nodes, readers, whole, written_out)
     arrays -= {node for node, into in root.items() if into is not node}
     levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}
     for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
-        if needed[root.get(node, node)].any() and (node in written_out or root.get(node, node) is node):
+        if needed[root[node] if node in root else node].any() and (node in written_out or root.get(node, node) is node):
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root)
     steps: dict[Node, set[Node | None]] = {}
-    for step, read in [*reads.items(), (None, {source for node in results for source in sources(node, arrays)})]:
+    of_results = {source for node in results for source in sources(node, arrays)}
+    every: list[tuple[Node | None, set[Node]]] = [*reads.items(), (None, of_results)]
+    for step, read in every:
         for source in read:
             steps.setdefault(source, set()).add(step)
     return Plan(order, written_out, arrays, root, needed, levels, reads, steps)
@@ -151,7 +154,7 @@ def _is_product(node: Node, written_out: set[Node]) -> bool:
     return node.op == "contract" and node not in written_out
 
 
-def _fused(nodes, readers, whole, written_out, arrays) -> dict[Node, Node]:
+def _fused(nodes, readers, whole, written_out) -> dict[Node, Node]:
     """The loop that each elementwise node is in."""
     root: dict[Node, Node] = {}
     for node in reversed(nodes):

@@ -7,7 +7,8 @@ order of that loop. Where there is one column, sums are kept in parts.
 
 import numpy as np
 
-from dln_jax.deploy.c.program import Node, is_constant, values
+from dln_jax.deploy.c.body import Body
+from dln_jax.deploy.c.nodes import Node, is_constant, values
 
 _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
@@ -25,7 +26,7 @@ def chain(pairs: list[tuple[str, str]]) -> str:
     return text
 
 
-def contracted(body, members: list[Node]) -> None:
+def contracted(body: Body, members: list[Node]) -> None:
     """Products of several matrices with one."""
     for node in members:
         body.kept(node)
@@ -54,7 +55,7 @@ def _parts(rows: int, columns: int, count: int) -> int:
     return parts
 
 
-def _block(body, rows: list[tuple[Node, int]], count: int, columns: int) -> None:
+def _block(body: Body, rows: list[tuple[Node, int]], count: int, columns: int) -> None:
     """Rows of products with one matrix."""
     lanes, factor = _LANES[body.source.precision], rows[0][0].args[1]
     body.spend(2 * len(rows) * count * columns)
@@ -98,7 +99,7 @@ def _block(body, rows: list[tuple[Node, int]], count: int, columns: int) -> None
         start += tiles * width
 
 
-def _many(body, node: Node) -> None:
+def _many(body: Body, node: Node) -> None:
     """A product of many rows, or of a batch of matrices."""
     a, b = node.args
     (batch, m, count), columns = a.shape, b.shape[2]
@@ -124,7 +125,7 @@ def _many(body, node: Node) -> None:
         body.closed()
 
 
-def _dots(body, node: Node) -> None:
+def _dots(body: Body, node: Node) -> None:
     """A product with one column."""
     a, b = node.args
     batch, m, count = a.shape

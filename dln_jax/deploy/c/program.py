@@ -26,48 +26,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.deploy.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, without_unused
 from dln_jax.deploy.c.operations import COMMUTATIVE, OPERATIONS
 from dln_jax.types import InputError
 
-Region = tuple[int, ...]
-"""The loops and branches that a node is in, outermost first."""
 LARGEST = 1 << 22
 """Elements of an array."""
-
-
-@dataclass(frozen=True, eq=False)
-class Node:
-    """An array that a program computes; equal ones are the same object."""
-
-    op: str
-    shape: tuple[int, ...]
-    dtype: str
-    """real, bool, int, long, unsigned or unsigned long."""
-    args: tuple["Node", ...]
-    attribute: Any
-    value: np.ndarray | None
-    """Numbers of a `const`, positions of an `arrange` [shape]."""
-    region: Region
-    number: int
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return int(np.prod(self.shape, dtype=np.int64))
-
-
-class Loop(NamedTuple):
-    """Inside of a `while`, `repeat` or `branch`."""
-
-    carries: list[Node]
-    """What a turn starts with; nothing for a branch."""
-    conditions: list[Node]
-    """Whether there is another turn, of a `while`."""
-    results: list[Node]
-    """New carries, then what each turn of a `repeat` leaves; results of each branch in turn."""
-    length: int | None = None
-    """Turns of a `repeat`."""
-    reverse: bool = False
 
 
 class Part(NamedTuple):
@@ -133,7 +97,7 @@ class Program:
             flat.append(within + start)
             start += sum(part.size for part in parts)
         positions = np.asarray(np.concatenate(flat)[np.asarray(positions, np.int64)])
-        inner, positions = _without_unused(inner, positions)
+        inner, positions = without_unused(inner, positions)
         if not inner or positions.size == 0:
             dtype = sources[0].dtype
             return self.constant(np.zeros(positions.shape, bool if dtype == "bool" else float), dtype)
@@ -142,9 +106,9 @@ class Program:
             if positions.size <= max(total, 64):
                 joined = np.concatenate([each.value.ravel() for each in inner if each.value is not None])
                 return self.constant(joined[positions], inner[0].dtype)
-        if len(inner) == 1 and inner[0].shape == positions.shape:
-            if np.array_equal(positions.ravel(), np.arange(positions.size)):
-                return inner[0]
+        alone = len(inner) == 1 and inner[0].shape == positions.shape
+        if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
+            return inner[0]
         return self.make("arrange", positions.shape, inner[0].dtype, inner, value=positions)
 
     def reshape(self, node: Node, shape: Sequence[int]) -> Node:
@@ -202,13 +166,11 @@ class Program:
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
         neutral = {"add": 0, "mul": 1, "sub": 0, "div": 1, "or": False, "and": True}
-        if op in neutral:
-            first, second = args
-            for kept, other in ((first, second), (second, first)) if op not in ("sub", "div") else ((first, second),):
-                if _is_all(other, neutral[op]) and kept.dtype == other.dtype:
-                    return self.broadcast(kept, shape)
-            if op == "sub" and _is_all(first, 0) and first.dtype == "real":
-                return self.elementwise("neg", second)
+        for kept, other in (args, args[::-1])[: 2 if op in COMMUTATIVE else 1] if op in neutral else ():
+            if is_all(other, neutral[op]) and kept.dtype == other.dtype:
+                return self.broadcast(kept, shape)
+        if op == "sub" and is_all(args[0], 0) and args[0].dtype == "real":
+            return self.elementwise("neg", args[1])
         if op in ("add", "sub") and args[1].op == "neg":
             return self.elementwise("sub" if op == "add" else "add", args[0], args[1].args[0])
         if op == "add" and args[0].op == "neg":
@@ -223,62 +185,22 @@ class Program:
 
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
         """The operation before the arguments are repeated, where all are repeated in the same way."""
-        repeated = [each for each in args if each.size > 1 and not _is_uniform(each)]
-        others = [each for each in args if each.size == 1 or _is_uniform(each)]
+        repeated = [each for each in args if each.size > 1 and not is_uniform(each)]
+        others = [each for each in args if each.size == 1 or is_uniform(each)]
         if not shape or any(each.op == "const" for each in repeated) or len(repeated) + len(others) < len(args):
             return None
         if not repeated:
             if np.prod(shape, dtype=np.int64) <= 1:
                 return None
             return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
-        first = repeated[0]
-        if first.op != "arrange" or len(first.args) > 1 or first.args[0].size >= first.size:
-            return None
+        positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
         for each in repeated:
-            if each.op != "arrange" or each.args[0].shape != first.args[0].shape or len(each.args) > 1:
-                return None
-            if not np.array_equal(each.value, first.value):
+            alike = each.op == "arrange" and len(each.args) == 1 and each.args[0].shape == source[0].shape
+            if not alike or each.args[0].size >= each.size or not np.array_equal(np.asarray(each.value), positions):
                 return None
         below = [each.args[0] if any(each is one for one in repeated) else self._one(each) for each in args]
-        return self.arrange([self.elementwise(op, *below)], first.value)
+        return self.arrange([self.elementwise(op, *below)], positions)
 
     def _one(self, node: Node) -> Node:
         """The scalar that all elements are."""
         return node if node.shape == () else self.arrange([node], np.zeros((), np.int64))
-
-
-def is_constant(node: Node) -> bool:
-    """Whether it is known beforehand."""
-    return node.op == "const" or (node.op == "arrange" and all(each.op == "const" for each in node.args))
-
-
-def values(node: Node) -> np.ndarray:
-    """Numbers of a node that is known beforehand."""
-    if node.op == "const":
-        return np.asarray(node.value)
-    return np.asarray(np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)])
-
-
-def _is_all(node: Node, number: Any) -> bool:
-    return is_constant(node) and bool((values(node) == number).all())
-
-
-def _is_uniform(node: Node) -> bool:
-    if node.op == "const":
-        array = np.asarray(node.value)
-        return array.size > 0 and bool((array == array.flat[0]).all())
-    return node.op == "arrange" and node.value is not None and bool((node.value == node.value.flat[0]).all())
-
-
-def _without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Node], np.ndarray]:
-    """Each source once, and only those of which something is taken."""
-    starts = np.cumsum([0, *(each.size for each in sources)])
-    owner = np.searchsorted(starts, positions, side="right") - 1
-    kept, start, moved = {}, 0, np.zeros(len(sources), np.int64)
-    for index in np.unique(owner):
-        source = sources[index]
-        if source not in kept:
-            kept[source] = start
-            start += source.size
-        moved[index] = kept[source] - starts[index]
-    return list(kept), np.asarray(positions + moved[owner])

@@ -15,9 +15,10 @@ import numpy as np
 
 from dln_jax.deploy.c import casadi as external
 from dln_jax.deploy.c import kernels
+from dln_jax.deploy.c.body import Source
 from dln_jax.deploy.c.demo import cmake, demo
 from dln_jax.deploy.c.elementary import definitions
-from dln_jax.deploy.c.emit import Source, body_of
+from dln_jax.deploy.c.emit import body_of
 from dln_jax.deploy.c.interface import (
     FORMAT,
     Leaf,
@@ -66,8 +67,8 @@ def export_c(
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
 
     Args:
-        functions: of arrays by name, parameters closed over, each with one example for each argument: an array or a tree
-            of arrays. Arguments keep their names, and results those of a dictionary or named tuple.
+        functions: of arrays by name, parameters closed over, each with one example for each argument: an array or a
+            tree of arrays. Arguments keep their names, and results those of a dictionary or named tuple.
         directory: is created where it is missing.
         name: a C name; every file and public function starts with it.
         precision: f32 or f64 of all real numbers; by default that of the examples.

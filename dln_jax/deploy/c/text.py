@@ -16,8 +16,8 @@ acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp 
 fmod frexp hypot ilogb ldexp lgamma llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter
 nexttoward pow remainder remquo rint round scalbln scalbn sin sinh sqrt tan tanh tgamma trunc
 """
-# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and what a source defines itself: a
-# function, a library or a header of that name would not build, or hide what is needed.
+# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and what a source defines itself:
+# a function, a library or a header of that name would not build, or hide what is needed.
 _RESERVED = frozenset(
     re.findall(
         r"\w+",
@@ -27,9 +27,9 @@ _RESERVED = frozenset(
         namespace new noexcept not nullptr operator or private protected public register restrict return short signed
         sizeof static struct switch template this thread_local throw true try typedef typeid typename union unsigned
         using virtual void volatile while xor
-        abort abs assert atol bufsiz clock complex ctype div eof errno exit fenv free gamma index infinity inttypes iso646 j0 j1 jn limits locale main
-        malloc math null printf rand real setjmp signal stdarg stdbool stddef stdint stdio stdlib string tgmath time wchar
-        wctype y0 y1 yn all clean demo install test cholesky lu triangular_solve
+        abort abs assert atol bufsiz clock complex ctype div eof errno exit fenv free gamma index infinity inttypes
+        iso646 j0 j1 jn limits locale main malloc math null printf rand real setjmp signal stdarg stdbool stddef stdint
+        stdio stdlib string tgmath time wchar wctype y0 y1 yn all clean demo install test cholesky lu triangular_solve
         """
         + _FUNCTIONS
         + re.sub(r"\b(\w+)\b", r"\1f", _FUNCTIONS),
@@ -39,11 +39,11 @@ _RESERVED = frozenset(
 
 def check_name(name: str, what: str = "name") -> str:
     """A name that may stand in C; InputError otherwise."""
-    taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table)_?\d\w*|elementary_.*|.*_", name)
+    taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table|part)_?\d\w*|elementary_.*|.*_", name)
     if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
-            f"{what} is {name!r:.60}; expected a C name: a letter, then letters, digits or _, at most 40, no keyword of "
-            "C or C++ and nothing that their libraries or the source itself define"
+            f"{what} is {name!r:.60}; expected a C name: a letter, then letters, digits or _, at most 40, no "
+            "keyword of C or C++ and nothing that their libraries or the source itself define"
         )
     return name
 
