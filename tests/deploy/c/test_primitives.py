@@ -416,7 +416,7 @@ STATES = {name: states_of(name, examples) for name, (_, examples) in CASES.items
 
 
 SINGLE = {*(f"of_{name}" for name in UNARY), *INTERFACES, *list(CASES)[::4]}
-"""Tried in single precision too by default: functions that have a C of their own there, types, and some of the others."""
+"""Tried in single precision too by default: elementary functions, of which there are two sorts, types, some others."""
 
 
 def pytest_generate_tests(metafunc):
