@@ -49,8 +49,8 @@ def in_c(
 def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="f64"):
     """The same of the functions, compiled at once and mapped over the states."""
     stacked = {
-        name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *each), precision)
-        for name, each in states.items()
+        name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)
+        for name in functions
     }
     every = jax.jit(lambda given: {name: jax.vmap(functions[name][0])(*given[name]) for name in functions})
     return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(each)] for name, each in every(stacked).items()}

@@ -130,17 +130,17 @@ def definitions(system, needs):
 
 def with_derivatives(name, expected, arguments):
     """A definition and its derivatives, by the names that they are exported under."""
-    slopes = jax.jacfwd(expected, argnums=tuple(k for k, each in enumerate(arguments) if each != "dt"))
+    places = tuple(k for k, each in enumerate(arguments) if each != "dt")
+    differentiated = jax.jacfwd(lambda *state: (expected(*state),) * 2, argnums=places, has_aux=True)
 
     def derivatives(*state):
+        slopes, values = differentiated(*state)
         named = {
-            f"{result}_{key}": each
-            for result, by in slopes(*state).items()
-            for key, each in zip(arguments, by, strict=False)
+            f"{result}_{key}": each for result, by in slopes.items() for key, each in zip(arguments, by, strict=False)
         }
         if name.startswith("step"):
             named = {"A": named["x_next_x"], "B": named["x_next_u"]}
-        return {**expected(*state), **named} if "step" in name else named
+        return {**values, **named} if "step" in name else named
 
     return {name: expected, f"{name}_jacobian": derivatives, f"{name}_gradient": derivatives}
 
@@ -160,6 +160,8 @@ def system_of(case):
 
 
 CASES = [*(name for name in MODELS if "needs" in MODELS[name]), *SCENES, "double-pendulum-lagrangian"]
+DEFAULT = ("structured-delan", "black-box-delan", "black-box-hnn", "feed-forward", "phase-network", "cart-pole")
+"""One of each sort of record; the others by `--every-export`."""
 STEPPED = ("cart-pole", "phase-network")
 """Steps call the same functions of every system, and take long to compile."""
 HAMILTONIANS = ("black-box-hnn", "separable-hnn", "polynomial-hamiltonian")
@@ -177,7 +179,9 @@ LACKING = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_functions_and_their_derivatives_are_those_of_the_mechanics(case):
+def test_functions_and_their_derivatives_are_those_of_the_mechanics(case, pytestconfig):
+    if case not in DEFAULT and not pytestconfig.getoption("--every-export"):
+        pytest.skip("is tried with --every-export")
     functions, system, needs = system_of(case)
     # As exported, traced once.
     system = system._replace(**{name: jax.jit(each) for name, each in system._asdict().items() if callable(each)})
@@ -209,10 +213,14 @@ def test_functions_and_their_derivatives_are_those_of_the_mechanics(case):
         for result, array in got[name].items():
             scale = max(1, np.abs(wanted[name][result]).max())
             np.testing.assert_allclose(array, wanted[name][result], rtol=0, atol=1e-10 * scale, err_msg=name)
-    if case in LACKING:
-        kind = ["rates", "hamiltonian"] * isinstance(system, Canonical | PhaseRates)
-        kind += ["gravity", "energy", "mass_matrix", "friction"] * (not isinstance(system, PhaseRates))
-        assert {name for name in kind if name not in functions} == LACKING[case]
+
+
+@pytest.mark.parametrize("case", LACKING)
+def test_what_a_system_lacks_is_not_exported(case):
+    functions, system, _ = system_of(case)
+    kind = ["rates", "hamiltonian"] * isinstance(system, Canonical | PhaseRates)
+    kind += ["gravity", "energy", "mass_matrix", "friction"] * (not isinstance(system, PhaseRates))
+    assert {name for name in kind if name not in functions} == LACKING[case]
 
 
 def test_a_step_has_the_derivatives_of_finite_differences():

@@ -1,5 +1,6 @@
 """Each primitive, in each of its modes, gives in C what it gives in JAX, on what is not finite too."""
 
+import functools
 import shutil
 
 import jax
@@ -414,18 +415,35 @@ def states_of(name, examples):
 STATES = {name: states_of(name, examples) for name, (_, examples) in CASES.items()}
 
 
-@pytest.fixture(scope="module", params=BOUND)
-def results(request, tmp_path_factory):
-    """Of all functions, exported and compiled at once: the precision, C's and JAX's."""
-    precision = request.param
-    got = in_c(CASES, STATES, tmp_path_factory.mktemp(precision), precision=precision)
-    return precision, got, in_jax(CASES, STATES, precision=precision)
+SINGLE = {*(f"of_{name}" for name in UNARY), *INTERFACES, *list(CASES)[::4]}
+"""Tried in single precision too by default: elementary functions, of which there are two sorts, types, some others."""
+
+
+def pytest_generate_tests(metafunc):
+    """Of the cases in each precision; all of them by `--every-export`."""
+    if "case" in metafunc.fixturenames:
+        every = metafunc.config.getoption("--every-export")
+        cases = [(each, name) for each in BOUND for name in CASES if every or each == "f64" or name in SINGLE]
+        metafunc.parametrize("precision, case", cases)
+
+
+@pytest.fixture(scope="module")
+def results(pytestconfig, tmp_path_factory):
+    """By precision, what C and JAX give: all functions are exported and compiled at once."""
+    every = pytestconfig.getoption("--every-export")
+
+    @functools.cache
+    def of(precision):
+        cases = {name: each for name, each in CASES.items() if every or precision == "f64" or name in SINGLE}
+        got = in_c(cases, STATES, tmp_path_factory.mktemp(precision), precision=precision)
+        return got, in_jax(cases, STATES, precision=precision)
+
+    return of
 
 
 @needs_compiler
-@pytest.mark.parametrize("case", CASES)
-def test_a_primitive_gives_what_it_gives_in_jax(case, results):
-    precision, got, expected = results
+def test_a_primitive_gives_what_it_gives_in_jax(precision, case, results):
+    got, expected = results(precision)
     for ours, theirs in zip(got[case], expected[case], strict=True):
         assert ours.shape == theirs.shape
         if theirs.dtype.kind == "f":
