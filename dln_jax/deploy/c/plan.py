@@ -66,7 +66,8 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}
     for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
-        if needed[root.get(node, node)].any() and (node in written_out or root.get(node, node) is node):
+        ends: Node = root.get(node, node)
+        if needed[ends].any() and (node in written_out or ends is node):
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root)
     steps: dict[Node, set[Node | None]] = {}
