@@ -111,9 +111,11 @@ def units_in_the_last_place(y, x, name: str) -> float:
 @pytest.mark.parametrize("name", VECTORISED)
 def test_values_are_right_to_two_units_in_the_last_place(evaluate, name, precision):
     x = points(name, precision)
-    for fused in (True, False):
-        errors = [units_in_the_last_place(*pair, name) for pair in zip(evaluate(name, x, fused), x, strict=True)]
-        assert max(errors) <= 2, (x[np.argmax(errors)], fused)
+    fused, unfused = (evaluate(name, x, each) for each in (True, False))
+    # What is the same both ways is compared once: mpmath takes most of the time.
+    for y, at in ((fused, x), (unfused[unfused != fused], x[unfused != fused])):
+        errors = [units_in_the_last_place(*pair, name) for pair in zip(y, at, strict=True)]
+        assert max(errors, default=0) <= 2, at[np.argmax(errors)]
 
 
 LIMITS = {  # at 0, -0, infinity, -infinity
