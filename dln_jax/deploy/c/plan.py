@@ -66,7 +66,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}
     for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
-        ends: Node = root.get(node, node)
+        ends = root.get(node, node)
         if needed[ends].any() and (node in written_out or ends is node):
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root)
@@ -106,7 +106,9 @@ def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
     return (first, tuple(steps)) if np.array_equal(positions, expected) else None
 
 
-def _reached(program: Program, results: list[Node]):
+def _reached(
+    program: Program, results: list[Node]
+) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
     """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
     found, waiting = set(), list(results)
     while waiting:
