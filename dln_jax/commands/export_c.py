@@ -34,7 +34,7 @@ class Arguments:
     iterations: int = ITERATIONS
     """Newton steps of the implicit midpoint rule."""
     libm: bool = False
-    """Call exp, tanh, sin, cos, log and log1p of the C library, in place of ones that vectorise."""
+    """Call exp, expm1, tanh, sin, cos, log and log1p of the C library, in place of ones that vectorise."""
     casadi: bool = False
     """Add NAME_casadi.c, the functions with exact derivatives for CasADi's external and for acados."""
     overwrite: bool = False

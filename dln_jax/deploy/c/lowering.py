@@ -19,7 +19,7 @@ _KINDS |= {str(jax.dtypes.float0): "bool"}
 _KINDS |= {"int64": "long", "uint32": "unsigned", "uint64": "unsigned_long"}
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
+    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
     "custom_vjp_call_jaxpr": "fun_jaxpr",
 }  # fmt: skip
 _REFUSED = {
@@ -148,6 +148,10 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
     if name in _CALLS:
         inner = parameters[_CALLS[name]]
         return _call(program, inner, args) if id(inner) in program.repeated else _inline(program, _closed(inner), args)
+    if name == "call_hi_primitive":
+        return _inline(program, _expanded(parameters["_prim"]), args)
+    if name == "scan":
+        parameters = {**parameters, **_scanned(equation)}
     if name in _CONTROL:
         return _CONTROL[name](program, parameters, args)
     if name in _TYPED_RULES:
@@ -178,6 +182,16 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
     call = program.make("call", (), "int", passed, attribute=key)
     return [program.make("project", shape, dtype, [call], k) for k, (shape, dtype) in enumerate(shapes)]
+
+
+def _expanded(primitive: Any) -> Any:
+    """What JAX 0.11 keeps of a function with derivatives of its own, such as `custom_root`, in other primitives."""
+
+    def expand(*leaves: Any) -> list[Any]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
+
+    examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
+    return jax.make_jaxpr(expand)(*examples)
 
 
 def _closed(jaxpr: Any) -> Any:
@@ -232,8 +246,22 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
 
 
+def _scanned(equation: Any) -> dict[str, int]:
+    """How many arguments of a scan are the same in each turn, and carried: releases of JAX state it differently.
+
+    What is stacked has another shape outside than inside.
+    """
+    inner = _closed(equation.params["jaxpr"]).jaxpr
+
+    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        return sum(a.aval.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
+
+    carried = alike(equation.outvars, inner.outvars)
+    return {"fixed": alike(equation.invars, inner.invars) - carried, "carried": carried}
+
+
 def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
-    constants, count = parameters["num_consts"], parameters["num_carry"]
+    constants, count = parameters["fixed"], parameters["carried"]
     fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
     length, reverse = parameters["length"], parameters["reverse"]
     if length == 0:

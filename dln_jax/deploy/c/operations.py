@@ -62,6 +62,7 @@ OPERATIONS = {
             "expm1": np.expm1,
             "log": np.log,
             "log1p": np.log1p,
+            "log2": np.log2,
             "sin": np.sin,
             "cos": np.cos,
             "tan": np.tan,

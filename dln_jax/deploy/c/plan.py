@@ -106,9 +106,7 @@ def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
     return (first, tuple(steps)) if np.array_equal(positions, expected) else None
 
 
-def _reached(
-    program: Program, results: list[Node]
-) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
+def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
     """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
     found, waiting = set(), list(results)
     while waiting:

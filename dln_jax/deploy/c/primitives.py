@@ -22,7 +22,7 @@ _RENAMED = {
     "reduce_precision": None,
 }
 _AS_NAMED = (
-    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
+    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "log2",
     "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc",
     "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
 )  # fmt: skip
@@ -81,6 +81,11 @@ def _logistic(program: Program, _, x: Node) -> Node:
     one = program.constant(1.0, "real")
     decay = program.elementwise("exp", program.elementwise("neg", x))
     return program.elementwise("div", one, program.elementwise("add", one, decay))
+
+
+def _one_minus_square(program: Program, _, x: Node) -> Node:
+    one = program.constant(1.0, "real")
+    return program.elementwise("mul", program.elementwise("sub", one, x), program.elementwise("add", one, x))
 
 
 def _clamp(program: Program, _, low: Node, x: Node, high: Node) -> Node:
@@ -182,6 +187,7 @@ RULES: dict[str, Rule] = {
     "rsqrt": _reciprocal_root,
     "integer_pow": _integer_power,
     "logistic": _logistic,
+    "one_minus_square": _one_minus_square,
     "clamp": _clamp,
     "round": _round,
     "select_n": _select_n,

@@ -72,7 +72,7 @@ def export_c(
         directory: is created where it is missing.
         name: a C name; every file and public function starts with it.
         precision: f32 or f64 of all real numbers; by default that of the examples.
-        libm: call the C library's exp, tanh, sin, cos and log1p, in place of ones that vectorise.
+        libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p, in place of ones that vectorise.
         casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
         leave_out_large: leave functions out that would be refused for their stack, or take more than 2,500 lines, which
             compile for seconds each; the header names them.
