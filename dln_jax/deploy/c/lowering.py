@@ -19,8 +19,8 @@ _KINDS |= {str(jax.dtypes.float0): "bool"}
 _KINDS |= {"int64": "long", "uint32": "unsigned", "uint64": "unsigned_long"}
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
-    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
 }  # fmt: skip
 _REFUSED = {
     "random": "random numbers; draw them outside and pass them as arguments",

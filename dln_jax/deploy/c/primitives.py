@@ -22,8 +22,8 @@ _RENAMED = {
     "reduce_precision": None,
 }
 _AS_NAMED = (
-    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "log2",
-    "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc",
+    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
+    "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc",
     "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
 )  # fmt: skip
 
