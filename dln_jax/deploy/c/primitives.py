@@ -23,8 +23,8 @@ _RENAMED = {
 }
 _AS_NAMED = (
     "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
-    "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc",
-    "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
+    "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
+    "erfc", "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
 )  # fmt: skip
 
 
