@@ -1,10 +1,10 @@
 """Elementwise operations: how each is written in C, computed beforehand, and what it costs."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
 
 from dln_jax.deploy.c.elementary import OPERATIONS as COSTS
 from dln_jax.deploy.c.elementary import VECTORISED as _VECTORISED
@@ -75,9 +75,9 @@ OPERATIONS = {
             "asinh": np.arcsinh,
             "acosh": np.arccosh,
             "atanh": np.arctanh,
-            "erf": special.erf,
-            "erfc": special.erfc,
-            "lgamma": special.gammaln,
+            "erf": np.vectorize(math.erf, otypes=[float]),
+            "erfc": np.vectorize(math.erfc, otypes=[float]),
+            "lgamma": np.vectorize(math.lgamma, otypes=[float]),
             "floor": np.floor,
             "ceil": np.ceil,
             "rint": np.rint,
