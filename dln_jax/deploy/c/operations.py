@@ -16,7 +16,7 @@ class Operation(NamedTuple):
     c: str
     """C expression of the arguments {0}, {1}, ...; {f} is the suffix of functions of <math.h>."""
     fold: Callable[..., Any] | None
-    """The same of NumPy arrays."""
+    """The same of NumPy arrays; by None it is left to C, which has an answer at poles."""
     cost: int = 1
     """Floating-point operations, 0 for what only compares, selects or moves."""
     dtype: str | None = None
@@ -25,7 +25,7 @@ class Operation(NamedTuple):
     """The function of <math.h> that it calls."""
 
 
-def _function(name: str, fold: Callable[..., Any], *, arguments: int = 1) -> Operation:
+def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1) -> Operation:
     call = f"{name}{{f}}({', '.join(f'{{{k}}}' for k in range(arguments))})"
     return Operation(call, fold, COSTS.get(name, 1), function=name)
 
@@ -77,7 +77,7 @@ OPERATIONS = {
             "atanh": np.arctanh,
             "erf": np.vectorize(math.erf, otypes=[float]),
             "erfc": np.vectorize(math.erfc, otypes=[float]),
-            "lgamma": np.vectorize(math.lgamma, otypes=[float]),
+            "lgamma": None,
             "floor": np.floor,
             "ceil": np.ceil,
             "rint": np.rint,
