@@ -27,6 +27,8 @@ class Called(NamedTuple):
     text: str
     operations: int
     bytes: int
+    calls: set[Any]
+    """Functions that it calls in turn, by their keys in the source."""
 
 
 @dataclass
@@ -74,7 +76,7 @@ class Body:
     operations: int = 0
     bytes: int = 0
     calls: set[Any] = field(default_factory=set)
-    """Functions that it calls, by their keys in the source."""
+    """Functions that it or those that it calls call, by their keys in the source."""
     names: dict[Node, str] = field(default_factory=dict)
     """Arrays that nodes are kept in."""
     _free: dict[tuple[Region, str, int], list[str]] = field(default_factory=dict)

@@ -174,14 +174,15 @@ def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | N
     return None if found is None else found[1]
 
 
-def part(body: Body, key: Any) -> Called:
+def part(caller: Body, key: Any) -> Called:
     """A function that is called, written where it was not yet."""
-    if key not in body.source.parts:
-        program, results = body.program.parts[key]
+    source = caller.source
+    if key not in source.parts:
+        program, results = caller.program.parts[key]
         inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda each: each.attribute)
         named = {each.attribute: (f"a{each.attribute}_", False) for each in inputs}
         targets = [f"r{k}_" for k in range(len(results))]
-        body = body_of(body.source, program, results, named, targets)
+        body = body_of(source, program, results, named, targets)
         parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
         parameters += [
             f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)
@@ -189,11 +190,12 @@ def part(body: Body, key: Any) -> Called:
         unused = [f"    (void)a{each.attribute}_;" for each in inputs if not body.uses(each)]
         lines = "\n".join([*unused, *body.lines])
         text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
-        name = body.source.names.setdefault(text, f"part_{len(body.source.names)}")
+        name = source.names.setdefault(text, f"part_{len(source.names)}")
         text = f"\nstatic void {name}{text}"
-        body.source.parts[key] = Called(name, results, text, body.operations, body.bytes)
-    body.calls.add(key)
-    return body.source.parts[key]
+        source.parts[key] = Called(name, results, text, body.operations, body.bytes, body.calls)
+    called = source.parts[key]
+    caller.calls |= {key, *called.calls}
+    return called
 
 
 def _call(body: Body, node: Node) -> None:

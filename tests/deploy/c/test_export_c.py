@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,6 +67,30 @@ def test_operations_are_counted(m, n):
     stated = json.loads(source_files(functions, name="model")["model.json"])["functions"]["product"]
     assert stated["operations"] in (2 * m * n, 2 * m * n - m)
     assert stated["stack_bytes"] < 8 * (2 * m + 1)
+
+
+def test_what_is_called_counts_with_what_calls_it():
+    """Functions that call a large one, or one that calls it, need its stack; each is written once."""
+
+    @jax.jit
+    def large(x):
+        for k in range(160):
+            x = jnp.sin(x[::-1]) + (k + 0.5) * x
+        return x
+
+    @jax.jit
+    def larger(x):
+        return large(x) + large(large(x))
+
+    x = np.zeros(100)
+    alone = json.loads(source_files({"large": (large, (x,))}, name="model")["model.json"])["functions"]["large"]
+    callers = {"once": large, "of_larger": lambda x: 2 * larger(x), "of_both": lambda x: larger(larger(x)) + large(x)}
+    files = source_files({name: (lambda x, call=call: call(x), (x,)) for name, call in callers.items()}, name="model")
+    stated = json.loads(files["model.json"])["functions"]
+    for each, calls in zip(stated.values(), (1, 2, 5), strict=True):  # large(x) is computed once
+        assert each["stack_bytes"] > alone["stack_bytes"]
+        assert calls <= each["operations"] / alone["operations"] < calls + 0.01
+    assert files["model.c"].count(b"static void part_") == 2
 
 
 @needs_compiler
