@@ -28,7 +28,8 @@ from dln_jax.deploy.c import sensitivities
 from dln_jax.deploy.c.body import Body, Source
 from dln_jax.deploy.c.emit import region
 from dln_jax.deploy.c.interface import Leaf, argument_leaves, result_leaves
-from dln_jax.deploy.c.lowering import program_of, traced
+from dln_jax.deploy.c.jaxprs import traced
+from dln_jax.deploy.c.lowering import program_of
 from dln_jax.deploy.c.moves import copied
 from dln_jax.deploy.c.plan import plan_of
 from dln_jax.types import InputError

@@ -1,14 +1,13 @@
 """A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend import core
 
 from dln_jax.deploy.c import indexing, linear_algebra, primitives, reductions
+from dln_jax.deploy.c.jaxprs import closed_jaxpr, expanded, made_at, scanned
 from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
 from dln_jax.deploy.c.program import Part, Program
 from dln_jax.types import InputError
@@ -28,32 +27,15 @@ _REFUSED = {
     "callback": "a callback into Python, which a robot has not",
     "debug_print": "printing, a side effect",
 }
-_LARGE_CALL = 600
-"""Equations from which on a jitted function that is called several times is a C function of its own."""
 _RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
 _TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
-
-
-def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
-    """The closed jaxpr of a function, and the tree of its results.
-
-    Raises:
-        InputError: side effects, or whole numbers beyond 64 bits.
-    """
-    try:
-        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
-    except OverflowError as error:
-        raise InputError(f"a whole number is out of range ({error}); C has those of 64 bits") from error
-    if closed.effects:
-        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
-    return closed, shapes
 
 
 def program_of(closed: Any, repeated: Mapping[int, str]) -> tuple[Program, list[Node], list[Node]]:
     """The program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: as `traced`.
+        closed: as `jaxprs.traced`.
         repeated: calls of these jaxprs, by `id`, are calls in the program too.
 
     Raises:
@@ -66,39 +48,6 @@ def program_of(closed: Any, repeated: Mapping[int, str]) -> tuple[Program, list[
         for number, variable in enumerate(closed.jaxpr.invars)
     ]
     return program, inputs, _inline(program, closed, inputs)
-
-
-def repeated_calls(every: Sequence[Any]) -> dict[int, str]:
-    """Jaxprs, by `id`, of jitted functions that are large and called several times by these closed ones; their text.
-
-    Equal texts are equal functions.
-    """
-    texts: dict[int, str] = {}
-    counts: Counter[str] = Counter()
-
-    def visit(jaxpr: Any) -> int:
-        """Number of equations, those of calls included."""
-        size = 0
-        for equation in jaxpr.eqns:
-            within = sum(visit(each) for value in equation.params.values() for each in _jaxprs(value))
-            size += max(1, within)
-            if equation.primitive.name in ("jit", "pjit") and within >= _LARGE_CALL:
-                closed = equation.params["jaxpr"]
-                if id(closed) not in texts:
-                    texts[id(closed)] = str(closed)
-                counts[texts[id(closed)]] += 1
-        return size
-
-    for closed in every:
-        visit(closed.jaxpr)
-    return {each: text for each, text in texts.items() if counts[text] > 1}
-
-
-def _jaxprs(value: Any) -> list[Any]:
-    if isinstance(value, list | tuple):
-        return [each for one in value for each in _jaxprs(one)]
-    value = getattr(value, "jaxpr", value)
-    return [value] if hasattr(value, "eqns") else []
 
 
 def kind_of(dtype: Any) -> str:
@@ -127,7 +76,7 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
             results = _apply(program, equation, [read(variable) for variable in equation.invars])
         except InputError as error:
             text = str(error)
-            where = "" if " (made at " in text else _line(equation)
+            where = "" if " (made at " in text else made_at(equation)
             raise InputError(text + where) from error
         known.update(zip(equation.outvars, results, strict=True))
     return [read(variable) for variable in jaxpr.outvars]
@@ -147,11 +96,13 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
             raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
     if name in _CALLS:
         inner = parameters[_CALLS[name]]
-        return _call(program, inner, args) if id(inner) in program.repeated else _inline(program, _closed(inner), args)
+        if id(inner) in program.repeated:
+            return _call(program, inner, args)
+        return _inline(program, closed_jaxpr(inner), args)
     if name == "call_hi_primitive":
-        return _inline(program, _expanded(parameters["_prim"]), args)
+        return _inline(program, expanded(parameters["_prim"]), args)
     if name == "scan":
-        parameters = {**parameters, **_scanned(equation)}
+        parameters = {**parameters, **scanned(equation)}
     if name in _CONTROL:
         return _CONTROL[name](program, parameters, args)
     if name in _TYPED_RULES:
@@ -182,28 +133,6 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
     call = program.make("call", (), "int", passed, attribute=key)
     return [program.make("project", shape, dtype, [call], k) for k, (shape, dtype) in enumerate(shapes)]
-
-
-def _expanded(primitive: Any) -> Any:
-    """What JAX 0.11 keeps of a function with derivatives of its own, such as `custom_root`, in other primitives."""
-
-    def expand(*leaves: Any) -> list[Any]:
-        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
-
-    examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
-    return jax.make_jaxpr(expand)(*examples)
-
-
-def _closed(jaxpr: Any) -> Any:
-    return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
-
-
-def _line(equation: Any) -> str:
-    """File and line of the user's code that made an equation, nothing where the call around it knows."""
-    traceback = equation.source_info.traceback
-    frames = [] if traceback is None else list(traceback.frames)
-    users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/deploy/" not in frame.file_name]
-    return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
 
 
 def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -244,20 +173,6 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
     program.loops[number] = Loop(carries, [condition], results)
     return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
-
-
-def _scanned(equation: Any) -> dict[str, int]:
-    """How many arguments of a scan are the same in each turn, and carried: releases of JAX state it differently.
-
-    What is stacked has another shape outside than inside.
-    """
-    inner = _closed(equation.params["jaxpr"]).jaxpr
-
-    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-        return sum(a.aval.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
-
-    carried = alike(equation.outvars, inner.outvars)
-    return {"fixed": alike(equation.invars, inner.invars) - carried, "carried": carried}
 
 
 def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:

@@ -28,7 +28,8 @@ from dln_jax.deploy.c.interface import (
     description,
     result_leaves,
 )
-from dln_jax.deploy.c.lowering import kind_of, program_of, repeated_calls, traced
+from dln_jax.deploy.c.jaxprs import repeated_calls, traced
+from dln_jax.deploy.c.lowering import kind_of, program_of
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
 from dln_jax.types import InputError
