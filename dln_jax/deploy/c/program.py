@@ -22,6 +22,7 @@ Simplifications keep what IEEE arithmetic gives: 1 x = x and 0 + x = x, but neve
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class Program:
     ) -> Node:
         """The node, new or met before, in the innermost region of its arguments: nothing stays in a loop needlessly."""
         shape, args = tuple(map(int, shape)), tuple(args)
-        if np.prod(shape, dtype=np.float64) > LARGEST:
+        if prod(shape) > LARGEST:
             raise InputError(
                 f"an array of shape {shape} is too large for generated C; expected at most {LARGEST} numbers"
             )
@@ -190,7 +191,7 @@ class Program:
         if not shape or any(each.op == "const" for each in repeated) or len(repeated) + len(others) < len(args):
             return None
         if not repeated:
-            if np.prod(shape, dtype=np.int64) <= 1:
+            if prod(shape) <= 1:
                 return None
             return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
         positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
