@@ -5,12 +5,23 @@ import gc
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 # As in the scripts: small factorisations on several threads burn the processor waiting for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
+
+LIBRARY = Path(__file__).resolve().parent.parent / "dln_jax"
+UNCHECKED = "dln_jax.deploy.c"
+"""Its arrays have no shapes in their types, and an export calls it half a million times."""
+ROOMS = [".".join(path.relative_to(LIBRARY.parent).with_suffix("").parts) for path in LIBRARY.glob("**/*.py")]
+ROOMS = [name.removesuffix(".__init__") for name in ROOMS if not name.startswith(UNCHECKED)]
+# A name stands for all below it.
+ROOMS = [name for name in ROOMS if not UNCHECKED.startswith(f"{name}.")]
+install_import_hook(ROOMS, "beartype.beartype")
 
 CACHE = "DLN_JAX_TEST_PROGRAMS"
 """Variable with the folder of compiled programs, which the test processes share: a run that is resumed has those of the

@@ -36,7 +36,10 @@ _TIMED = """        if (calls_ > 0) {{
 
 
 def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
-    """Text of NAME_demo.c: prints each function at one state, and with an argument N times N calls of each."""
+    """Text of NAME_demo.c: prints each function at one state, and with an argument N times N calls of each.
+
+    Numbers are drawn, but a time step `dt` is a millisecond.
+    """
     real = PRECISIONS[precision][1]
     kinds = {**KINDS, "real": real}
     text = comment(
@@ -54,6 +57,7 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
         )
         for leaf in each.arguments:
             value = "uniform_()" if leaf.kind == "real" else "0"
+            value = f"({real})1e-3" if leaf.name == "dt" else value  # the steps of this library have one
             text += f"        for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};\n"
         text += f"        {call};\n"
         for leaf in each.results:

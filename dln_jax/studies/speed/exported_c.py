@@ -1,8 +1,8 @@
 """benchmark c: exported C, called in a warm loop, with cold caches and from Python; its derivatives, rivals and making.
 
-Everything that is compared takes turns in one run, each turn in processes of its own; medians over turns count, and
-quantiles of cold calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most;
-numbers are drawn, since times do not depend on them.
+What is compared takes turns in one run, each turn in processes of its own; medians over turns count, and quantiles of
+cold calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most; numbers are
+drawn, since times do not depend on them.
 """
 
 import json
@@ -100,35 +100,34 @@ def measure(quick: bool, against: Path | None = None) -> Findings:
     """
     names = (SMALLEST, RIVALLED) if quick else tuple(ARMS)
     require_exports(against, names)
-    effort = {"repeats": 3, "calls": 200, "cold": 50} if quick else {"repeats": 15, "calls": 2_000, "cold": 500}
+    effort = {"repeats": 3, "calls": 200, "cold": 50} if quick else {"repeats": 15, "calls": 2_000, "cold": 200}
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as place:
         ours, others = (Path(place) / whose for whose in (OURS, OTHERS))
-        making = {name: made({**ARMS, **LARGEST}[name], ours / name) for name in (*names, *LARGEST)}
-        timing = {(name, OURS): programs(ours / name, ours / name / "model.o", FUNCTIONS) for name in names}
-        if against:
-            for name in names:
-                (others / name).mkdir(parents=True)
-                timing[name, OTHERS] = programs(against / name, compiled(against / name, others / name), FUNCTIONS)
-        turns: list[dict[tuple[str, str, str], Times]] = [
-            {
-                (*key, function): timed(program, mebibytes=evicting(), **effort)
-                for key, found in timing.items()
-                for function, program in found.items()
-            }
-            for _ in range(QUICK_TURNS if quick else TURNS)
-        ]
+        making: dict[str, tuple[float, float]] = {}
+        every: list[Times] = []
         for name in names:
+            making[name] = made(ARMS[name], ours / name)
+            timing = {OURS: programs(ours / name, ours / name / "model.o", FUNCTIONS)}
+            if against:
+                (others / name).mkdir(parents=True)
+                timing[OTHERS] = programs(against / name, compiled(against / name, others / name), FUNCTIONS)
+            each = {(whose, function): path for whose, found in timing.items() for function, path in found.items()}
+            turns = [
+                {key: timed(program, mebibytes=evicting(), **effort) for key, program in each.items()}
+                for _ in range(QUICK_TURNS if quick else TURNS)
+            ]
+            every += turns[0].values()
             rows += stated(name, json.loads((ours / name / "model.json").read_text()))
-            in_turns = {key[1:]: [turn[key] for turn in turns] for key in turns[0] if key[0] == name}
-            rows += rows_of_calls(name, ARMS[name], in_turns)
+            rows += rows_of_calls(name, ARMS[name], {key: [turn[key] for turn in turns] for key in each})
+            print(f"{name}: {sum(making[name]):.1f} s to make; {len(each)} functions timed", flush=True)
         loaded = {name: load_c(ours / name) for name in names}
+        making |= {name: made(arm, ours / name) for name, arm in LARGEST.items()}
     rows += from_python(loaded, repetitions=20 if quick else 200)
-    first = next(iter(turns[0].values()))
-    rows += [row for name, seconds in making.items() for row in rows_of_making(name, seconds, first.compiler)]
+    rows += [row for name, seconds in making.items() for row in rows_of_making(name, seconds, every[0].compiler)]
     rows.append(Row("caches", "emptied_by_mib", evicting(), "MiB", expected="read before each cold call"))
     rows.append(Row("caches", "last_level_mib", last_level_cache() or math.nan, "MiB"))
-    rows.append(Row("clock", "subtracted_ns", first.timer, "ns", expected="taken off each cold call"))
+    rows.append(Row("clock", "subtracted_ns", every[0].timer, "ns", expected="taken off each cold call"))
     return Findings(rows, curves_of(rows))
 
 
