@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from comparison import STRICT
 
 from dln_jax.deploy.c.load import load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.types import InputError
-from comparison import STRICT
 
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="there is no C compiler on the PATH")
 MATRIX = np.arange(6.0).reshape(2, 3)
