@@ -40,7 +40,7 @@ STACK = 256 * 1024
 """Bytes of the stack that a function may take."""
 LENGTH = 10_000_000
 """Bytes of a source."""
-LINES = 2500
+LINES = 4000
 """Of a function, with those that it calls, up to which it is exported without being asked for."""
 
 
@@ -75,7 +75,7 @@ def export_c(
         precision: f32 or f64 of all real numbers; by default that of the examples.
         libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p, in place of ones that vectorise.
         casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
-        leave_out_large: leave functions out that would be refused for their stack, or take more than 2,500 lines, which
+        leave_out_large: leave functions out that would be refused for their stack, or take more than 4,000 lines, which
             compile for seconds each; the header names them.
         overwrite: replace files that exist.
 
