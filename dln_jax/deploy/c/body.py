@@ -173,13 +173,24 @@ class Body:
 
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """C expression of an index."""
+        terms, first = [], 0
         found = strides(positions)
         if found is None:
-            table = self.source.table(positions.astype(np.int32), "int")
-            return f"{table}[{self.index(np.arange(positions.size).reshape(positions.shape), names)}]"
-        first, steps = found
-        terms = [f"{step} * {name}" if step != 1 else name for step, name in zip(steps, names, strict=True) if step]
-        return " + ".join([*terms, *([str(first)] if first or not terms else [])]).replace("+ -", "- ")
+            # What moves by equal steps is not stored.
+            even = {axis: each for axis in range(positions.ndim) if (each := _step(positions, axis)) is not None}
+            kept = positions[tuple(0 if axis in even else slice(None) for axis in range(positions.ndim))]
+            table, names_kept = self.source.table(kept.astype(np.int32), "int"), []
+            for axis, name in enumerate(names):
+                if axis in even:
+                    terms += [(even[axis], name)]
+                else:
+                    names_kept.append(name)
+            inside = self.index(np.arange(kept.size).reshape(kept.shape), names_kept)
+            terms.append((1, f"{table}[{inside}]"))
+        else:
+            first, terms = found[0], list(zip(found[1], names, strict=True))
+        texts = [f"{step} * {name}" if step != 1 else name for step, name in terms if step]
+        return " + ".join([*texts, *([str(first)] if first or not texts else [])]).replace("+ -", "- ")
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
         """C expression of numbers over the box of loops with these variables."""
@@ -220,6 +231,12 @@ class Body:
     def uses(self, node: Node) -> bool:
         """Whether anything reads an input."""
         return node in self.plan.needed and bool(self.plan.needed[node].any())
+
+
+def _step(positions: np.ndarray, axis: int) -> int | None:
+    """By which all positions move along an axis, or None where they do so differently."""
+    steps = np.diff(positions, axis=axis)
+    return None if steps.size and np.ptp(steps) else int(steps.flat[0]) if steps.size else 0
 
 
 def same(numbers: np.ndarray) -> np.ndarray:

@@ -9,6 +9,9 @@ from dln_jax.deploy.c.body import Body
 from dln_jax.deploy.c.nodes import Node
 from dln_jax.deploy.c.plan import WRITTEN_OUT, strides
 
+_BOXES = 6
+"""Up to which each is a loop; positions are read from tables where there were more."""
+
 
 def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
     """The shape with neighbouring axes as one where all readings allow it; never without an axis."""
@@ -36,7 +39,8 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
         for k in range(node.size):
             body.line(f"{target}[{k}] = {_moved(body, node, np.array(k), own)};")
         return
-    for box in [index] if stored else _boxes(node, index):
+    boxes = [index] if stored else _boxes(node, index)
+    for box in boxes if len(boxes) <= _BOXES else _by_source(node, index):
         box = box.reshape(box.shape or (1,))
         body.looped(
             box.shape,
@@ -80,6 +84,18 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
         ]
 
     return split(index)
+
+
+def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
+    """Elements of each source, [leading axes along which the source is the same, its elements of the others]."""
+    starts = np.cumsum([0, *(each.size for each in node.args)])
+    owner = np.searchsorted(starts, np.asarray(node.value), side="right") - 1
+    leading = []
+    while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
+        leading.append(index.shape[len(leading)])
+        owner = owner[0]
+    rows = index.reshape(*leading, -1)
+    return [rows[..., owner.ravel() == each] for each in np.unique(owner)]
 
 
 def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.deploy.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, without_unused
+from dln_jax.deploy.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, values, without_unused
 from dln_jax.deploy.c.operations import COMMUTATIVE, OPERATIONS
 from dln_jax.types import InputError
 
@@ -126,12 +126,14 @@ class Program:
         shape = np.broadcast_shapes(*(each.shape for each in args))
         args = tuple(each if each.shape in ((), shape) else self.broadcast(each, shape) for each in args)
         dtype = operation.dtype or args[-1].dtype
-        if all(each.op == "const" for each in args) and operation.fold is not None:
+        # Real numbers that are only repeated stay so: a table of them would be read from memory.
+        known = all(each.op == "const" or (dtype != "real" and is_constant(each)) for each in args)
+        if known and operation.fold is not None:
             with np.errstate(all="ignore"):
-                value = operation.fold(*(each.value for each in args))
+                value = operation.fold(*map(values, args))
             return self.constant(np.broadcast_to(value, shape), dtype)
-        if (known := self._simpler(op, args, shape)) is not None:
-            return known
+        if (simpler := self._simpler(op, args, shape)) is not None:
+            return simpler
         if (pushed := self._below_broadcast(op, args, shape)) is not None:
             return pushed
         if op in COMMUTATIVE:
@@ -158,8 +160,8 @@ class Program:
     def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
         """Elementwise, moved beforehand where the choice is known."""
         shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
-        if chosen.op == "const" and chosen.value is not None:
-            chosen_value = np.broadcast_to(chosen.value, shape)
+        if is_constant(chosen):
+            chosen_value = np.broadcast_to(values(chosen), shape)
             both = [self.broadcast(each, shape) for each in (if_false, if_true)]
             index = np.arange(chosen_value.size).reshape(shape)
             return self.arrange(both, np.where(chosen_value, index + chosen_value.size, index))

@@ -215,6 +215,10 @@ INDEXED = {
         *(x.at[1].set(0.0), x.at[:, 2].add(x[0, 0]), x.at[1:3, ::2].mul(3.0), x.at[np.array([1, 1, 2])].add(1.0)),
         *(x.at[2, 3].set(i[0]), x.at[np.array([1, 1])].min(0.0)),
     ),
+    "scatter_triangles": lambda x, i: jax.vmap(  # of which a loop cannot follow the places
+        lambda row: jnp.zeros((4, 4), x.dtype).at[np.tril_indices(4)].add(jnp.tile(row, 2)[:10]).at[1].mul(row[1])
+    )(x),
+    "lower_triangles": lambda x, i: jnp.tril(jnp.broadcast_to(x[:, None], (5, 7, 7))) * 2.0,
     "scatter_whole": lambda x, i: x.at[:].set(x[0, i[0] % 5]),
     "scatter_batched": lambda x, i: jax.vmap(lambda row, k: row.at[k].add(2.0))(x, i[:5]),
     "gather_gradient": lambda x, i: jax.grad(lambda x: jnp.sum(x[i % 5] ** 2) + jnp.sum(jnp.sin(x[:, i % 7])))(x),
