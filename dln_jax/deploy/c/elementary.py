@@ -179,12 +179,17 @@ VECTORISED: tuple[str, ...] = tuple(_BODIES)
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
     """C text of `elementary_NAME(x)` for the names, `elementary_NAME_each(n, x, y)` for arrays, and what they need.
 
+    The name `choice` stands for the choice between two numbers alone, which the others need too.
+
     Before it, the source has <math.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not.
     Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own because gcc vectorises
     the loop around a call only where it inlines the call, and it inlines some sixty calls a source.
     """
     arrays = set(arrays)
-    chosen = (set(names) | arrays) & set(VECTORISED)
+    needed = set(names) | arrays
+    chosen = needed & set(VECTORISED)
+    if not chosen and "choice" not in needed:
+        return ""  # clang warns of what is not used
     text = [fill(_COMMON, precision, **_values(precision))]
     for name in (name for name in VECTORISED if name in chosen):
         bounded = name in BOUNDS

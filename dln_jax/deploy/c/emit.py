@@ -121,9 +121,12 @@ def expression(body: Body, node: Node, args: list[str], *, looped: bool = False)
         body.source.functions.add(node.op)
         return f"elementary_{node.op}({args[0]})"
     if looped and node.dtype == "real" and node.op in _CHOICES:
+        body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
     if node.op in ("max", "min") and node.dtype != "real":
         return f"({args[0]} {'>' if node.op == 'max' else '<'} {args[1]} ? {args[0]} : {args[1]})"
+    if node.op in ("lt", "gt") and args[0] == args[1]:
+        return "0"  # clang warns of comparing a number with itself
     if node.op.startswith("to_") and node.op != "to_bool":
         return f"(({C_TYPES[node.dtype]}){args[0]})"
     return operation.c.format(*args, f=body.source.suffix)

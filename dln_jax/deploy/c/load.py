@@ -17,7 +17,7 @@ from dln_jax.types import InputError
 
 FLAGS = ("-O3", "-march=native")
 """Optimisation for the machine that compiles; sums are not reordered."""
-WARNINGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
+STANDARD = ("-std=c99", "-pedantic")
 # What Python gives is found when the library is loaded.
 _UNDEFINED = ("-undefined", "dynamic_lookup") if sys.platform == "darwin" else ()
 
@@ -38,7 +38,7 @@ def load_c(
         directory: with the files that `export_c` wrote.
         name: of the export.
         compiler: by default $CC, cc, gcc or clang, whichever is there first.
-        flags: for the compiler, beside those that make a C99 library without warnings.
+        flags: for the compiler, beside those that make a C99 library.
 
     Raises:
         InputError: files are missing, altered or of another format, or there is no compiler, or it fails.
@@ -53,7 +53,7 @@ def load_c(
             between, built = Path(folder) / "for-python.c", Path(folder) / f"lib{name}.so"
             between.write_text(binding(name, signatures, precision))
             texts = [str(Path(folder) / f"{name}.c"), str(between)]
-            compile_c([*WARNINGS, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", str(built)], compiler)
+            compile_c([*STANDARD, *flags, "-fPIC", "-shared", *_UNDEFINED, *texts, "-lm", "-o", str(built)], compiler)
             # The functions take microseconds: handing the interpreter's lock on and back would take longer.
             library = ctypes.PyDLL(str(built))
     except OSError as error:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.deploy.c.load import FLAGS, WARNINGS, compile_c
+from dln_jax.deploy.c.load import FLAGS, STANDARD, compile_c
 from dln_jax.types import InputError
 
 SMALLEST, LARGEST = 8, 64
@@ -184,7 +184,7 @@ def program(name: str, function: str, prototype: Prototype) -> str:
 def compiled(export: Path, place: Path, *, name: str = "model") -> Path:
     """The object file of an export's source, compiled as `load_c` does; `InputError` where that fails."""
     built = place / f"{name}.o"
-    compile_c([*WARNINGS, *FLAGS, "-c", str(export / f"{name}.c"), "-o", str(built)])
+    compile_c([*STANDARD, *FLAGS, "-c", str(export / f"{name}.c"), "-o", str(built)])
     return built
 
 
@@ -201,7 +201,7 @@ def programs(export: Path, model: Path, functions: Iterable[str], *, name: str =
             source.write_text(program(name, function, declared[function]))
             found[function] = source.with_suffix("")
             # Apart from the model's source, so that no call is folded into the loop.
-            compile_c([*WARNINGS, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(found[function])])
+            compile_c([*STANDARD, *FLAGS, f"-I{export}", str(source), str(model), "-lm", "-o", str(found[function])])
     if not found:
         raise InputError(f"{export / f'{name}.h'} declares none of {', '.join(functions)}; export it again")
     return found

