@@ -55,6 +55,7 @@ def main(given: Arguments) -> None:
         overwrite=given.overwrite,
     )
     print(f"{given.out}: {', '.join(path.name for path in paths)}")
-    left_out = [line for line in paths[0].read_text().splitlines() if line.startswith(" * Left out: ")]
-    for line in left_out:
-        print(line[3:])
+    for path in paths:
+        if path.suffix in (".h", ".c"):
+            left_out = [line for line in path.read_text().splitlines() if line.startswith(" * Left out: ")]
+            print(*(line[3:] for line in left_out), sep="\n", end="\n" * bool(left_out))

@@ -97,32 +97,54 @@ class Block(NamedTuple):
         return self.rows * self.columns if self.dense else 0
 
 
-def external_functions(name: str, functions: Mapping[str, Any], *, libm: bool, stack: int) -> tuple[Source, str]:
-    """C text of `casadi_NAME_F` and its derivatives for each function F, and the source with the tables it reads.
+def external_functions(
+    name: str, functions: Mapping[str, Any], *, libm: bool, stack: int, leave_out: bool = False
+) -> tuple[Source, str, list[str]]:
+    """The source with the tables that `casadi_NAME_F` and its derivatives read for each function F, and their C text.
+
+    Third is why functions are left out, if they may be.
 
     Args:
         name: of the export.
         functions: as `export_c` takes them.
         libm: call the C library's elementary functions.
         stack: bytes that a function may take.
+        leave_out: functions that would be refused.
 
     Raises:
         InputError: what CasADi cannot take: numbers that are not real, more than two axes, some names; or a function
             without arguments, without derivatives, or that takes more stack.
     """
-    source, texts, largest = Source("f64", libm), [], 1
+    source, texts, largest, left_out = Source("f64", libm), [], 1, []
     for key, (function, examples) in functions.items():
-        symbol = f"casadi_{name}_{key}"
         try:
-            inputs, outputs, flat = _flat(function, examples)
-            _check_names(symbol, [*inputs, *outputs])
+            source, text, size = _with_derivatives(source, f"casadi_{name}_{key}", function, examples, stack)
         except InputError as error:
-            raise InputError(f"{symbol}: {error}") from error
-        for prefix, given, results, ways in _derivatives(inputs, outputs, flat):
-            largest = max(largest, *(each.size for each in given))
-            source, text = _function(source, prefix + symbol, given, results, ways, stack)
-            texts.append(text)
-    return source, f"{_DECLARATIONS}\nstatic const casadi_real zeros[{largest}] = {{0}};\n" + "".join(texts)
+            if not leave_out:
+                raise
+            left_out.append(str(error))
+            continue
+        texts.append(text)
+        largest = max(largest, size)
+    zeros = f"\nstatic const casadi_real zeros[{largest}] = {{0}};\n"
+    return source, _DECLARATIONS + zeros + "".join(texts), left_out
+
+
+def _with_derivatives(
+    source: Source, symbol: str, function: Callable[..., Any], examples: Sequence[Any], stack: int
+) -> tuple[Source, str, int]:
+    """The source, the text of a function and its derivatives, and the elements of the largest input."""
+    try:
+        inputs, outputs, flat = _flat(function, examples)
+        _check_names(symbol, [*inputs, *outputs])
+    except InputError as error:
+        raise InputError(f"{symbol}: {error}") from error
+    texts, largest = "", 1
+    for prefix, given, results, ways in _derivatives(inputs, outputs, flat):
+        largest = max(largest, *(each.size for each in given))
+        source, text = _function(source, prefix + symbol, given, results, ways, stack)
+        texts += text
+    return source, texts, largest
 
 
 def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[Block], list[Block], Any]:

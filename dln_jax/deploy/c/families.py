@@ -56,6 +56,8 @@ Function = Callable[..., Mapping[str, Array]]
 Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 """By name, a function and one example of each argument, of its shape and type."""
 Named = dict[str, Function]
+DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
+"""How names of functions end that are derivatives of others."""
 SCALARS = ("energy", "hamiltonian")
 """Functions with one number as their result, whose derivative is a gradient."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from dln_jax.deploy.c.families import functions_of_run
+from dln_jax.deploy.c.families import DERIVATIVES, functions_of_run
 from dln_jax.deploy.c.source import export_c
 from dln_jax.deploy.c.text import PRECISIONS
 from dln_jax.mechanics.discrete import ITERATIONS
@@ -28,7 +28,8 @@ def export_run(
     Args:
         run: the folder.
         directory: of the export.
-        functions: names of `families.functions_of_run`; all by default, but for those that are too large for C.
+        functions: names of `families.functions_of_run`; all by default, but for those that are too large for C, and
+            for CasADi those that are no derivatives.
         name: of the export.
         precision: f32 or f64; by default that of the training.
         iterations: Newton steps of the implicit midpoint rule.
@@ -42,7 +43,9 @@ def export_run(
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     chosen = functions_of_run(trained, precision=precision, names=functions, iterations=iterations)
+    # CasADi has the first and second derivatives of what it is given.
+    itself = casadi if functions else casadi and [each for each in chosen if not each.endswith(DERIVATIVES)]
     return export_c(
-        chosen, directory, name=name, precision=precision, libm=libm, casadi=casadi, overwrite=overwrite,
+        chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
         leave_out_large=functions is None,
     )  # fmt: skip

@@ -6,7 +6,7 @@ library but <math.h>. The same functions, name and precision give the same files
 
 import importlib.metadata
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,7 +61,7 @@ def export_c(
     name: str = "model",
     precision: str | None = None,
     libm: bool = False,
-    casadi: bool = False,
+    casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
@@ -74,9 +74,10 @@ def export_c(
         name: a C name; every file and public function starts with it.
         precision: f32 or f64 of all real numbers; by default that of the examples.
         libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p, in place of ones that vectorise.
-        casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`.
+        casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; or those of these
+            names.
         leave_out_large: leave functions out that would be refused for their stack, or take more than 4,000 lines, which
-            compile for seconds each; the header names them.
+            compile for seconds each, and of NAME_casadi.c also those that CasADi cannot take; the files name them.
         overwrite: replace files that exist.
 
     Raises:
@@ -95,7 +96,7 @@ def source_files(
     name: str,
     precision: str | None = None,
     libm: bool = False,
-    casadi: bool = False,
+    casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
 ) -> dict[str, bytes]:
     """Content of each file, by its name."""
@@ -136,19 +137,27 @@ def source_files(
         "CMakeLists.txt": cmake(name),
     }
     if casadi:
-        files |= _for_casadi(functions, name, libm, precision, written_by)
+        chosen = {
+            key: each for key, each in functions.items() if key in signatures and (casadi is True or key in casadi)
+        }
+        files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
 
 
-def _for_casadi(functions: Functions, name: str, libm: bool, precision: str, written_by: str) -> dict[str, str]:
+def _for_casadi(
+    functions: Functions, name: str, libm: bool, precision: str, written_by: str, leave_out: bool
+) -> dict[str, str]:
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
     with jax.enable_x64(True):
-        source, text = external.external_functions(name, functions, libm=libm, stack=STACK)
-    about = comment(external.ABOUT.format(name=name, written_by=written_by))
+        source, text, left_out = external.external_functions(
+            name, functions, libm=libm, stack=STACK, leave_out=leave_out
+        )
+    absent = "\n".join(f"Left out: {each}" for each in left_out)
+    about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
     return {
         f"{name}_casadi.c": about + _preamble(source, name) + text,
         "CMakeLists.txt": cmake(name) + external.BUILD.format(name=name),

@@ -202,3 +202,14 @@ def test_derivatives_that_take_more_than_the_stack_are_refused():
         InputError, match=r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"
     ):
         external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, libm=True, stack=2048)
+
+
+def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):
+    functions = {"f": (jnp.tanh, [np.ones(2)]), "g": (lambda x: x.sum(), [np.ones((2, 2, 2))]), "h": (jnp.cos, [1.0])}
+    for chosen, missing in ((True, "gi"), (("f", "g"), "ghi")):
+        folder = tmp_path / str(chosen)
+        export_c(functions, folder, casadi=chosen, leave_out_large=True)
+        text = (folder / "model_casadi.c").read_text()
+        assert [each for each in "fghi" if f"DESCRIBED(casadi_model_{each}," not in text] == list(missing)
+        assert " * Left out: casadi_model_g: x is real of shape [2, 2, 2]; CasADi takes real" in text
+        assert "model_g(" in (folder / "model.h").read_text()
