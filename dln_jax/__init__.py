@@ -7,6 +7,7 @@ of shape [d], SI units): `jax.vmap` them over samples. The documentation has a p
 import importlib.metadata
 
 import dln_jax.interrupts  # noqa: F401  first, as the others take a second to import
+from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.schema import load as load_trajectories
 from dln_jax.data.schema import save as save_trajectories
@@ -24,6 +25,8 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.trees import Tree, tree_system
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
@@ -51,9 +54,12 @@ __all__ = [
     "PlainDynamics",
     "PlainFlow",
     "Problem",
+    "RecursiveSystem",
+    "Robot",
     "Run",
     "Training",
     "Trajectories",
+    "Tree",
     "__version__",
     "build",
     "describe",
@@ -67,6 +73,8 @@ __all__ = [
     "load_trajectories",
     "low_latency",
     "make_delan",
+    "read_robot",
     "save",
     "save_trajectories",
+    "tree_system",
 ]

@@ -2,11 +2,13 @@
 
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories, load, save
 from dln_jax.data.splits import Split, hold_out, merged, partition_labels, select, split
 
 __all__ = [
     "FunctionSamples",
+    "Robot",
     "SampleSplit",
     "Split",
     "Trajectories",
@@ -15,6 +17,7 @@ __all__ = [
     "load",
     "merged",
     "partition_labels",
+    "read_robot",
     "save",
     "select",
     "split",

@@ -3,7 +3,7 @@
 `equations.dynamics` and `equations.flow` turn a record of energies into functions; `integrators` step them.
 """
 
-from dln_jax.mechanics import equations, integrators
+from dln_jax.mechanics import equations, integrators, trees
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import hamiltonian_of
@@ -12,6 +12,7 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.recursive import RecursiveSystem
 
 __all__ = [
     "ClosedForm",
@@ -26,8 +27,10 @@ __all__ = [
     "PhaseRates",
     "PlainDynamics",
     "PlainFlow",
+    "RecursiveSystem",
     "equations",
     "hamiltonian_of",
     "integrators",
     "legendre",
+    "trees",
 ]

@@ -4,6 +4,7 @@
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
 | `ClosedForm` | M, V, D, and the forces that follow | `mechanics.closed_form` |
+| `RecursiveSystem` | M, V, D, and all forces by a recursion | `mechanics.recursive` |
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
 | `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural_hamiltonian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
@@ -17,7 +18,7 @@ from typing import Any, overload
 
 import jax.numpy as jnp
 
-from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain
+from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain, recursive
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
@@ -26,11 +27,12 @@ from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.types import Hamiltonian, InputError
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
 """Energies that are given in momenta."""
-Energies = NaturalSystem | ClosedForm | LagrangianSystem | Canonical
+Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical
 Driven = Energies | InverseForward
 """Systems on which forces act."""
 System = Driven | PhaseRates
@@ -38,6 +40,7 @@ System = Driven | PhaseRates
 _DYNAMICS: dict[type, Any] = {
     NaturalSystem: natural.dynamics,
     ClosedForm: closed_form.dynamics,
+    RecursiveSystem: recursive.dynamics,
     LagrangianSystem: lagrangian.dynamics,
     NaturalHamiltonian: natural_hamiltonian.dynamics,
     HamiltonianSystem: hamiltonian.dynamics,
@@ -104,6 +107,8 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
             return natural.hamiltonian(system)
         case ClosedForm():
             return hamiltonian.legendre(closed_form.lagrangian(system), iterations=1)
+        case RecursiveSystem():
+            return hamiltonian.legendre(recursive.lagrangian(system), iterations=1)
         case LagrangianSystem():
             return hamiltonian.legendre(system.lagrangian)
 

@@ -28,10 +28,11 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward
+from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.solvers.elimination import solve, solve_lower
 from dln_jax.types import Matrix, Vector
 
-Natural = NaturalSystem | ClosedForm | NaturalHamiltonian
+Natural = NaturalSystem | ClosedForm | RecursiveSystem | NaturalHamiltonian
 """Energies whose mass matrix depends on q alone."""
 Jacobians = tuple[Array, Array, Array]
 """By each of three arguments [d, d]; row i is of the i-th result."""

@@ -1,0 +1,31 @@
+"""Rigid bodies in a tree of revolute and prismatic joints: a description, its energies, and recursions over it.
+
+`tree_system(tree)` is a record for `mechanics.equations.dynamics`; `lagrangian(tree)` is the scalar that it comes from.
+"""
+
+from dln_jax.mechanics.trees.description import Tree, dh_frames, make_tree, serial, with_payload
+from dln_jax.mechanics.trees.energies import kinetic_energy, lagrangian, potential_energy, tree_energies, tree_system
+from dln_jax.mechanics.trees.frames import world_frames
+from dln_jax.mechanics.trees.inertia import PARAMETERS, inertial_parameters, moved, pseudo_inertia
+from dln_jax.mechanics.trees.recursions import composite_bodies, newton_euler, regressor
+
+__all__ = [
+    "PARAMETERS",
+    "Tree",
+    "composite_bodies",
+    "dh_frames",
+    "inertial_parameters",
+    "kinetic_energy",
+    "lagrangian",
+    "make_tree",
+    "moved",
+    "newton_euler",
+    "potential_energy",
+    "pseudo_inertia",
+    "regressor",
+    "serial",
+    "tree_energies",
+    "tree_system",
+    "with_payload",
+    "world_frames",
+]

@@ -1,0 +1,143 @@
+"""A tree of rigid bodies: which joint hangs on which, where and along which axis, and what each link weighs."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.mechanics.trees.inertia import Inertia, moved
+from dln_jax.types import InputError, JointKind, Needs
+
+EARTH = (0.0, 0.0, -9.81)
+"""m/s², z up."""
+
+
+class Tree(NamedTuple):
+    """Rigid bodies in a tree of d joints, one link behind each; a link's frame has its origin at its joint.
+
+    Where q = 0, link i is turned by `rotations[i]` and placed at `positions[i]` in the frame of the link that it hangs
+    on. It turns about `axes[i]`, or moves along it, in its own frame. The structure is plain Python; the numbers are
+    arrays, of NumPy where they are known (then zeros among them cost nothing) or of JAX where they are learned.
+    """
+
+    parents: tuple[int, ...]
+    """The link that each hangs on, one before it; -1 is the ground."""
+    joints: tuple[JointKind, ...]
+    rotations: Any
+    """[d, 3, 3]; columns are the axes of the link's frame."""
+    positions: Any
+    """[d, 3], m."""
+    axes: Any
+    """[d, 3], unit vectors."""
+    inertias: Any
+    """[d, 10], the inertial parameters of each link in its frame, as `inertia.PARAMETERS`."""
+    armature: Any
+    """[d], inertia of each motor on the joint's side, kg m² or kg."""
+    gravity: Any = np.array(EARTH)
+    """[3], m/s², in the frame of the ground."""
+    names: tuple[str, ...] = ()
+    """Of the joints, where they have any."""
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """d."""
+        return len(self.parents)
+
+    @property
+    def needs(self) -> Needs:
+        """What a model of it needs; friction is stated apart."""
+        still = isinstance(self.gravity, np.ndarray) and not self.gravity.any()
+        return Needs(joints=self.joints, gravity=not still)
+
+
+def make_tree(
+    parents: Sequence[int],
+    joints: Sequence[str],
+    rotations: Any,
+    positions: Any,
+    axes: Any,
+    inertias: Any,
+    *,
+    armature: Any = None,
+    gravity: Any = EARTH,
+    names: Sequence[str] = (),
+) -> Tree:
+    """A tree of known numbers, whose structure and shapes are checked; axes are made unit vectors.
+
+    Raises:
+        InputError: links out of order, joints of another kind, arrays of another shape or not finite, a rotation that
+            is none, or an axis of length zero.
+    """
+    d = len(parents)
+    if d == 0 or any(not -1 <= parent < link for link, parent in enumerate(parents)):
+        raise InputError(f"parents are {tuple(parents)}; expected for each link one before it, or -1 for the ground")
+    if len(joints) != d or not set(joints) <= {"revolute", "prismatic"}:
+        raise InputError(f"joints are {tuple(joints)!r:.100}; expected {d} of revolute and prismatic")
+    if names and (len(names) != d or len(set(names)) < d):
+        raise InputError(f"names are {tuple(names)!r:.100}; expected {d} different ones")
+    arrays = {
+        "rotations": (rotations, (d, 3, 3)),
+        "positions": (positions, (d, 3)),
+        "axes": (axes, (d, 3)),
+        "inertias": (inertias, (d, 10)),
+        "armature": (np.zeros(d) if armature is None else armature, (d,)),
+        "gravity": (gravity, (3,)),
+    }
+    checked = {}
+    for name, (array, shape) in arrays.items():
+        checked[name] = np.asarray(array, float)
+        if checked[name].shape != shape or not np.isfinite(checked[name]).all():
+            raise InputError(f"{name} has shape {checked[name].shape}; expected {shape}, and finite numbers")
+    turned = checked["rotations"]
+    if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turned) < 0).any():
+        raise InputError("rotations has a matrix that is no rotation; expected orthonormal columns, right-handed")
+    lengths = np.linalg.norm(checked["axes"], axis=1)
+    if not (lengths > 0).all():
+        raise InputError(f"joint {int(np.argmin(lengths))} has an axis of length zero; expected a direction")
+    checked["axes"] = checked["axes"] / lengths[:, None]
+    kinds: list[JointKind] = ["revolute" if each == "revolute" else "prismatic" for each in joints]
+    return Tree(tuple(map(int, parents)), tuple(kinds), names=tuple(names), **checked)
+
+
+def serial(rotations: Any, positions: Any, inertias: Any, *, axes: Any = None, **others: Any) -> Tree:
+    """An arm: each link hangs on the one before; by default revolute joints about z. Others as for `make_tree`."""
+    d = np.shape(positions)[0]
+    axes = np.tile([0.0, 0.0, 1.0], (d, 1)) if axes is None else axes
+    joints = others.pop("joints", ("revolute",) * d)
+    return make_tree(range(-1, d - 1), joints, rotations, positions, axes, inertias, **others)
+
+
+def dh_frames(rows: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [d, 3, 3] and positions [d, 3] of an arm whose joints turn about z, from Denavit-Hartenberg rows.
+
+    Args:
+        rows: [d, 4], modified, after Craig: each (alpha, a, d, theta) is a turn by alpha, rad, about x and a shift by
+            a, m, along it, then a turn by theta about z and a shift by d along it.
+
+    Raises:
+        InputError: rows of another shape.
+    """
+    table = np.asarray(rows, float)
+    if table.ndim != 2 or table.shape[1] != 4:
+        raise InputError(f"rows have shape {table.shape}; expected [d, 4]: alpha, a, d, theta")
+    alpha, a, offset, theta = table.T
+    sa, ca, st, ct, zero = np.sin(alpha), np.cos(alpha), np.sin(theta), np.cos(theta), 0 * a
+    rotations = np.array([[ct, -st, zero], [st * ca, ct * ca, -sa], [st * sa, ct * sa, ca]]).transpose(2, 0, 1)
+    positions = np.stack([a, -sa * offset, ca * offset], axis=1)
+    rounded = np.where(np.abs(rotations) < 1e-15, 0.0, rotations)
+    return rounded, np.where(np.abs(positions) < 1e-15, 0.0, positions)
+
+
+def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = None, position: Any = None) -> Tree:
+    """The tree with a body fixed to a link, in whose frame the body's own has this rotation and position.
+
+    Raises:
+        InputError: no such link.
+    """
+    if not 0 <= link < tree.degrees_of_freedom:
+        raise InputError(f"link is {link}; expected 0 to {tree.degrees_of_freedom - 1}")
+    there = moved(inertia, np.eye(3) if rotation is None else rotation, np.zeros(3) if position is None else position)
+    if isinstance(tree.inertias, np.ndarray) and isinstance(there, np.ndarray):
+        return tree._replace(inertias=tree.inertias + there * (np.arange(len(tree.parents)) == link)[:, None])
+    return tree._replace(inertias=jnp.asarray(tree.inertias).at[link].add(there))

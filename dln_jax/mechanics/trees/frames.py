@@ -1,0 +1,158 @@
+"""Frames of a tree's links, and vectors between them.
+
+Every joint is about z of its link here: `aligned` turns the links of a tree so. Rotations that are known and only
+exchange axes cost nothing but signs.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.inertia import moved
+from dln_jax.types import Vector
+
+Vector3 = Float[Array, "3"]
+
+
+class Placed(NamedTuple):
+    """A link's frame in that of the link that it hangs on, at one state."""
+
+    rotation: Any
+    """[3, 3] where q = 0."""
+    turned: tuple[Array, Array] | None
+    """Cosine and sine of the joint's angle; `None` for a prismatic joint."""
+    position: Any
+    """[3]."""
+
+
+def aligned(tree: Tree) -> Tree:
+    """The same bodies and joints in frames whose joint axis is z; payloads and frames of links are others then."""
+    if not isinstance(tree.axes, np.ndarray) or np.array_equal(
+        tree.axes, np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
+    ):
+        return tree
+    turns = [_onto(axis) for axis in tree.axes]
+    rotations, positions = [], []
+    for link, parent in enumerate(tree.parents):
+        # In the frame of the parent as it was, then as it is turned.
+        rotation, position = tree.rotations[link] @ turns[link], tree.positions[link]
+        back = np.eye(3) if parent < 0 else turns[parent].T
+        rotations.append(back @ rotation)
+        positions.append(back @ position)
+    inertias = [moved(each, turn.T, np.zeros(3)) for each, turn in zip(tree.inertias, turns, strict=True)]
+    numpy = np if all(isinstance(each, np.ndarray) for each in (*rotations, *positions, *inertias)) else jnp
+    rounded = [numpy.stack(each) for each in (rotations, positions, inertias)]
+    axes = np.tile([0.0, 0.0, 1.0], (len(turns), 1))
+    return tree._replace(rotations=rounded[0], positions=rounded[1], inertias=rounded[2], axes=axes)
+
+
+def _onto(axis: np.ndarray) -> np.ndarray:
+    """A rotation whose third column is an axis, of whole numbers where that is one of the frame's."""
+    place = int(np.argmax(np.abs(axis)))
+    first = np.eye(3)[(place + 1) % 3]
+    first = first - axis * (axis @ first)
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis], axis=1) + 0.0
+
+
+def placed(tree: Tree, q: Vector) -> list[Placed]:
+    """Where each link of an aligned tree is on the one that it hangs on."""
+    found = []
+    for link, kind in enumerate(tree.joints):
+        rotation, position = tree.rotations[link], tree.positions[link]
+        if kind == "revolute":
+            found.append(Placed(rotation, (jnp.cos(q[link]), jnp.sin(q[link])), position))
+        else:
+            found.append(Placed(rotation, None, position + rotation[:, 2] * q[link]))
+    return found
+
+
+def outwards(frame: Placed, vector: Vector3) -> Vector3:
+    """A vector of the parent's frame in that of the link."""
+    x, y, z = _product(frame.rotation.T, vector)
+    if frame.turned is None:
+        return jnp.stack([x, y, z])
+    c, s = frame.turned
+    return jnp.stack([c * x + s * y, c * y - s * x, z])
+
+
+def inwards(frame: Placed, vector: Vector3) -> Vector3:
+    """A vector of the link's frame in that of the parent."""
+    if frame.turned is not None:
+        c, s = frame.turned
+        x, y, z = vector
+        vector = jnp.stack([c * x - s * y, s * x + c * y, z])
+    return jnp.stack(_product(frame.rotation, vector))
+
+
+def _product(matrix: Any, vector: Vector3) -> list[Any]:
+    """Matrix times vector, element by element, without terms that are known to be zero."""
+    if not isinstance(matrix, np.ndarray):
+        return list(matrix @ vector)
+    rows = []
+    for row in matrix:
+        terms = [
+            vector[k] if factor == 1 else -vector[k] if factor == -1 else factor * vector[k]
+            for k, factor in enumerate(row.tolist())
+            if factor != 0
+        ]
+        rows.append(sum(terms[1:], start=terms[0]))
+    return rows
+
+
+def rotation_of(frame: Placed) -> Float[Array, "3 3"]:
+    """Of the link's frame in the parent's; columns are its axes."""
+    return jax.vmap(lambda column: inwards(frame, column), out_axes=1, in_axes=1)(jnp.eye(3, dtype=_dtype(frame)))
+
+
+def _dtype(frame: Placed) -> Any:
+    return frame.turned[0].dtype if frame.turned is not None else jnp.asarray(frame.position).dtype
+
+
+def cross(a: Any, b: Any) -> Vector3:
+    """a x b, of which either may be known; then zeros among its numbers cost nothing."""
+
+    def difference(i: int, j: int) -> Any:
+        terms = [(1, a[i], b[j]), (-1, a[j], b[i])]
+        kept = [(sign, x, y) for sign, x, y in terms if not (_is_zero(x) or _is_zero(y))]
+        if not kept:
+            return 0.0
+        total = kept[0][0] * (kept[0][1] * kept[0][2]) if kept[0][0] > 0 else -(kept[0][1] * kept[0][2])
+        return total - kept[1][1] * kept[1][2] if len(kept) == 2 else total
+
+    return jnp.stack([jnp.asarray(difference(*pair)) for pair in ((1, 2), (2, 0), (0, 1))])
+
+
+def _is_zero(number: Any) -> bool:
+    return isinstance(number, float | np.floating) and bool(number == 0)
+
+
+def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Array, "d 3"]]:
+    """Rotations and origins of the links' own frames in that of the ground, for figures and tips."""
+    rotations: list[Any] = []
+    origins: list[Any] = []
+    for link, (parent, kind) in enumerate(zip(tree.parents, tree.joints, strict=True)):
+        axis = jnp.asarray(tree.axes[link], q.dtype)
+        turn, shift = (_turn(axis, q[link]), 0.0 * axis) if kind == "revolute" else (jnp.eye(3), axis * q[link])
+        rotation = jnp.asarray(tree.rotations[link], q.dtype)
+        position = jnp.asarray(tree.positions[link], q.dtype) + rotation @ shift
+        rotation = rotation @ turn
+        if parent >= 0:
+            position = origins[parent] + rotations[parent] @ position
+            rotation = rotations[parent] @ rotation
+        rotations.append(rotation)
+        origins.append(position)
+    return jnp.stack(rotations), jnp.stack(origins)
+
+
+def _turn(axis: Vector3, angle: Array) -> Float[Array, "3 3"]:
+    """Rodrigues' formula."""
+    x, y, z = axis
+    zero = jnp.zeros_like(x)
+    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    return jnp.eye(3, dtype=axis.dtype) + jnp.sin(angle) * hat + (1 - jnp.cos(angle)) * hat @ hat

@@ -1,0 +1,67 @@
+"""The ten inertial parameters of a rigid body, in which its energies and forces are linear.
+
+    theta = (m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)
+
+m in kg; h = m c in kg m, of the centre of mass c; I in kg m² about the origin of the body's frame, along its axes.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+PARAMETERS = ("m", "h_x", "h_y", "h_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+Inertia = Float[Array, "10"] | Float[np.ndarray, "10"]
+_ROWS, _COLUMNS = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+def inertial_parameters(mass: Any, centre: Any, about_centre: Any) -> Inertia:
+    """theta of a body, of NumPy in double precision where all is known.
+
+    Args:
+        mass: m, kg.
+        centre: of mass [3], m.
+        about_centre: moments about the centre of mass [3, 3], kg m².
+    """
+    m, c, about = _alike(mass, centre, about_centre)
+    return _joined(m, m * c, about + m * (c @ c * np.eye(3) - c[:, None] * c))
+
+
+def parts(theta: Inertia) -> tuple[Any, Any, Any]:
+    """m, h [3] and I [3, 3]."""
+    return theta[0], theta[1:4], theta[4:][_PLACES]
+
+
+def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
+    """theta of the same body in the frame in which its own has this rotation (columns are its axes) and position."""
+    own, R, r = _alike(theta, rotation, position)
+    m, h, moments = parts(own)
+    turned = R @ h
+    shifted = (2 * (turned @ r) + m * (r @ r)) * np.eye(3)
+    outer = turned[:, None] * r + r[:, None] * turned + m * r[:, None] * r
+    return _joined(m, turned + m * r, R @ moments @ R.T + shifted - outer)
+
+
+def pseudo_inertia(theta: Inertia) -> Any:
+    """The matrix that is positive definite exactly for bodies that exist (Wensing, Kim and Slotine, RA-L 2018).
+
+    J = [[tr(I) / 2 - I, h], [hᵀ, m]]
+    """
+    (own,) = _alike(theta)
+    m, h, moments = parts(own)
+    numpy = np if isinstance(own, np.ndarray) else jnp
+    spread = 0.5 * numpy.trace(moments) * np.eye(3) - moments
+    return numpy.block([[spread, h[:, None]], [h[None, :], m.reshape(1, 1)]])
+
+
+def _joined(m: Any, h: Any, moments: Any) -> Any:
+    numpy = np if isinstance(moments, np.ndarray) else jnp
+    return numpy.concatenate([m.reshape(1), h, moments[_ROWS, _COLUMNS]])
+
+
+def _alike(*arrays: Any) -> list[Any]:
+    """All as arrays of NumPy, or all of JAX where any is."""
+    learned = any(isinstance(each, Array) for each in arrays)
+    return [jnp.asarray(each) if learned else np.asarray(each, float) for each in arrays]

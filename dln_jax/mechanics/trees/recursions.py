@@ -1,0 +1,127 @@
+"""Dynamics of a tree by recursions over its links, for one state: each takes some hundred operations a link.
+
+`newton_euler` gives forces (Luh, Walker and Paul 1980), `composite_bodies` the mass matrix (Walker and Orin 1982); both
+after Featherstone, Rigid Body Dynamics Algorithms, 2008. Vectors are in the frame of their link, forces about its
+origin. Gravity is an acceleration of the ground.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.frames import Placed, aligned, cross, inwards, outwards, placed
+from dln_jax.mechanics.trees.inertia import parts
+from dln_jax.types import Matrix, Vector
+
+
+def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
+    """Generalised force tau [d] that a motion takes, gravity and armature included, friction not."""
+    tree = aligned(tree)
+    frames = placed(tree, q)
+    forces: list[Any] = []
+    motions: list[Any] = []
+    for link, (parent, frame) in enumerate(zip(tree.parents, frames, strict=True)):
+        w, dw, a = _on_parent(motions[parent] if parent >= 0 else None, frame, tree.gravity)
+        rate, change = qd[link], qdd[link]
+        if tree.joints[link] == "revolute":
+            spin = rate if w is None else w[2] + rate
+            turning = jnp.zeros(2, q.dtype) if w is None else jnp.stack([w[1] * rate, -w[0] * rate])
+            dw = jnp.append(turning, change) if dw is None else dw + jnp.append(turning, change)
+            w = jnp.append(jnp.zeros(2, q.dtype) if w is None else w[:2], spin)
+        else:
+            coriolis = jnp.zeros(2, q.dtype) if w is None else 2 * jnp.stack([w[1] * rate, -w[0] * rate])
+            a = a + jnp.append(coriolis, change)
+        motions.append((w, dw, a))
+        forces.append(_force(tree.inertias[link], w, dw, a))
+    tau: list[Any] = [None] * len(frames)
+    for link in reversed(range(len(frames))):
+        force, moment = forces[link]
+        tau[link] = moment[2] if tree.joints[link] == "revolute" else force[2]
+        parent = tree.parents[link]
+        if parent >= 0:
+            carried, turned = inwards(frames[link], force), inwards(frames[link], moment)
+            before = forces[parent]
+            forces[parent] = (before[0] + carried, before[1] + turned + cross(frames[link].position, carried))
+    return jnp.stack(tau) + tree.armature * qdd
+
+
+def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]:
+    """Angular velocity and acceleration, and the acceleration of the link's origin, if the joint were still.
+
+    Angular ones are `None` where they are zero: on the ground, and along prismatic joints from there.
+    """
+    if motion is None:
+        return None, None, outwards(frame, -jnp.asarray(gravity, jnp.result_type(float)))
+    w, dw, a = motion
+    if w is not None:
+        r = frame.position
+        a = a + cross(dw, r) + cross(w, cross(w, r))
+        w, dw = outwards(frame, w), outwards(frame, dw)
+    return w, dw, outwards(frame, a)
+
+
+def _force(theta: Any, w: Any, dw: Any, a: Any) -> tuple[Any, Any]:
+    """Force and moment that a body's motion takes."""
+    m, h, moments = parts(theta)
+    force, moment = m * a, cross(h, a)
+    if w is not None:
+        force = force + cross(dw, h) + cross(w, cross(w, h))
+        moment = moment + moments @ dw + cross(w, moments @ w)
+    return force, moment
+
+
+def composite_bodies(tree: Tree, q: Vector) -> Matrix:
+    """Mass matrix M [d, d], armature included."""
+    tree = aligned(tree)
+    frames = placed(tree, q)
+    d = len(frames)
+    bodies = [parts(theta) for theta in tree.inertias]
+    M: dict[tuple[int, int], Any] = {}
+    for link in reversed(range(d)):
+        m, h, moments = bodies[link]
+        if tree.joints[link] == "revolute":  # momentum of a unit rate
+            force, moment = jnp.stack([-h[1], h[0], jnp.zeros_like(h[0])]), moments[:, 2]
+        else:
+            force, moment = jnp.stack([*(jnp.zeros_like(m),) * 2, m]), jnp.stack([h[1], -h[0], jnp.zeros_like(m)])
+        M[link, link] = moment[2] if tree.joints[link] == "revolute" else force[2]
+        other, frame = link, frames[link]
+        while tree.parents[other] >= 0:
+            force, moment = inwards(frame, jnp.asarray(force)), inwards(frame, jnp.asarray(moment))
+            moment = moment + cross(frame.position, force)
+            other = tree.parents[other]
+            frame = frames[other]
+            M[link, other] = M[other, link] = moment[2] if tree.joints[other] == "revolute" else force[2]
+        if tree.parents[link] >= 0:
+            carried = _carried(bodies[link], frames[link])
+            bodies[tree.parents[link]] = tuple(a + b for a, b in zip(bodies[tree.parents[link]], carried, strict=True))
+    zero = jnp.zeros((), q.dtype)
+    rows = [jnp.stack([jnp.asarray(M.get((i, j), zero)) for j in range(d)]) for i in range(d)]
+    return jnp.stack(rows) + jnp.diag(jnp.asarray(tree.armature, q.dtype))
+
+
+def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
+    """m, h and I of a body in the frame of the link that it hangs on."""
+    m, h, moments = body
+    turned = inwards(frame, jnp.asarray(h))
+    half = jnp.stack([inwards(frame, column) for column in jnp.asarray(moments).T], axis=1)
+    there = jnp.stack([inwards(frame, row) for row in half])
+    r = jnp.asarray(frame.position)
+    shifted = (2 * (turned @ r) + m * (r @ r)) * np.eye(3)
+    outer = turned[:, None] * r
+    return m, turned + m * r, there + shifted - outer - outer.T - m * r[:, None] * r
+
+
+def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
+    """Phi with tau = Phi theta, theta the links' ten parameters end to end and then the armature, P = 11 d."""
+
+    def force(inertias: Array, armature: Array) -> Vector:
+        return newton_euler(tree._replace(inertias=inertias, armature=armature), q, qd, qdd)
+
+    d = q.shape[0]
+    _, pull_back = jax.vjp(force, jnp.zeros((d, 10), q.dtype), jnp.zeros(d, q.dtype))
+    by_link, by_motor = jax.vmap(pull_back)(jnp.eye(d, dtype=q.dtype))
+    return jnp.concatenate([by_link.reshape(d, -1), by_motor], axis=1)

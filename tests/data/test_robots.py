@@ -1,0 +1,163 @@
+"""Robots that MuJoCo reads move as they do in MuJoCo, and as in Pinocchio where it is installed."""
+
+import textwrap
+
+import jax
+import numpy as np
+import pytest
+
+from dln_jax.data.robots import read_robot
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import tree_system, world_frames
+from dln_jax.types import InputError
+
+mujoco = pytest.importorskip("mujoco")
+LINK = """
+<link name="{name}">
+  <inertial>
+    <origin xyz="0.1 -0.05 0.2" rpy="0.3 -0.2 0.5"/> <mass value="{mass}"/>
+    <inertia ixx="0.03" iyy="0.04" izz="0.02" ixy="0.004" ixz="-0.002" iyz="0.001"/>
+  </inertial>
+  <visual><geometry><mesh filename="nowhere/{name}.stl"/></geometry></visual>
+</link>"""
+JOINT = """
+<joint name="{name}" type="{kind}">
+  <parent link="{parent}"/> <child link="{child}"/> <origin xyz="{xyz}" rpy="0.4 -0.3 0.2"/> <axis xyz="{axis}"/>
+  <limit lower="-1" upper="2" effort="30" velocity="3"/> <dynamics damping="0.2" friction="0.1"/>
+</joint>"""
+
+
+def urdf(*parts):
+    return f'<robot name="arm"><link name="base"/>{"".join(parts)}</robot>'
+
+
+ARM = urdf(
+    LINK.format(name="one", mass=2.0),
+    LINK.format(name="two", mass=1.5),
+    LINK.format(name="three", mass=0.7),
+    LINK.format(name="hand", mass=0.4),
+    JOINT.format(name="shoulder", kind="revolute", parent="base", child="one", xyz="0 0 0.3", axis="0 0 1"),
+    JOINT.format(name="elbow", kind="continuous", parent="one", child="two", xyz="0.2 0 0.1", axis="0.6 0 0.8"),
+    JOINT.format(name="slide", kind="prismatic", parent="two", child="three", xyz="0 0.3 0", axis="0 1 0"),
+    JOINT.format(name="weld", kind="fixed", parent="three", child="hand", xyz="0.1 0 0.1", axis="1 0 0"),
+)
+BRANCHED = """
+<mujoco><option gravity="1 -2 -9"/><worldbody>
+  <body name="stand" pos="0.1 0 0.5" euler="10 20 30"><geom type="box" size=".1 .1 .1"/>
+    <body name="a" pos="0 0.2 0.3" euler="40 0 10">
+      <joint name="x" type="hinge" axis="1 0 0" pos="0 0.05 0.1" armature="0.3"/>
+      <joint name="y" type="slide" axis="0 1 1"/>
+      <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.4"/>
+      <body name="b" pos="0 0 0.4"><joint name="z" damping="0.5"/><geom type="sphere" size=".1" pos=".2 0 0"/></body>
+      <body name="c" pos="0.3 0 0" euler="0 90 0">
+        <joint name="w" axis="0 1 0"/><geom type="sphere" size=".15" pos="0 .2 0"/>
+        <body name="d" pos="0 0.1 0.2"><geom type="box" size=".05 .1 .02"/></body></body>
+    </body>
+  </body>
+</worldbody></mujoco>"""
+FILES = {"arm.urdf": ARM, "branched.xml": BRANCHED}
+
+
+def written(folder, name, text):
+    path = folder / name
+    path.write_text(textwrap.dedent(text))
+    return path
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_forces_are_those_of_mujoco(name, tmp_path):
+    path = written(tmp_path, name, FILES[name])
+    robot = read_robot(path)
+    text = FILES[name].replace("<visual>", "<!--").replace("</visual>", "-->")
+    model = mujoco.MjModel.from_xml_string(text)
+    model.dof_damping[:], model.dof_frictionloss[:] = 0, 0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    data = mujoco.MjData(model)
+    motion = dynamics(tree_system(robot.tree), degrees_of_freedom=model.nv)
+    inverse, forward = jax.jit(motion.inverse_dynamics), jax.jit(motion.forward_dynamics)
+    random = np.random.default_rng(0)
+    for _ in range(5):
+        data.qpos, data.qvel, data.qacc = random.normal(size=(3, model.nv))
+        wanted = np.array(data.qacc)
+        mujoco.mj_inverse(model, data)
+        tau = inverse(data.qpos, data.qvel, wanted)
+        np.testing.assert_allclose(tau, data.qfrc_inverse, rtol=1e-10, atol=1e-10)
+        data.qfrc_applied = np.asarray(tau)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(forward(data.qpos, data.qvel, tau), data.qacc, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(forward(data.qpos, data.qvel, tau), wanted, rtol=1e-9, atol=1e-9)
+        origins = world_frames(robot.tree, jax.numpy.asarray(data.qpos))[1]
+        turning = np.array(robot.tree.joints) == "revolute"  # MuJoCo's anchor of a slide stays behind
+        np.testing.assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
+
+
+def test_forces_are_those_of_pinocchio(tmp_path):
+    pinocchio = pytest.importorskip("pinocchio")
+    path = written(tmp_path, "arm.urdf", ARM.replace("continuous", "revolute"))
+    robot, model = read_robot(path), pinocchio.buildModelFromUrdf(str(path))
+    order = [model.joints[model.getJointId(name)].idx_q for name in robot.tree.names]
+    state = np.random.default_rng(0).normal(size=(3, model.nv))
+    tau = pinocchio.rnea(model, model.createData(), *state)[order]
+    ours = dynamics(tree_system(robot.tree)).inverse_dynamics(*state[:, order])
+    np.testing.assert_allclose(ours, tau, rtol=1e-10, atol=1e-10)
+
+
+def test_what_a_file_states_of_its_joints(tmp_path):
+    robot = read_robot(written(tmp_path, "arm.urdf", ARM))
+    assert robot.tree.names == ("shoulder", "elbow", "slide")
+    assert robot.tree.joints == ("revolute", "revolute", "prismatic")
+    np.testing.assert_array_equal(robot.damping, [0.2] * 3)
+    np.testing.assert_array_equal(robot.coulomb, [0.1] * 3)
+    np.testing.assert_array_equal(robot.position_limits, [[-1, 2], [-np.inf, np.inf], [-1, 2]])
+    np.testing.assert_array_equal(robot.force_limits, [[-30, 30]] * 3)
+    np.testing.assert_array_equal(robot.tree.gravity, [0, 0, -9.81])
+
+
+ONE = LINK.format(name="one", mass=1.0)
+SHOULDER = JOINT.format(name="shoulder", kind="revolute", parent="base", child="one", xyz="0 0 0", axis="0 0 1")
+REFUSED = {
+    "no XML": ("arm.urdf", "hello", "no XML"),
+    "another element": ("arm.urdf", "<sdf/>", "its outer element is <sdf>"),
+    "cyclic": (
+        "arm.urdf",
+        urdf(
+            ONE, SHOULDER, JOINT.format(name="b", kind="revolute", parent="one", child="one", xyz="0 0 0", axis="0 0 1")
+        ),
+        "MuJoCo cannot compile it",
+    ),
+    "massless": (
+        "arm.urdf",
+        urdf('<link name="one"/>', SHOULDER),
+        r"MuJoCo cannot compile it: .*mass|joint 'shoulder' moves no mass",
+    ),
+    "mimic": (
+        "arm.urdf",
+        urdf(ONE, SHOULDER.replace("<axis", '<mimic joint="other"/><axis')),
+        r"joint 'shoulder' follows another \(mimic\)",
+    ),
+    "nothing moves": ("arm.urdf", urdf(ONE, SHOULDER.replace("revolute", "fixed")), "it has 0 joints"),
+    "a ball": (
+        "ball.xml",
+        '<mujoco><worldbody><body><joint name="hip" type="ball"/><geom size="1"/></body></worldbody></mujoco>',
+        "joint 'hip' is a ball; expected revolute and prismatic",
+    ),
+    "floating": (
+        "free.xml",
+        '<mujoco><worldbody><body><freejoint name="root"/><geom size="1"/></body></worldbody></mujoco>',
+        "joint 'root' is free",
+    ),
+    "entities": ("arm.urdf", '<!DOCTYPE x [<!ENTITY a "b">]><robot/>', "entities"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_tree_is_refused_in_one_line(case, tmp_path):
+    name, text, message = REFUSED[case]
+    with pytest.raises(InputError, match=message) as raised:
+        read_robot(written(tmp_path, name, text))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        read_robot(tmp_path / "arm.urdf")
