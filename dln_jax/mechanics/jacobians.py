@@ -116,6 +116,8 @@ def _momentum(system: Natural, q: Vector, qd: Vector) -> Vector:
     if isinstance(system, NaturalSystem):
         factor = system.cholesky(q)
         return factor @ (factor.T @ qd)  # two small products, where M takes a large one
+    if isinstance(system, RecursiveSystem):
+        return system.mass_matrix(q) @ qd  # whose parts would be differences of recursions
     return dynamics(system).decompose(q, jnp.zeros_like(qd), qd).inertial
 
 
