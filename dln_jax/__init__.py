@@ -20,6 +20,7 @@ from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
@@ -68,6 +69,7 @@ __all__ = [
     "export_c",
     "fit",
     "flow",
+    "joint_dissipation",
     "load",
     "load_c",
     "load_trajectories",

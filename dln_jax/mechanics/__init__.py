@@ -7,6 +7,7 @@ from dln_jax.mechanics import equations, integrators, trees
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Decomposition, Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.equations import hamiltonian_of
+from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.natural import NaturalSystem
@@ -31,6 +32,7 @@ __all__ = [
     "equations",
     "hamiltonian_of",
     "integrators",
+    "joint_dissipation",
     "legendre",
     "trees",
 ]
