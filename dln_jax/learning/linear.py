@@ -66,6 +66,7 @@ def fit_linear(
     *,
     ridge: float = 0.0,
     rank_tolerance: float | None = None,
+    negligible: float = 0.0,
     chunk_size: int = 4096,
 ) -> LinearFit:
     """The parameters that minimise the torque error on the data, computed in float64 whatever the model's dtype.
@@ -78,6 +79,7 @@ def fit_linear(
         data: trajectories to fit; hold out those that the result is judged by.
         ridge: dimensionless, as in `solvers.least_squares.solve`.
         rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
+        negligible: as there; about 1e-12 for rigid trees, some of whose parameters have no effect but rounding's.
         chunk_size: samples whose design matrix is in memory at a time.
 
     Raises:
@@ -98,7 +100,9 @@ def fit_linear(
                 weighted = columns / scale[:, None]
                 yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
 
-        solution = least_squares.solve_chunks(equations(), ridge=ridge, rank_tolerance=rank_tolerance)
+        solution = least_squares.solve_chunks(
+            equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
+        )
         parameters = _unravel(solution.x, like)
         squares = 0.0
         for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):

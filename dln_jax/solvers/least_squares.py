@@ -38,6 +38,7 @@ def solve(
     *,
     ridge: float = 0.0,
     rank_tolerance: float | None = None,
+    negligible: float = 0.0,
 ) -> Solution:
     """The x of least |A x - b|² + ridge |D x|², shortest in |D x| where several are.
 
@@ -47,6 +48,8 @@ def solve(
         ridge: dimensionless; with orthogonal columns it divides each unknown by 1 + ridge.
         rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
             the decomposition, 2.2e-16 max(N, P).
+        negligible: columns with norms up to it, relative to the largest, are zeros: what terms that cancel leave of
+            each other is rounding, and would count as much as any column once it is scaled.
 
     Raises:
         InputError: numbers that are not finite, a negative ridge, a tolerance outside [0, 1).
@@ -60,12 +63,14 @@ def solve(
         raise InputError(f"ridge is {ridge}; expected a number >= 0")
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(A.shape))
-    if not 0 <= rank_tolerance < 1:
-        raise InputError(f"rank_tolerance is {rank_tolerance}; expected a number in [0, 1)")
+    for name, given in (("rank_tolerance", rank_tolerance), ("negligible", negligible)):
+        if not 0 <= given < 1:
+            raise InputError(f"{name} is {given}; expected a number in [0, 1)")
 
     norms = np.linalg.norm(A, axis=0)
-    scale = np.where(norms > 0, norms, 1.0)
-    scaled, rhs = A / scale, b
+    seen = norms > negligible * norms.max(initial=0.0)
+    scale = np.where(seen, norms, 1.0)
+    scaled, rhs = np.where(seen, A, 0.0) / scale, b
     if A.shape[0] > A.shape[1] + 1:
         triangle = triangular_factor(scaled, rhs)
         scaled, rhs = triangle[:, :-1], triangle[:, -1]
@@ -82,7 +87,11 @@ def solve(
 
 
 def solve_chunks(
-    chunks: Iterable[tuple[np.ndarray, np.ndarray]], *, ridge: float = 0.0, rank_tolerance: float | None = None
+    chunks: Iterable[tuple[np.ndarray, np.ndarray]],
+    *,
+    ridge: float = 0.0,
+    rank_tolerance: float | None = None,
+    negligible: float = 0.0,
 ) -> Solution:
     """`solve` for equations (A, b) that come in chunks of rows, of which only one is held at a time.
 
@@ -98,7 +107,7 @@ def solve_chunks(
         raise InputError("there are no equations to solve; expected at least one")
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(rows, triangle.shape[1] - 1))
-    return solve(triangle[:, :-1], triangle[:, -1], ridge=ridge, rank_tolerance=rank_tolerance)
+    return solve(triangle[:, :-1], triangle[:, -1], ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible)
 
 
 def triangular_factor(A: Float[np.ndarray, "N P"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, "K P_and_1"]:

@@ -1,0 +1,68 @@
+"""The parameters of a rigid tree with known frames are found by one linear fit, and predict unseen motions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data.schema import from_arrays
+from dln_jax.learning.linear import fit_linear, linearised
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import InputError
+
+FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [np.pi / 2, 0.1, 0.4, 0.2]])
+LINKS = [inertial_parameters(m, [0.05, -0.02, 0.1], np.diag([0.02, 0.03, 0.01])) for m in (3.0, 2.0, 1.0)]
+ARM = serial(*FRAMES, LINKS, armature=[0.1, 0.2, 0.05])
+FRICTION = {"viscous": [0.2, 0.1, 0.3], "coulomb": [0.5, 0.3, 0.1], "offset": [0.1, 0.0, -0.2]}
+
+
+def data(seed, noise, *, friction, samples=300):
+    random = np.random.default_rng(seed)
+    state = random.normal(size=(3, samples, 3))
+    dissipation = joint_dissipation(*FRICTION.values()) if friction else None
+    tau = jax.jit(jax.vmap(dynamics(tree_system(ARM, dissipation)).inverse_dynamics))(*state)
+    arrays = dict(zip(("q", "qd", "qdd"), state, strict=True))
+    trajectory = np.arange(samples)
+    return from_arrays(
+        {**arrays, "t": np.zeros(samples), "tau": tau + noise * random.normal(size=tau.shape), "trajectory": trajectory}
+    )
+
+
+@pytest.mark.parametrize("friction", [False, True])
+def test_a_fit_is_exact_and_knows_what_it_cannot_know(friction):
+    model = make_rigid_tree(ARM, friction=friction)
+    train, test = (data(seed, 0.0, friction=friction) for seed in range(2))
+    fit = fit_linear(model, train, negligible=1e-12)
+    columns = jax.vmap(lambda *state: linearised(model, fit.parameters, *state)[0])(train.q, train.qd, train.qdd)
+    columns = np.asarray(columns).reshape(-1, 33 + 9 * friction)
+    assert fit.rank == np.linalg.matrix_rank(columns, rtol=1e-10) == 16 + 9 * friction
+    assert fit.parameter_count == 33 + 9 * friction and fit.condition < 10
+    predicted = jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics)(test.q, test.qd, test.qdd)
+    assert np.abs(predicted - test.tau).max() < 1e-10 * np.abs(test.tau).max()
+    if friction:
+        for name, values in FRICTION.items():
+            np.testing.assert_allclose(getattr(fit.parameters, name), values, atol=1e-9)
+
+
+def test_noise_is_averaged():
+    model, noise = make_rigid_tree(ARM), 0.1
+    fit = fit_linear(model, data(0, noise, friction=False), negligible=1e-12)
+    test = data(1, 0.0, friction=False)
+    predicted = jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics)(test.q, test.qd, test.qdd)
+    # Of 900 equations the fit takes one for each parameter that it determines.
+    expected = noise * np.sqrt(fit.rank / 900)
+    assert 0.5 * expected < np.sqrt(np.mean((predicted - test.tau) ** 2)) < 2 * expected
+
+
+def test_a_scale_must_be_positive():
+    with pytest.raises(InputError, match="velocity_scale"):
+        make_rigid_tree(ARM, friction=True, velocity_scale=0.0)
+
+
+def test_it_starts_from_the_tree():
+    parameters = make_rigid_tree(ARM).init(jax.random.key(0))
+    np.testing.assert_array_equal(parameters.inertias, jnp.asarray(ARM.inertias))
+    assert parameters.viscous is None
