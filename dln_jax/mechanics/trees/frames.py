@@ -6,7 +6,6 @@ exchange axes cost nothing but signs.
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -103,15 +102,6 @@ def _product(matrix: Any, vector: Vector3) -> list[Any]:
         ]
         rows.append(sum(terms[1:], start=terms[0]))
     return rows
-
-
-def rotation_of(frame: Placed) -> Float[Array, "3 3"]:
-    """Of the link's frame in the parent's; columns are its axes."""
-    return jax.vmap(lambda column: inwards(frame, column), out_axes=1, in_axes=1)(jnp.eye(3, dtype=_dtype(frame)))
-
-
-def _dtype(frame: Placed) -> Any:
-    return frame.turned[0].dtype if frame.turned is not None else jnp.asarray(frame.position).dtype
 
 
 def cross(a: Any, b: Any) -> Vector3:
