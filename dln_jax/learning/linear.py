@@ -91,27 +91,20 @@ def fit_linear(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(data))
         zero = np.zeros(count(like))
-        # One program for both passes.
-        one = functools.partial(linearised, model)
-        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+        linearise = design(model)  # one program for both passes
 
         def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, chunk_size):
+            for columns, _, tau in design_chunks(linearise, unravelled(zero, like), data, chunk_size):
                 weighted = columns / scale[:, None]
                 yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
 
         solution = least_squares.solve_chunks(
             equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
         )
-        parameters = _unravel(solution.x, like)
+        parameters = unravelled(solution.x, like)
         squares = 0.0
-        for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):
-            rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(solution.x))
-            if not (abs(columns @ solution.x - predicted) <= rounding).all():
-                raise InputError(
-                    "the model's torque is not linear in its parameters, as a linear fit expects: "
-                    "take make_trigonometric, or train this model by its residuals"
-                )
+        for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size):
+            require_linear(columns, solution.x, predicted)
             squares += float(np.sum((predicted - tau) ** 2))
     return LinearFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
@@ -137,7 +130,23 @@ def linearised(
     return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
 
 
-def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
+def design(model: Model) -> Callable:
+    """(parameters, q, qd, qdd [N, d] each) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
+    one = functools.partial(linearised, model)
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+
+
+def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> None:
+    """Raises `InputError` unless Phi theta is the model's force, but for rounding."""
+    rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(theta))
+    if not (abs(columns @ theta - predicted) <= rounding).all():
+        raise InputError(
+            "the model's torque is not linear in its parameters, as a linear fit expects: "
+            "take make_trigonometric, or train this model by its residuals"
+        )
+
+
+def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
     """A tree like another, of the elements of a vector in the order of its leaves; NumPy, so that nothing compiles."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
@@ -145,7 +154,7 @@ def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
     return jax.tree.unflatten(structure, parts)
 
 
-def _chunks(
+def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
