@@ -50,31 +50,43 @@ def read_robot(path: str | Path) -> Robot:
         InputError: MuJoCo is missing; the file is not there, broken or cyclic; a joint is of another kind than
             revolute, continuous or prismatic, or follows another; nothing moves; or a link that moves has no mass.
     """
-    try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
-        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
     path = Path(path)
+    mujoco, model = compiled(path, parsed(path))
+    try:
+        return _robot(mujoco, model)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def parsed(path: Path) -> ET.Element:
+    """The outer element of a URDF or MJCF file, comments included; errors as `read_robot`."""
     if not path.is_file() or path.stat().st_size > LARGEST:
         raise InputError(f"{path}: no file of up to {LARGEST >> 20} MiB; give one of a robot, URDF or MJCF")
     content = path.read_bytes()
     if b"<!ENTITY" in content:
         raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
     try:
-        root = ET.fromstring(content)
+        root = ET.fromstring(content, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     except ET.ParseError as error:
         raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    return root
+
+
+def compiled(path: Path, root: ET.Element) -> tuple[Any, Any]:
+    """MuJoCo, and its model of a file with this outer element, shapes of a URDF left out; errors as `read_robot`."""
     try:
-        model = _compiled(mujoco, path, root)
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError:
+        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
+    try:
+        return mujoco, _compiled(mujoco, path, root)
+    except InputError:
+        raise
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
-    try:
-        return _robot(mujoco, model)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _compiled(mujoco: Any, path: Path, root: ET.Element) -> Any:

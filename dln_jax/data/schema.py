@@ -11,11 +11,13 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
 | `trajectory` | [N] int | | index of the trajectory that a sample belongs to; any number >= 0 without `label` |
 | `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
+| `joint_names` | [d] str | | optional, the joint of each column |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
 import json
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -29,7 +31,7 @@ from dln_jax.types import InputError, JointKind, Needs
 JOINTS = get_args(JointKind)
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "needs")
+KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "joint_names", "needs")
 LARGEST_INDEX = 2**53
 """Up to which float64 tells whole numbers apart."""
 
@@ -50,6 +52,7 @@ class Trajectories(NamedTuple):
     tau_coriolis: np.ndarray | None = None
     tau_gravity: np.ndarray | None = None
     needs: Needs | None = None
+    joint_names: np.ndarray | None = None
     estimated: tuple[str, ...] = ()
     """Keys that were absent: rates estimated by finite differences, torques taken as zero."""
 
@@ -111,7 +114,31 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         raise InputError(
             f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
         )
-    return Trajectories(t=t, trajectory=trajectory, label=label, needs=needs, estimated=tuple(estimated), **checked)
+    names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
+    return Trajectories(
+        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=tuple(estimated), **checked
+    )
+
+
+def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
+    """The data with their columns in the order of these joints; as they are where neither has names.
+
+    Raises:
+        InputError: another number of joints, or names that are not the same.
+    """
+    d = data.degrees_of_freedom
+    if len(names) != d:
+        raise InputError(f"the data have {d} joints, the robot {len(names)}: {reprlib.repr(', '.join(names))}")
+    if data.joint_names is None:
+        return data
+    own = data.joint_names.tolist()
+    if missing := [name for name in names if name not in own]:
+        shown = ", ".join(own)
+        raise InputError(f"the robot's joint '{missing[0]}' is not among the data's ({shown:.300}); make names agree")
+    order = [own.index(name) for name in names]
+    columns = {key: getattr(data, key)[:, order] for key in ("q", *RATES, *OPTIONAL) if getattr(data, key) is not None}
+    needs = None if data.needs is None else data.needs._replace(joints=tuple(data.needs.joints[k] for k in order))
+    return data._replace(**columns, joint_names=data.joint_names[order], needs=needs)
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
@@ -179,6 +206,13 @@ def needs_from_json(stated: Any) -> Needs:
             raise InputError(f"needs: actuation is {reprlib.repr(actuation)}; expected finite numbers")
         actuation = tuple(tuple(float(entry) for entry in row) for row in rows)
     return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation})
+
+
+def _joint_names(given: Any, d: int) -> np.ndarray:
+    names = np.asarray(given)
+    if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
+        raise InputError(f"joint_names has type {names.dtype} and shape {names.shape}; expected {d} different strings")
+    return names.astype(str)
 
 
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:

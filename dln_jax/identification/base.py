@@ -7,15 +7,16 @@ and of a body what is usually kept; its mass, h_z and I_yy are what is usually r
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from dln_jax.identification.columns import Columns
-from dln_jax.mechanics.trees.inertia import PARAMETERS
 
 Determinacy = Literal["alone", "in combination", "not at all"]
+DETERMINACIES = get_args(Determinacy)
+"""The best first."""
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
 """Of the ten of a body, those first that stay."""
 TOLERANCE = 1e-8
@@ -101,9 +102,7 @@ def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
     return text
 
 
-def determinacy(
-    unseen: Float[np.ndarray, "K P"], *, tolerance: float = 1e-6
-) -> tuple[Determinacy, ...]:
+def determinacy(unseen: Float[np.ndarray, "K P"], *, tolerance: float = 1e-6) -> tuple[Determinacy, ...]:
     """Of each parameter, from orthonormal directions that change no force.
 
     Args:

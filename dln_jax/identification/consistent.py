@@ -7,8 +7,8 @@ and friction are c = c_0 exp(z). These numbers minimise
 
     sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
-D(J | J_0) = tr(J J_0⁻¹) - log det(J J_0⁻¹) - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020), which is
-in these coordinates a sum of ten squares and so made for Gauss-Newton. It depends on no frame. The data are one
+D(J | J_0) = tr(J J_0⁻¹) - log det(J J_0⁻¹) - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020). In
+these coordinates it is a sum of ten squares, and so made for Gauss-Newton; it depends on no frame. The data are one
 triangle: an iteration takes some P³ operations, whatever N is.
 """
 
@@ -40,15 +40,15 @@ class ConsistentFit(NamedTuple):
 
     theta: Float[np.ndarray, " P"]
     divergence: Float[np.ndarray, " bodies"]
-    """D(J | J_0) of each body."""
+    """D(J | J_0) of each body that there is."""
     iterations: int
     status: levenberg_marquardt.Status
 
 
 def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
-    """Of each body, whether its pseudo-inertia is positive definite."""
+    """Of each body, whether its pseudo-inertia is positive definite, or there is no body."""
     bodies = theta[np.array(columns.kinds) == "inertia"].reshape(-1, 10)
-    return tuple(bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
+    return tuple(bool(not body.any() or np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
 
 
 def nearest_body(theta: Float[np.ndarray, "10"], *, smallest: float = SMALLEST) -> Float[np.ndarray, "10"]:
@@ -81,7 +81,8 @@ def fit_consistent(
         triangle: of the equations in units of noise, as `equations.weighted`.
         columns: of the P parameters, ten of each body side by side.
         known: values to start from and to be near to; a body that does not exist is replaced by `nearest_body`, a
-            coefficient that is zero by one that explains a hundredth of the torque.
+            coefficient that is zero by one that explains a hundredth of the torque. Where all ten numbers of a body are
+            zero, there is none, and they stay.
         regularisation: dimensionless; what a unit of divergence counts, in squares of the noise. Positive, since the
             data never determine all.
         smallest: as for `nearest_body`.
@@ -94,7 +95,8 @@ def fit_consistent(
     require_positive(regularisation=regularisation, smallest=smallest)
     kinds = np.array(columns.kinds)
     inertial, positive, signed = (np.flatnonzero(kinds == kind) for kind in ("inertia", "positive", "signed"))
-    bodies = [nearest_body(theta, smallest=smallest) for theta in known[inertial].reshape(-1, 10)]
+    inertial = inertial.reshape(-1, 10)[known[inertial].reshape(-1, 10).any(axis=1)]
+    bodies = [nearest_body(theta, smallest=smallest) for theta in known[inertial]]
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
     typical = np.where(typical > 0, typical, 1.0)
@@ -106,7 +108,7 @@ def fit_consistent(
         roots = jnp.asarray(factors) @ relative
         inertias = jax.vmap(lambda root: body_of_pseudo_inertia(root @ root.T))(roots)
         theta = jnp.zeros(len(kinds))
-        theta = theta.at[inertial].set(inertias.ravel())
+        theta = theta.at[inertial].set(inertias)
         theta = theta.at[positive].set(coefficients * jnp.exp(x["coefficients"]))
         return theta.at[signed].set(known[signed] + typical[signed] * x["signed"])
 

@@ -46,13 +46,16 @@ class Regressor(NamedTuple):
     unknowns: int
 
 
-def regressor_of(model: Model, parameters: Any, data: Trajectories, *, chunk_size: int = CHUNK) -> Regressor:
+def regressor_of(
+    model: Model, parameters: Any, data: Trajectories, *, free: np.ndarray | None = None, chunk_size: int = CHUNK
+) -> Regressor:
     """The equations of data, sample by sample.
 
     Args:
         model: linear in its parameters.
         parameters: of the model, at which it is differentiated, and its linearity is checked.
         data: with tau.
+        free: columns [P] that are none where it is false, of parameters that are known to be zero.
         chunk_size: samples whose Phi is in memory at a time.
 
     Raises:
@@ -70,7 +73,7 @@ def regressor_of(model: Model, parameters: Any, data: Trajectories, *, chunk_siz
         with jax.enable_x64(True):
             for columns, predicted, tau in design_chunks(linearise, at, data, chunk_size):
                 require_linear(columns, theta, predicted)
-                yield columns, tau
+                yield columns if free is None else columns * free, tau
 
     return Regressor(passes, len(data.tau), data.degrees_of_freedom, theta.size)
 

@@ -3,12 +3,14 @@
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.identification import equations
 from dln_jax.identification.base import (
+    DETERMINACIES,
     BaseParameters,
     Determinacy,
     base_parameters,
@@ -49,8 +51,6 @@ class Identification(NamedTuple):
     """Of the residuals of `fit`."""
     consistent: ConsistentFit | None
     """Bodies that exist, where asked for."""
-    training_squares: Float[np.ndarray, "2 d"]
-    """Mean squared residuals of `fit` and of `consistent` (of `fit` again where there is none), (N m)² or N²."""
 
     @property
     def theta(self) -> Float[np.ndarray, " P"]:
@@ -98,30 +98,57 @@ def identify(
     if robust and noise is not None:
         raise InputError("noise is given, which a robust fit estimates; leave one of them out")
     columns, theta = columns_of(known), flat(known)
-    held = _massless(columns, theta)
-    regressor = regressor_of(model, known, data)
-    general = compressed(regressor_of(model, known, random_states(joints, STATES * d, seed)))
-    every = _without(general.triangles.reshape(-1, general.unknowns + 1)[:, :-1], held)
+    free = _with_mass(columns, theta)
+    general = compressed(regressor_of(model, known, random_states(joints, STATES * d, seed), free=free))
+    every = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
     structure = determinacy(null_directions(every))
-    options: dict[str, Any] = {"held": held, "rank_tolerance": rank_tolerance}
-    given = compressed(regressor)
-
-    def fitted(correlation: np.ndarray | None) -> WeightedFit:
-        if robust:
-            return fit_robust(regressor, theta, correlation=correlation, **options)
-        return fit_weighted(given, theta, noise=noise, correlation=correlation, **options)
-
-    fit = fitted(None)
+    regressor, weights = regressor_of(model, known, data, free=free), None
+    if robust:
+        rough, weights = fit_robust(regressor, theta, rank_tolerance=rank_tolerance)
+        noise = rough.noise
+    given = compressed(regressor, weights)
+    fit = fit_weighted(given, theta, noise=noise, rank_tolerance=rank_tolerance)
     errors = equations.residuals(regressor, fit.theta)
     statistics = residual_statistics(errors, data.trajectory, fit.noise)
-    fit = fit._replace(covariance=fitted(statistics.correlation).covariance)
+    fit = fit_weighted(given, theta, noise=fit.noise, correlation=statistics.correlation, rank_tolerance=rank_tolerance)
+    seen = determinacy(fit.unseen, tolerance=UNSEEN_SHARE)
     found = None
     if consistent:
-        bodies = fit_consistent(equations.weighted(given, fit.noise), columns, theta, regularisation=regularisation)
-        found = bodies
-    squares = [equations.squares(given, each) / given.samples for each in (fit.theta, (found or fit).theta)]
-    seen = tuple(
-        worse(*pair) for pair in zip(structure, determinacy(fit.unseen, tolerance=UNSEEN_SHARE), strict=True)
+        triangle = equations.weighted(given, fit.noise)
+        found = fit_consistent(triangle, columns, theta, regularisation=regularisation)
+    return Identification(
+        columns,
+        theta,
+        structure,
+        base_parameters(every, columns),
+        fit,
+        tuple(max(pair, key=DETERMINACIES.index) for pair in zip(structure, seen, strict=True)),
+        statistics,
+        found,
     )
-    base = base_parameters(every, columns)
-    return Identification(columns, theta, structure, base, fit, seen, statistics, found, np.array(squares))
+
+
+def parameters_of(found: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
+    """Parameters of the model, of numbers in the order of its columns."""
+    return jax.tree.map(jnp.asarray, unravelled(found, like))
+
+
+def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
+    """States anywhere: angles of the whole circle, a metre of displacement, rates and accelerations of some units."""
+    d, random = len(joints), np.random.default_rng(seed)
+    reach = np.where(np.array(joints) == "revolute", np.pi, 1.0)
+    arrays = {
+        "q": random.uniform(-reach, reach, (samples, d)),
+        "qd": 2 * random.normal(size=(samples, d)),
+        "qdd": 5 * random.normal(size=(samples, d)),
+        "tau": np.ones((samples, d)),
+    }
+    return from_arrays({**arrays, "t": np.zeros(samples), "trajectory": np.arange(samples)})
+
+
+def _with_mass(columns: Columns, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+    """1 for each column, 0 for those of links that have no mass."""
+    free = np.ones(len(theta))
+    inertial = np.flatnonzero(np.array(columns.kinds) == "inertia").reshape(-1, 10)
+    free[inertial[~theta[inertial].any(axis=1)]] = 0.0
+    return free

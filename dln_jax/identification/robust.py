@@ -63,11 +63,12 @@ def fit_robust(
     threshold: float = THRESHOLD,
     iterations: int = 30,
     tolerance: float = 1e-4,
-    **options: object,
-) -> WeightedFit:
+    rank_tolerance: float | None = None,
+) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
     """Huber's estimate: an error beyond `threshold` times the noise counts by its size and no longer by its square.
 
-    Least squares again and again, with weights min(1, threshold noise / |error|); noise is the median size of errors.
+    Least squares again and again, with weights min(1, threshold noise / |error|), which are returned beside the fit;
+    noise is the median size of errors.
 
     Args:
         regressor: the data's equations, of which each iteration takes one pass.
@@ -75,20 +76,21 @@ def fit_robust(
         threshold: in units of the noise.
         iterations: at most.
         tolerance: relative change of the predicted torques at which to stop.
-        options: `rank_tolerance` and `correlation`, as for `fit_weighted`.
+        rank_tolerance: as for `fit_weighted`.
 
     Raises:
         InputError: a threshold that is not positive, or as `fit_weighted`.
     """
     require_positive(threshold=threshold)
-    fit = fit_weighted(compressed(regressor), known, **options)  # type: ignore[arg-type]
+    fit = fit_weighted(compressed(regressor), known, rank_tolerance=rank_tolerance)
     errors = residuals(regressor, fit.theta)
+    weights = np.ones_like(errors)
     for _ in range(iterations):
         deviation = TO_DEVIATION * np.median(abs(errors), axis=0)
         noise = np.maximum(deviation, np.finfo(float).tiny)
         weights = np.minimum(1.0, threshold * noise / np.maximum(abs(errors), np.finfo(float).tiny))
-        fit = fit_weighted(compressed(regressor, weights), known, noise=noise, **options)  # type: ignore[arg-type]
+        fit = fit_weighted(compressed(regressor, weights), known, noise=noise, rank_tolerance=rank_tolerance)
         before, errors = errors, residuals(regressor, fit.theta)
         if (np.linalg.norm(errors - before, axis=0) <= tolerance * np.linalg.norm(errors, axis=0)).all():
             break
-    return fit
+    return fit, weights

@@ -2,10 +2,10 @@
 
     theta minimises sum over joints of |Phi_j theta - tau_j|² / noise_j²
 
-about values that are known before, so that what data do not show stays as it was: of all theta that fit equally well it
-is the nearest, in units of the columns' lengths. Then noise_j² = |residual_j|² / (N - share of the parameters that joint
-j determines), and again, until noises stay. The covariance of theta is that of independent errors of this size; where
-residuals follow each other for T samples, T of them count as one (see `residual_statistics`).
+about values that are known before, so that what data do not show stays as it was: of all theta that fit equally well
+it is the nearest, in units of the columns' lengths. Then noise_j² = |residual_j|² / (N - share of the parameters that
+joint j determines), and again, until noises stay. The covariance of theta is that of independent errors of this size;
+where residuals follow each other for T samples, T of them count as one (`robust.residual_statistics`).
 """
 
 from typing import NamedTuple

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from dln_jax.mechanics.trees import tree_from_json
 from dln_jax.models.baselines import make_feed_forward, make_phase_network
 from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import (
@@ -23,6 +24,7 @@ from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, require_network, require_positive
@@ -116,11 +118,24 @@ def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model
     return make_pairwise_hamiltonian(needs.degrees_of_freedom // dimension, dimension, **keywords)
 
 
+def make_stored_tree(
+    needs: Needs, *, tree: dict[str, Any], velocity_scale: float = 0.01, dtype: DTypeLike = jnp.float64
+) -> Model:
+    """`make_rigid_tree` of a tree as `mechanics.trees.tree_to_json` gives it, with friction where the needs have it."""
+    frames = tree_from_json(tree)
+    if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
+        raise InputError(
+            f"the rigid tree has the joints {frames.joints}, and gravity if it is not zero; it got {needs}"
+        )
+    return make_rigid_tree(frames, friction=needs.friction, velocity_scale=velocity_scale, dtype=dtype)
+
+
 MOMENTUM = {"momentum_scale": ("p",)}
 CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True)),
     "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(make_trigonometric, Properties(linear=True)),
+    "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
     "feed-forward": Entry(
         make_feed_forward,
         Properties(energy=False),

@@ -14,6 +14,7 @@ from dln_jax.mechanics.trees.inertia import (
     pseudo_inertia,
 )
 from dln_jax.mechanics.trees.recursions import composite_bodies, newton_euler, regressor
+from dln_jax.mechanics.trees.stored import tree_from_json, tree_to_json
 
 __all__ = [
     "PARAMETERS",
@@ -32,7 +33,9 @@ __all__ = [
     "regressor",
     "serial",
     "tree_energies",
+    "tree_from_json",
     "tree_system",
+    "tree_to_json",
     "with_payload",
     "world_frames",
 ]
