@@ -177,7 +177,9 @@ def test_a_joint_that_is_held_is_fixed(tmp_path):
     np.testing.assert_allclose(forces(held), forces(robot), rtol=1e-12, atol=1e-12)
 
 
-FREE = '<freejoint name="root"/><geom size="1"/><body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>'
+FREE = (
+    '<freejoint name="root"/><geom size="1"/><body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>'
+)
 
 
 def test_a_base_that_is_free_can_be_held(tmp_path):
