@@ -27,13 +27,14 @@ def torque_by_joint(
     shown = np.flatnonzero(data.trajectory == data.trajectory[0])[:MOST_SAMPLES]
     t = data.t[shown]
     d = len(names)
-    figure, axes = style.figure(d, 1, height=0.6 + 0.95 * d, sharex=True)
+    figure, axes = style.figure(d, 1, height=0.6 + 1.1 * d, sharex=True)
     for joint, axis in enumerate(axes[:, 0]):
         measured, found = data.tau[shown, joint], predicted[shown, joint]
         axis.plot(t, measured, color="black", linewidth=1.6, label="measured")
         axis.plot(t, found, color=style.BLUE, linewidth=1.0, label="identified")
         axis.plot(t, measured - found, color=style.VERMILLION, linewidth=0.8, label="residual")
-        axis.set_ylabel(f"{names[joint]:.18}\n{units[joint]}", fontsize=style.SMALL)
+        style.title(axis, names[joint], loc="left", pad=2, fontsize=style.SMALL)
+        axis.set_ylabel(units[joint], fontsize=style.SMALL)
         axis.margins(x=0.01)
     axes[-1, 0].set_xlabel(f"time, s (held out: {data.label[data.trajectory[0]]})")
     figure.align_ylabels(axes[:, 0])

@@ -95,7 +95,7 @@ def predict(case: Case, parameters: Parameters, q: np.ndarray, qd: np.ndarray, q
     return Predictions(*map(np.asarray, every(parameters, q, qd, qdd)))
 
 
-def evaluate(case: Case, found: Identification) -> tuple[dict[str, float], dict[str, Predictions]]:
+def evaluate(case: Case, found: Identification) -> tuple[dict[str, float | int], dict[str, Predictions]]:
     """Metrics of what was held out, and predictions by the file, by least squares, and by what is kept."""
     test = case.sets.test
     sources = {"file": found.known, "least_squares": found.fit.theta, KEPT: found.theta}
@@ -103,7 +103,7 @@ def evaluate(case: Case, found: Identification) -> tuple[dict[str, float], dict[
         name: predict(case, parameters_of(theta, case.known), test.q, test.qd, test.qdd)
         for name, theta in sources.items()
     }
-    metrics: dict[str, float] = {
+    metrics: dict[str, float | int] = {
         "parameters": len(found.theta),
         "base_parameters": len(found.base.words),
         "rank": found.fit.rank,
