@@ -102,7 +102,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
     for element in root.iter():
         if element.tag in ("include", "replicate", "attach", "composite", "flexcomp", "model"):
             raise InputError(
-                f"{original} has <{element.tag}>, whose bodies are elsewhere; expected all in the file, as MuJoCo saves it"
+                f"{original} has <{element.tag}>, with bodies that are elsewhere; expected one file, as MuJoCo saves it"
             )
     for compiler in root.findall("compiler"):
         # They would change what is written.
@@ -120,7 +120,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
             theta = np.asarray(tree.inertias[k], float)
             if theta.any():
                 # From the joint's anchor, where the link's frame is, to the body's.
-                mass, centre, about = _about_centre(moved(theta, np.eye(3), model.jnt_pos[k]))
+                mass, centre, about = _about_centre(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
                 entries = [about[place] for place in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
                 inertial = ET.Element("inertial", pos=_text(centre), mass=repr(mass), fullinertia=_text(entries))
             named = (("armature", tree.armature), ("damping", damping), ("frictionloss", coulomb))

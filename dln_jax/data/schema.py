@@ -17,7 +17,6 @@ Samples of all trajectories are concatenated on axis 0.
 
 import json
 import reprlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -118,27 +117,6 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
     return Trajectories(
         t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=tuple(estimated), **checked
     )
-
-
-def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
-    """The data with their columns in the order of these joints; as they are where neither has names.
-
-    Raises:
-        InputError: another number of joints, or names that are not the same.
-    """
-    d = data.degrees_of_freedom
-    if len(names) != d:
-        raise InputError(f"the data have {d} joints, the robot {len(names)}: {reprlib.repr(', '.join(names))}")
-    if data.joint_names is None:
-        return data
-    own = data.joint_names.tolist()
-    if missing := [name for name in names if name not in own]:
-        shown = ", ".join(own)
-        raise InputError(f"the robot's joint '{missing[0]}' is not among the data's ({shown:.300}); make names agree")
-    order = [own.index(name) for name in names]
-    columns = {key: getattr(data, key)[:, order] for key in ("q", *RATES, *OPTIONAL) if getattr(data, key) is not None}
-    needs = None if data.needs is None else data.needs._replace(joints=tuple(data.needs.joints[k] for k in order))
-    return data._replace(**columns, joint_names=data.joint_names[order], needs=needs)
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:

@@ -7,7 +7,7 @@ and of a body what is usually kept; its mass, h_z and I_yy are what is usually r
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,8 +15,6 @@ from jaxtyping import Float
 from dln_jax.identification.columns import Columns
 
 Determinacy = Literal["alone", "in combination", "not at all"]
-DETERMINACIES = get_args(Determinacy)
-"""The best first."""
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
 """Of the ten of a body, those first that stay."""
 TOLERANCE = 1e-8
@@ -91,8 +89,7 @@ def _order(columns: Columns) -> list[int]:
 
 def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
     """A combination as a sum, the names with factor 1 first."""
-    chosen = np.flatnonzero(combination)
-    chosen = sorted(chosen, key=lambda column: (combination[column] != 1.0, column))
+    chosen = sorted(np.flatnonzero(combination).tolist(), key=lambda column: (combination[column] != 1.0, column))
     text = ""
     for column in chosen:
         factor = combination[column]

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from dln_jax.data.schema import Trajectories, from_arrays
 from dln_jax.identification import equations
 from dln_jax.identification.base import (
-    DETERMINACIES,
     BaseParameters,
     Determinacy,
     base_parameters,
@@ -28,9 +27,9 @@ from dln_jax.types import InputError, JointKind
 
 STATES = 40
 """Random states by joint, from which the structure is seen."""
-UNSEEN_SHARE = 0.1
-"""Part of a parameter in directions that data do not show, up to which it counts as seen, and less that from all as
-unseen."""
+UNSEEN_SHARE = 0.02
+"""Of the part of a parameter that motions could show, squared: up to it data may miss what counts as seen, and what
+counts as missed may they show."""
 
 
 class Identification(NamedTuple):
@@ -111,7 +110,7 @@ def identify(
     errors = equations.residuals(regressor, fit.theta)
     statistics = residual_statistics(errors, data.trajectory, fit.noise)
     fit = fit_weighted(given, theta, noise=fit.noise, correlation=statistics.correlation, rank_tolerance=rank_tolerance)
-    seen = determinacy(fit.unseen, tolerance=UNSEEN_SHARE)
+    base = base_parameters(every, columns)
     found = None
     if consistent:
         triangle = equations.weighted(given, fit.noise)
@@ -120,11 +119,29 @@ def identify(
         columns,
         theta,
         structure,
-        base_parameters(every, columns),
+        base,
         fit,
-        tuple(max(pair, key=DETERMINACIES.index) for pair in zip(structure, seen, strict=True)),
+        seen_by(fit, base, structure),
         statistics,
         found,
+    )
+
+
+def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
+    """What data show of each parameter, of what motions could."""
+    scaled = base.combinations / np.where(fit.lengths > 0, fit.lengths, np.inf)
+    _, sizes, right = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True).clip(min=1e-300))
+    possible = np.sum(right[: int(np.sum(sizes > 1e-10 * sizes.max(initial=0.0)))] ** 2, axis=0)
+    # Directions that data miss are those that no motion shows, and of the possible ones those that are lost.
+    missed = np.sum(fit.unseen**2, axis=0) - (1 - possible)
+    share = np.where(possible > 1e-10, missed / np.where(possible > 1e-10, possible, 1.0), 1.0)
+    return tuple(
+        "not at all"
+        if each > 1 - UNSEEN_SHARE or before == "not at all"
+        else before
+        if each < UNSEEN_SHARE
+        else "in combination"
+        for each, before in zip(share, structure, strict=True)
     )
 
 

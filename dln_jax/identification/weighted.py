@@ -112,6 +112,7 @@ def _solved(
     left, sizes, right = np.linalg.svd(np.where(lengths > 0, A, 0.0) / scale)
     rank, every = (int(np.sum(sizes > each * sizes[0])) for each in (rank_tolerance, min(ROUNDING, rank_tolerance)))
     to_theta = (right[:every] / sizes[:every, None]).T / scale[:, None]
+    to_theta[lengths == 0] = 0.0  # and not rounding, which large torques in units of small noise would show
     # Rows of each joint in the basis of what has an effect: their squares sum to one over all joints.
     by_joint = [rows[:, :-1] @ to_theta / each for rows, each in zip(given.triangles, sigma, strict=True)]
     times = np.ones(len(sigma)) if correlation is None else np.asarray(correlation, float)

@@ -1,7 +1,7 @@
 """Numbers about a model: errors, rollouts, definiteness, misfit, latency."""
 
 from dln_jax.metrics.definiteness import Definiteness, definiteness
-from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.errors import errors, mean_square, normalised_error, predictions
 from dln_jax.metrics.frames import Injection, inject_energy
 from dln_jax.metrics.latency import Latency, medians_in_turns, one_step
 from dln_jax.metrics.misfit import Misfit, velocity_misfit
@@ -35,6 +35,7 @@ __all__ = [
     "medians_in_turns",
     "motion_energies",
     "motion_errors",
+    "normalised_error",
     "normalised_state_error",
     "one_step",
     "predict",

@@ -19,7 +19,8 @@ URDF = f"""<robot name="arm"><!-- kept --><link name="base">{INERTIAL.format(mas
 <joint name="elbow" type="continuous"><parent link="one"/><child link="two"/><origin xyz="0.2 0 0.1"/>
  <axis xyz="0.6 0 0.8"/></joint>
 <joint name="shoulder" type="revolute"><parent link="base"/><child link="one"/><origin xyz="0 0 0.3" rpy="0.4 0 0"/>
- <axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="30" velocity="3"/><dynamics damping="0.2" friction="0.1"/></joint>
+ <axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="30" velocity="3"/>
+ <dynamics damping="0.2" friction="0.1"/></joint>
 <joint name="weld" type="fixed"><parent link="two"/><child link="hand"/><origin xyz="0.1 0 0.1" rpy="0 1 0"/></joint>
 <joint name="tip" type="fixed"><parent link="hand"/><child link="finger"/></joint></robot>"""
 MJCF = """<mujoco><compiler angle="radian" inertiafromgeom="true"/><default><joint damping="3"/></default><worldbody>
@@ -27,7 +28,8 @@ MJCF = """<mujoco><compiler angle="radian" inertiafromgeom="true"/><default><joi
     <body name="a" pos="0 0.2 0.3" euler="0.4 0 0.1">
       <joint name="x" type="hinge" axis="1 0 0" pos="0 0.05 0.1" armature="0.3"/>
       <joint name="y" type="slide" axis="0 1 1"/><geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.4"/>
-      <frame pos="0.1 0 0"><body name="b" pos="0 0 0.4"><joint/><geom type="sphere" size=".1" pos=".2 0 0"/></body></frame>
+      <frame pos="0.1 0 0">
+        <body name="b" pos="0 0 0.4"><joint/><geom type="sphere" size=".1" pos=".2 0 0"/></body></frame>
       <body name="c" pos="0.3 0 0" euler="0 1 0"><geom type="sphere" size=".15" pos="0 .2 0"/>
         <body name="d" pos="0 0.1 0.2"><geom type="box" size=".05 .1 .02"/></body></body>
     </body></body></worldbody></mujoco>"""
