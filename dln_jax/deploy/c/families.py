@@ -106,12 +106,12 @@ def functions_of_system(
     """
     d = degrees_of_freedom
     # Networks take long to trace: each once, and not for every function that it occurs in.
-    system, link = _traced_once(system), _link(system)
+    traced = _traced_once(system)
     functions: Named = {}
     if not isinstance(system, PhaseRates):
-        functions |= _of_dynamics(system, d, actuation, iterations)
-    if isinstance(link, Canonical | PhaseRates):
-        functions |= _of_flow(flow(system, degrees_of_freedom=d), iterations)
+        functions |= _of_dynamics(traced, d, actuation, iterations)
+    if isinstance(_link(system), Canonical | PhaseRates):
+        functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
     controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
 
