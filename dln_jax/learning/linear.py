@@ -28,10 +28,10 @@ from dln_jax.learning.growth import Trial, grow, significantly_better
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, Needs, Vector, require_positive
+from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
 """That is tried."""
@@ -180,18 +180,19 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         InputError: the basis of degree 1 is too large, or what `fit_linear` refuses.
     """
     d = needs.degrees_of_freedom
+    make = CATALOGUE["trigonometric"].factory
     target = ROUNDING**2 * float(np.mean(np.sum(validation.tau**2, axis=1)))
 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
-            model = make_trigonometric(needs, degree=degrees)
+            model = make(needs, degree=degrees)
             found = fit_linear(model, train)
             judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
             errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
         return found, np.sum(np.asarray(errors) ** 2, axis=1)
 
     def fits(degree: int) -> bool:
-        size = count(jax.eval_shape(make_trigonometric(needs, degree=degree).init, jax.random.key(0)))
+        size = count(jax.eval_shape(make(needs, degree=degree).init, jax.random.key(0)))
         return size <= min(MOST_PARAMETERS, train.tau.size)
 
     most = next((n - 1 for n in range(2, LARGEST_DEGREE + 1) if not fits(n)), LARGEST_DEGREE)

@@ -7,6 +7,7 @@ from dln_jax.models.hamiltonian import (
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
+from dln_jax.models.joint_friction import FrictionParameters, friction_of, with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.latent_phase import make_latent_phase
 from dln_jax.models.model import Model, Parameters
@@ -16,8 +17,10 @@ from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 
 __all__ = [
+    "FrictionParameters",
     "Model",
     "Parameters",
+    "friction_of",
     "make_black_box_hamiltonian",
     "make_black_box_lagrangian",
     "make_delan",
@@ -31,4 +34,5 @@ __all__ = [
     "make_separable_hamiltonian",
     "make_structured_hamiltonian",
     "make_trigonometric",
+    "with_joint_friction",
 ]

@@ -72,6 +72,8 @@ def announce(task: Task) -> None:
     terms = [name for name in ("gravity", "friction") if getattr(task.needs, name)] or ["no potential, no friction"]
     print(f"{task.name}: {counts} samples")
     print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
+    if task.needs.joint_friction:
+        print(f"friction of joints: {', '.join(task.needs.joint_friction)}")
     if task.sets.train.estimated:
         print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
     if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:

@@ -38,6 +38,7 @@ from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
+from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.nn import differential_mlp
@@ -105,14 +106,27 @@ def functions_of_system(
     """
     d = degrees_of_freedom
     # Networks take long to trace: each once, and not for every function that it occurs in.
-    system = system._replace(**{name: jax.jit(each) for name, each in system._asdict().items() if callable(each)})
+    traced = _traced_once(system)
     functions: Named = {}
     if not isinstance(system, PhaseRates):
-        functions |= _of_dynamics(system, d, actuation, iterations)
-    if isinstance(system, Canonical | PhaseRates):
-        functions |= _of_flow(flow(system, degrees_of_freedom=d), iterations)
+        functions |= _of_dynamics(traced, d, actuation, iterations)
+    if isinstance(_link(system), Canonical | PhaseRates):
+        functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
     controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
+
+
+def _traced_once(system: Any) -> Any:
+    """Its functions jitted."""
+    fields = {name: jax.jit(each) for name, each in system._asdict().items() if callable(each)}
+    if isinstance(system, LoadedSystem):
+        fields["link"] = _traced_once(system.link)
+    return system._replace(**fields)
+
+
+def _link(system: System) -> Any:
+    """Of a system behind transmissions, that without them."""
+    return system.link if isinstance(system, LoadedSystem) else system
 
 
 def _of_run(run: Run, precision: str, iterations: int) -> Functions:
@@ -159,7 +173,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     inverse_jacobians, coriolis_jacobians = (
         functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
     )
-    natural = isinstance(system, Natural)
+    link = _link(system)
+    natural = isinstance(link, Natural)
 
     def at_rest(q: Array) -> Array:
         return motion.decompose(q, jnp.zeros_like(q), jnp.zeros_like(q)).gravity
@@ -178,7 +193,7 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         "coriolis": _named(coriolis, "c"),
         "coriolis_jacobian": _named(coriolis_jacobians, "c_q", "c_qd"),
     }
-    if not natural or system.potential is not None:
+    if not natural or link.potential is not None:
         functions |= _with_derivatives("gravity", _named(at_rest, "g"))
     if isinstance(motion, Dynamics):
         mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else (lambda q, qd: motion.mass_matrix(q, qd))
