@@ -43,6 +43,8 @@ CholeskyFactor = Callable[[Array], Array]
 JointKind = Literal["revolute", "prismatic"]
 FrictionLaw = Literal["viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load"]
 """Laws of friction in a joint; `mechanics.friction` has their formulas."""
+ResidualTerm = Literal["potential", "dissipation", "inertia"]
+"""Energies that a residual may have; `mechanics.residual` says what each explains."""
 
 
 class InputError(ValueError):

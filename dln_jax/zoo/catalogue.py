@@ -24,11 +24,13 @@ from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.networks import Scale
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.residual import make_residual, make_with_residual
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Needs, require_network, require_positive
+from dln_jax.types import InputError, Needs, ResidualTerm, require_network, require_positive
 from dln_jax.zoo.differential_network import make_differential_network
 from dln_jax.zoo.pictures import make_picture_model
 
@@ -143,12 +145,44 @@ def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> 
     return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
 
 
+@extending(make_stored_tree)
+def make_stored_residual(
+    needs: Needs,
+    *,
+    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
+    width: int = 8,
+    depth: int = 1,
+    activation: Activation = tanh,
+    resolved_velocity: Scale = 0.05,
+    torque_scale: Scale = 1.0,
+    rate_scale: Scale = 1.0,
+    acceleration_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float64,
+    **keywords: Any,
+) -> Model:
+    """`make_stored_tree` with a `make_residual`, whose `velocity_scale` is `resolved_velocity` here."""
+    residual = make_residual(
+        needs,
+        terms=tuple(terms),
+        width=width,
+        depth=depth,
+        activation=activation,
+        velocity_scale=resolved_velocity,
+        torque_scale=torque_scale,
+        rate_scale=rate_scale,
+        acceleration_scale=acceleration_scale,
+        dtype=dtype,
+    )
+    return make_with_residual(make_stored_tree(needs, dtype=dtype, **keywords), residual)
+
+
 MOMENTUM = {"momentum_scale": ("p",)}
 CATALOGUE = {
     "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
     "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(with_friction_laws(make_trigonometric, linear=True), Properties(linear=True)),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
+    "rigid-tree-residual": Entry(make_stored_residual, Properties()),
     "feed-forward": Entry(
         with_friction_laws(make_feed_forward),
         Properties(energy=False),
