@@ -16,7 +16,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design, design_chunks, require_linear, unravelled
 from dln_jax.models.model import Model
 from dln_jax.solvers.least_squares import triangular_factor
-from dln_jax.types import InputError, require_positive
+from dln_jax.types import InputError
 
 CHUNK = 2048
 """Samples whose design matrix is in memory at a time."""
@@ -47,7 +47,12 @@ class Regressor(NamedTuple):
 
 
 def regressor_of(
-    model: Model, parameters: Any, data: Trajectories, *, free: np.ndarray | None = None, chunk_size: int = CHUNK
+    model: Model,
+    parameters: Any,
+    data: Trajectories,
+    *,
+    free: np.ndarray | None = None,
+    linearise: Callable | None = None,
 ) -> Regressor:
     """The equations of data, sample by sample.
 
@@ -56,22 +61,22 @@ def regressor_of(
         parameters: of the model, at which it is differentiated, and its linearity is checked.
         data: with tau.
         free: columns [P] that are none where it is false, of parameters that are known to be zero.
-        chunk_size: samples whose Phi is in memory at a time.
+        linearise: `learning.linear.design` of the model, where it is compiled already.
 
     Raises:
         InputError: data without torques, or as many joints as the model has not; passes raise it where the model turns
             out not to be linear.
     """
-    require_positive(chunk_size=chunk_size)
     if "tau" in data.estimated:
         raise InputError("the data have no tau; identification takes measured torques")
     theta = np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)])
     with jax.enable_x64(True):
-        linearise, at = design(model), unravelled(theta, parameters)
+        linearise = design(model) if linearise is None else linearise
+        at = unravelled(theta, parameters)
 
     def passes() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         with jax.enable_x64(True):
-            for columns, predicted, tau in design_chunks(linearise, at, data, chunk_size):
+            for columns, predicted, tau in design_chunks(linearise, at, data, CHUNK):
                 require_linear(columns, theta, predicted)
                 yield columns if free is None else columns * free, tau
 

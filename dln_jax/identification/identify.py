@@ -21,7 +21,7 @@ from dln_jax.identification.consistent import REGULARISATION, ConsistentFit, fit
 from dln_jax.identification.equations import compressed, regressor_of
 from dln_jax.identification.robust import ResidualStatistics, fit_robust, residual_statistics
 from dln_jax.identification.weighted import WeightedFit, fit_weighted
-from dln_jax.learning.linear import unravelled
+from dln_jax.learning.linear import design, unravelled
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
 
@@ -98,10 +98,14 @@ def identify(
         raise InputError("noise is given, which a robust fit estimates; leave one of them out")
     columns, theta = columns_of(known), flat(known)
     free = _with_mass(columns, theta)
-    general = compressed(regressor_of(model, known, random_states(joints, STATES * d, seed), free=free))
+    linearise = design(model)
+    # As many as data in a chunk, which is then one program.
+    samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
+    states = random_states(joints, samples, seed)
+    general = compressed(regressor_of(model, known, states, free=free, linearise=linearise))
     every = general.triangles.reshape(-1, general.unknowns + 1)[:, :-1]
     structure = determinacy(null_directions(every))
-    regressor, weights = regressor_of(model, known, data, free=free), None
+    regressor, weights = regressor_of(model, known, data, free=free, linearise=linearise), None
     if robust:
         rough, weights = fit_robust(regressor, theta, rank_tolerance=rank_tolerance)
         noise = rough.noise

@@ -1,6 +1,7 @@
 """Identifying a robot into a run folder: parameters and what is known of them, errors on what is held out, files."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,12 +52,13 @@ def run(given: Options, command: str) -> None:
         )
         seconds = time.perf_counter() - began
         save(folder, case.description, parameters_of(found.theta, case.known))
-        metrics, predicted = evaluate(case, found)
+        predict = predictor(case)
+        metrics, predicted = evaluate(case, found, predict)
         write_json(folder / "metrics.json", {**metrics, "identify_seconds": seconds})
         write_json(folder / "parameters.json", {"base": base_rows(found), "parameters": parameter_rows(found)})
         write_bytes(folder / "report.txt", text(found).encode())
         if given.figures:
-            draw(folder, case, found, predicted[KEPT])
+            draw(folder, case, found, predict, predicted[KEPT])
         lines = [*findings(found, case.sets.train, case.names), *write_file(folder, given, case, found)]
         write_config(folder, given, **case.description)
         print_result(case, found, predicted)
@@ -84,24 +86,28 @@ class Predictions(NamedTuple):
     """Its part."""
 
 
-def predict(case: Case, parameters: Parameters, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> Predictions:
-    """Torques of states [N, d], and friction among them."""
+Predict = Callable[[Parameters, np.ndarray, np.ndarray, np.ndarray], Predictions]
+
+
+def predictor(case: Case) -> Predict:
+    """(parameters, q, qd, qdd [N, d] each) -> torques, and friction among them; compiled once for one N."""
 
     def one(parameters: Parameters, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         motion = dynamics(case.model.energies(parameters))
         return motion.inverse_dynamics(q, qd, qdd), motion.friction(q, qd)
 
     every = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
-    return Predictions(*map(np.asarray, every(parameters, q, qd, qdd)))
+    return lambda *arguments: Predictions(*map(np.asarray, every(*arguments)))
 
 
-def evaluate(case: Case, found: Identification) -> tuple[dict[str, float | int], dict[str, Predictions]]:
+def evaluate(
+    case: Case, found: Identification, predict: Predict
+) -> tuple[dict[str, float | int], dict[str, Predictions]]:
     """Metrics of what was held out, and predictions by the file, by least squares, and by what is kept."""
     test = case.sets.test
     sources = {"file": found.known, "least_squares": found.fit.theta, KEPT: found.theta}
     predicted = {
-        name: predict(case, parameters_of(theta, case.known), test.q, test.qd, test.qdd)
-        for name, theta in sources.items()
+        name: predict(parameters_of(theta, case.known), test.q, test.qd, test.qdd) for name, theta in sources.items()
     }
     metrics: dict[str, float | int] = {
         "parameters": len(found.theta),
@@ -121,15 +127,15 @@ def evaluate(case: Case, found: Identification) -> tuple[dict[str, float | int],
     return metrics, predicted
 
 
-def draw(folder: Path, case: Case, found: Identification, kept: Predictions) -> None:
+def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept: Predictions) -> None:
     """Writes the figures."""
     test, names, units = case.sets.test, case.names, units_of(case)
     write_figure(folder / "torque.png", torque_by_joint(test, kept.torque, names, units))
     if case.friction:
         # All joints at once, each through its own range: friction of one does not depend on others.
-        rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), 401)
+        rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
         still = np.zeros_like(rates)
-        curves = predict(case, parameters_of(found.theta, case.known), still, rates, still).friction
+        curves = predict(parameters_of(found.theta, case.known), still, rates, still).friction
         left = test.tau - (kept.torque - kept.friction)
         write_figure(folder / "friction.png", friction_curves(test.qd, left, rates, curves, names, units))
 
@@ -143,13 +149,16 @@ def write_file(folder: Path, given: Options, case: Case, found: Identification) 
         return [f"no {path.name}: by least squares the links behind {which} are no bodies that exist"]
     parameters = parameters_of(found.theta, case.known)
     tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(parameters.armature))
-    friction = {}
     remarks = [f"Identified from {given.data.name}."]
-    if case.friction:
-        pairs = zip(case.names, parameters.offset.tolist(), strict=True)
-        offsets = ", ".join(f"{name} {value!r}" for name, value in pairs)
-        friction = {"damping": parameters.viscous, "coulomb": parameters.coulomb}
-        remarks.append(f"Offsets of torque, for which there is no place (N m or N): {offsets}.")
+    coefficients = {
+        name: np.asarray(values)
+        for name, values in parameters._asdict().items()
+        if values is not None and name not in ("inertias", "armature")
+    }
+    friction = {"damping": coefficients.pop("viscous", None), "coulomb": coefficients.pop("coulomb", None)}
+    for name, values in coefficients.items():
+        pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
+        remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
     try:
         write_robot(path, given.robot, tree, **friction, remarks=tuple(remarks))
     except InputError as error:

@@ -94,8 +94,10 @@ def prepare(given: Options) -> Case:
     )
     model = build(description)
     known = model.init(jax.random.key(0))
-    if given.friction:
-        known = known._replace(viscous=jnp.asarray(robot.damping), coulomb=jnp.asarray(robot.coulomb))
+    stated = {"viscous": robot.damping, "coulomb": robot.coulomb}
+    known = known._replace(
+        **{name: jnp.asarray(values) for name, values in stated.items() if getattr(known, name) is not None}
+    )
     return Case(robot, robot.tree.names, split(data, given.test), description, model, known, noises(given.noise, d))
 
 
