@@ -104,15 +104,20 @@ def fit_linear(
             equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
         )
         parameters = _unravel(solution.x, like)
-        squares = 0.0
+        squares = weighted = bound = 0.0
+        linear = True
         for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):
             rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(solution.x))
-            if not (abs(columns @ solution.x - predicted) <= rounding).all():
-                raise InputError(
-                    "the model's torque is not linear in its parameters, as a linear fit expects: "
-                    "take make_trigonometric, or train this model by its residuals"
-                )
+            linear &= bool((abs(columns @ solution.x - predicted) <= rounding).all())
             squares += float(np.sum((predicted - tau) ** 2))
+            weighted += float(np.sum(((predicted - tau) / scale) ** 2))
+            bound += float(np.sum((rounding / scale) ** 2))
+        # A force that is homogeneous in its parameters passes sample by sample; its residual is another.
+        if not (linear and abs(weighted**0.5 - solution.residual) <= bound**0.5):
+            raise InputError(
+                "the model's torque is not linear in its parameters, as a linear fit expects: "
+                "take make_trigonometric, or train this model by its residuals"
+            )
     return LinearFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
         parameter_count=zero.size,
