@@ -116,8 +116,9 @@ def fit_friction(
         found = {name: np.asarray(each) for name, each in _shapes(learned, solution.nonlinear, d).items()}
     left = solution.residuals.reshape(-1, d) * weights
     keywords = {name: tuple(each.tolist()) for name, each in found.items()}
-    constant = {name: _plain(value) for name, value in start._asdict().items() if name not in found}
-    model = make_rigid_tree(tree, friction=laws, **constant, **keywords)
+    constant = {name: _plain(value) for name, value in start._asdict().items()}
+    shaped: dict[str, Any] = constant | keywords
+    model = make_rigid_tree(tree, friction=laws, **shaped)
     errors = np.sqrt(np.diagonal(solution.covariance))
     count = solution.linear.size
     by_shape = {name: errors[count:].reshape(-1, d)[place] for place, name in enumerate(learned)}

@@ -41,6 +41,10 @@ ROUNDING = 1e-10
 """Error, relative to the torque, below which no basis is better than another."""
 # Phi theta may differ from the model's force by the rounding of its sum, relative to the sum of absolute terms.
 _LINEARITY_TOLERANCE = 1e-9
+_NOT_LINEAR = (
+    "the model's torque is not linear in its parameters, as a linear fit expects: "
+    "take make_trigonometric, or train this model by its residuals"
+)
 
 
 class LinearFit(NamedTuple):
@@ -102,10 +106,15 @@ def fit_linear(
             equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
         )
         parameters = unravelled(solution.x, like)
-        squares = 0.0
+        squares = weighted = bound = 0.0
         for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size):
-            require_linear(columns, solution.x, predicted)
+            rounding = require_linear(columns, solution.x, predicted)
             squares += float(np.sum((predicted - tau) ** 2))
+            weighted += float(np.sum(((predicted - tau) / scale) ** 2))
+            bound += float(np.sum((rounding / scale) ** 2))
+        # A force that is homogeneous in its parameters passes sample by sample; its residual is another.
+        if not abs(weighted**0.5 - solution.residual) <= bound**0.5:
+            raise InputError(_NOT_LINEAR)
     return LinearFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
         parameter_count=zero.size,
@@ -136,14 +145,12 @@ def design(model: Model) -> Callable:
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
-def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> None:
-    """Raises `InputError` unless Phi theta is the model's force, but for rounding."""
+def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """By how much rounding may part Phi theta from the model's force; `InputError` where more does."""
     rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(theta))
     if not (abs(columns @ theta - predicted) <= rounding).all():
-        raise InputError(
-            "the model's torque is not linear in its parameters, as a linear fit expects: "
-            "take make_trigonometric, or train this model by its residuals"
-        )
+        raise InputError(_NOT_LINEAR)
+    return rounding
 
 
 def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:

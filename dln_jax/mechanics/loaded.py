@@ -52,7 +52,8 @@ class LoadedSystem(NamedTuple):
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
     """Generalised force tau [d] before the transmissions, of tau_link behind them."""
     at_joints = _to_joints(load, tau_link)
-    return _from_joints(load, at_joints + _slope(load, qd) * jnp.abs(at_joints))
+    # By the sign, whose derivative is 0, where that of the absolute value is one-sided.
+    return _from_joints(load, at_joints * (1 + jnp.sign(at_joints) * _slope(load, qd)))
 
 
 def carried(load: Load, qd: Vector, tau: Vector) -> Vector:

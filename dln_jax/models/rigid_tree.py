@@ -11,6 +11,7 @@ What friction is not linear in, its shape and what load takes, is given where th
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
@@ -86,7 +87,7 @@ def make_rigid_tree(
     laws = USUAL if friction is True else friction or ()
     require_laws(laws, "friction")
     shape = FrictionShape(velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift)
-    shape = FrictionShape(*(jnp.asarray(each) if isinstance(each, tuple) else each for each in shape))
+    shape = FrictionShape(*(np.asarray(each) if isinstance(each, tuple) else each for each in shape))
     require_shape(shape)
     shares = load if isinstance(load, tuple) else (load,)
     if not all(0 <= share < 1 for share in shares):

@@ -34,6 +34,10 @@ MODELS = {
     "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
     "rigid-tree": {"needs": SWING, "tree": tree_to_json(PENDULUM), "velocity_scale": 0.1},
+    "rigid-tree-residual": {
+        **{"needs": SWING._replace(friction=False, joint_friction=("asymmetric",)), "tree": tree_to_json(PENDULUM)},
+        **{"terms": ["potential", "dissipation", "inertia"], **SMALL, "torque_scale": 0.5},
+    },
     "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
     "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},

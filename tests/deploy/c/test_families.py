@@ -33,6 +33,9 @@ MODELS = {
     "black-box-delan": {"needs": MIXED, **SMALL, "activation": "softplus"},
     "trigonometric": {"needs": FREE, "degree": 1},
     "rigid-tree": {"needs": MIXED, "tree": tree_to_json(CART)},
+    "rigid-tree-residual": {
+        **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
+    },
     "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
     "structured-hnn": {"needs": MIXED, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": MIXED, **CONVEX},
