@@ -20,7 +20,7 @@ from dln_jax.identification.columns import Columns, columns_of, flat
 from dln_jax.identification.consistent import REGULARISATION, ConsistentFit, fit_consistent
 from dln_jax.identification.equations import compressed, regressor_of
 from dln_jax.identification.robust import ResidualStatistics, fit_robust, residual_statistics
-from dln_jax.identification.weighted import WeightedFit, fit_weighted
+from dln_jax.identification.weighted import ROUNDING, WeightedFit, fit_weighted
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
@@ -134,19 +134,20 @@ def identify(
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
     """What data show of each parameter, of what motions could."""
     scaled = base.combinations / np.where(fit.lengths > 0, fit.lengths, np.inf)
-    _, sizes, right = np.linalg.svd(scaled / np.linalg.norm(scaled, axis=1, keepdims=True).clip(min=1e-300))
-    possible = np.sum(right[: int(np.sum(sizes > 1e-10 * sizes.max(initial=0.0)))] ** 2, axis=0)
+    lengths = np.linalg.norm(scaled, axis=1)
+    _, sizes, right = np.linalg.svd(scaled[lengths > 0] / lengths[lengths > 0, None], full_matrices=False)
+    possible = np.sum(right[sizes > ROUNDING * sizes.max(initial=0.0)] ** 2, axis=0)
     # Directions that data miss are those that no motion shows, and of the possible ones those that are lost.
     missed = np.sum(fit.unseen**2, axis=0) - (1 - possible)
-    share = np.where(possible > 1e-10, missed / np.where(possible > 1e-10, possible, 1.0), 1.0)
-    return tuple(
-        "not at all"
-        if each > 1 - UNSEEN_SHARE or before == "not at all"
-        else before
-        if each < UNSEEN_SHARE
-        else "in combination"
-        for each, before in zip(share, structure, strict=True)
-    )
+    shown = possible > ROUNDING
+    shares = np.where(shown, missed / np.where(shown, possible, 1.0), 1.0)
+
+    def judged(share: float, before: Determinacy) -> Determinacy:
+        if share > 1 - UNSEEN_SHARE:
+            return "not at all"
+        return before if share < UNSEEN_SHARE or before == "not at all" else "in combination"
+
+    return tuple(judged(share, before) for share, before in zip(shares.tolist(), structure, strict=True))
 
 
 def parameters_of(found: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
