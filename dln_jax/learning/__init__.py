@@ -10,6 +10,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
+from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.growth import grow
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
@@ -31,6 +32,7 @@ __all__ = [
     "choose_degrees",
     "dynamics",
     "fit",
+    "fit_friction",
     "fit_linear",
     "frames",
     "functions",

@@ -4,6 +4,7 @@ Each is the integral of its force from rest. Derivatives are written out, and no
 cancel; further ones are exact derivatives of the force.
 """
 
+import math
 from collections.abc import Callable, Mapping
 
 import jax
@@ -68,7 +69,7 @@ def _stribeck_value(x: Vector, ratio: Vector) -> Vector:
     reach = jnp.minimum(size, jnp.minimum(20 * ratio, 7.0))[..., None]
     s = reach * jnp.asarray(NODES, x.dtype)
     missing = 2 * jnp.exp(-(s**2)) * jax.nn.sigmoid(-2 * s / ratio[..., None])
-    return 0.5 * np.sqrt(np.pi) * jax.scipy.special.erf(size) - jnp.sum(
+    return 0.5 * math.sqrt(math.pi) * jax.scipy.special.erf(size) - jnp.sum(
         reach * jnp.asarray(WEIGHTS, x.dtype) * missing, axis=-1
     )
 

@@ -86,6 +86,14 @@ def test_derivatives_by_rate_and_shape_are_differences(name, function):
         np.testing.assert_allclose(slope, differences, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", FORMULAS)
+def test_single_precision_stays_single(name):
+    u = jnp.asarray(RATES, jnp.float32)
+    shape = FrictionShape(*(jnp.full(len(RATES), each, jnp.float32) for each in SHAPE))
+    assert unit_force(name, u, shape).dtype == POTENTIALS[name](u, shape).dtype == jnp.float32
+    np.testing.assert_allclose(unit_force(name, u, shape), FORMULAS[name](RATES), rtol=1e-5, atol=1e-5)
+
+
 def test_what_is_not_asked_for_is_not_computed():
     """Stribeck's integral takes an error function and 40 nodes, its force neither."""
     D = joint_dissipation(stribeck=0.2)
