@@ -3,6 +3,7 @@
 What is seen or collides is not read: meshes need not be there, unless a body's mass comes from its shapes alone.
 """
 
+import contextlib
 import importlib
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -33,6 +34,8 @@ class Robot(NamedTuple):
     """rad or m."""
     force_limits: Float[np.ndarray, "d 2"]
     """N m or N, of the motors."""
+    velocity_limits: Any = np.inf
+    """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
 
 
 class _Link(NamedTuple):
@@ -72,9 +75,22 @@ def read_robot(path: str | Path) -> Robot:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
     try:
-        return _robot(mujoco, model)
+        robot = _robot(mujoco, model)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    return robot._replace(velocity_limits=_velocity_limits(root, robot.tree.names))
+
+
+def _velocity_limits(root: ET.Element, names: tuple[str, ...]) -> np.ndarray:
+    """What <limit velocity="..."> of each joint says, which MuJoCo does not read; infinite where it says nothing."""
+    stated = {}
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        velocity = "" if limit is None else limit.get("velocity", "")
+        with contextlib.suppress(ValueError):
+            stated[joint.get("name")] = float(velocity)
+    # Some files write 0 for what nobody knows.
+    return np.array([stated[name] if stated.get(name, 0.0) > 0 else np.inf for name in names])
 
 
 def _compiled(mujoco: Any, path: Path, root: ET.Element) -> Any:
