@@ -6,7 +6,8 @@ Unknowns are the series of each joint. The criterion is one of A, the informatio
     condition      largest over smallest singular value of the regressor with columns of unit length
 
 and every limit at every sample is an inequality of an augmented Lagrangian. Both have many minima: several random
-starts are taken. What is returned keeps the limits at ten times as many samples; it is shrunk a little if it has to.
+starts are taken. What is returned keeps the limits at ten times as many samples, designed anew with more margin or
+shrunk where it does not.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from dln_jax.identification.excitation_designs import (
     MARGIN,
     Design,
     functions_at,
+    furthest,
     grid,
     kept,
     states,
@@ -36,6 +38,9 @@ from dln_jax.types import InputError, Needs, Scalar, require_positive
 
 SHARPNESS = 4
 """Power of the means that stand for the largest and the smallest eigenvalue."""
+FIRST_MARGIN, TIGHTENINGS = 0.01, 3
+"""Of limits, relative to them, where a motion is designed, for what it does between its samples; and how often it is
+designed, with more where that was too little."""
 Criterion = Callable[[Array], Array]
 """A [B, B] -> scalar, smaller is better."""
 Optimiser = Callable[[Design, Any], Design | None]
@@ -71,7 +76,7 @@ class _Scale(NamedTuple):
     half: np.ndarray
 
 
-def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 40) -> Optimiser:
+def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
     """An optimiser that is compiled once for all starts.
 
     Args:
@@ -87,23 +92,29 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
         unknowns = x.reshape(len(scale.half), -1)
         return scale.middle + scale.half * unknowns[:, 0], scale.half[:, None] * (unknowns[:, 1:] @ basis.T)
 
-    def problem(x: Array, known: Array) -> tuple[Array, Array]:
+    def problem(x: Array, known: Array, margin: Array) -> tuple[Array, Array]:
         motion = states(functions, *series(x))
         Phi, _, beyond = jax.vmap(task.observe)(*motion)
         W = weighted(task, Phi).reshape(-1, task.columns.size)
         A = known + W.T @ W / task.steps
-        return criterion(A), jnp.concatenate([each.ravel() + 2 * MARGIN for each in jax.tree.leaves(beyond)])
+        return criterion(A), jnp.concatenate([each.ravel() + margin for each in jax.tree.leaves(beyond)])
 
     minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
 
     def optimise(start: Design, known: Any = None) -> Design | None:
         given = start.motion
         place = (np.asarray(given.offset) - scale.middle) / scale.half
-        x = np.column_stack([place, np.asarray(given.coefficients) / scale.half[:, None] @ basis])
-        none = np.zeros_like(start.information)
-        found = minimise(x.ravel(), none if known is None else np.asarray(known)).x
-        offset, coefficients = series(found)
-        motion = FourierMotion(np.asarray(offset), np.asarray(coefficients), task.period)
+        x = np.column_stack([place, np.asarray(given.coefficients) / scale.half[:, None] @ basis]).ravel()
+        there, margin = np.zeros_like(start.information) if known is None else np.asarray(known), FIRST_MARGIN
+        motion = given
+        for _ in range(TIGHTENINGS):
+            x = minimise(x, there, margin).x
+            offset, coefficients = series(x)
+            motion = FourierMotion(np.asarray(offset), np.asarray(coefficients), task.period)
+            beyond = furthest(task, motion)[0]
+            if beyond <= -MARGIN:
+                break
+            margin += beyond + 2 * MARGIN
         return kept(task, motion)[0]
 
     return optimise

@@ -22,8 +22,8 @@ MARGIN = 1e-3
 """Of every limit, in m of clearances, that the samples checked keep free for the times between them."""
 DRAWS = 50
 """Of a random motion, before none is said to be within the limits."""
-SMALLEST = 0.05
-"""Amplitude, relative to that drawn, to which a motion is shrunk to keep the limits."""
+SMALLEST, BISECTIONS = 0.05, 8
+"""Amplitude, relative to that drawn, to which a motion is shrunk at most to keep the limits, and how closely."""
 
 
 class Design(NamedTuple):
@@ -58,7 +58,7 @@ def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple
     return offset + q, qd, qdd
 
 
-def _beyond(task: Task, motion: FourierMotion) -> tuple[float, str]:
+def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
     """The largest excess on the fine grid, and of which limit."""
     motions = states(functions_at(task, grid(task, FINER)), motion.offset, motion.coefficients)
     parts = zip(*(np.split(np.asarray(each), FINER) for each in motions), strict=True)
@@ -74,17 +74,16 @@ def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
     def shrunk(amplitude: float) -> FourierMotion:
         return motion._replace(coefficients=amplitude * np.asarray(motion.coefficients))
 
-    broken, amplitude = 1.0, 1.0
-    beyond, kind = _beyond(task, motion)
-    while beyond > -MARGIN and amplitude > SMALLEST:
-        broken, amplitude = amplitude, amplitude - max(MARGIN, 1 - amplitude)
-        if amplitude > SMALLEST:
-            beyond, kind = _beyond(task, shrunk(amplitude))
+    beyond, _ = furthest(task, motion)
+    if beyond <= -MARGIN:
+        return measured(task, motion), ""
+    beyond, kind = furthest(task, shrunk(SMALLEST))
     if beyond > -MARGIN:
         return None, f"{kind} by {100 * beyond:.2g} %" if kind != "clearance" else f"clearance by {beyond:.2g} m"
-    for _ in range(5 if amplitude < broken else 0):
+    amplitude, broken = SMALLEST, 1.0
+    for _ in range(BISECTIONS):
         middle = (amplitude + broken) / 2
-        if _beyond(task, shrunk(middle))[0] <= -MARGIN:
+        if furthest(task, shrunk(middle))[0] <= -MARGIN:
             amplitude = middle
         else:
             broken = middle
@@ -104,7 +103,7 @@ def measured(task: Task, motion: FourierMotion) -> Design:
     sizes = np.linalg.svd(W / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     with np.errstate(divide="ignore"):
         logarithm = 2 * np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)) - len(sizes) * np.log(task.steps)
-    beyond, kind = _beyond(task, motion)
+    beyond, kind = furthest(task, motion)
     condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0 else np.inf
     return Design(motion, W.T @ W / task.steps, condition, float(logarithm), -beyond, kind)
 

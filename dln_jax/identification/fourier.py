@@ -19,6 +19,10 @@ from jaxtyping import Float
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 
+MOST_HARMONICS = 50
+"""Of a motion that is designed: more are no smooth motion, and take hours."""
+
+
 class FourierMotion(NamedTuple):
     """A periodic motion of d joints, of H harmonics."""
 
@@ -60,10 +64,12 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
     """Orthonormal columns [2 H, 2 H - 2] that span all coefficients of a joint that rests at both ends.
 
     Raises:
-        InputError: fewer than two harmonics, of which none moves from rest to rest.
+        InputError: fewer than two harmonics, of which none moves from rest to rest, or more than `MOST_HARMONICS`.
     """
-    if harmonics < 2:
-        raise InputError(f"harmonics is {harmonics}; expected at least 2, of which a motion can start and end at rest")
+    if not 2 <= harmonics <= MOST_HARMONICS:
+        raise InputError(
+            f"harmonics is {harmonics}; expected 2, with which a motion can start and end at rest, to {MOST_HARMONICS}"
+        )
     orders = np.arange(1.0, harmonics + 1)
     basis = np.zeros((2 * harmonics, 2 * harmonics - 2))
     for place, equation in enumerate((orders, orders**2)):
