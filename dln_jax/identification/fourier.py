@@ -18,7 +18,6 @@ from jaxtyping import Float
 
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
-
 MOST_HARMONICS = 50
 """Of a motion that is designed: more are no smooth motion, and take hours."""
 

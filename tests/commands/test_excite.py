@@ -53,7 +53,7 @@ def test_a_folder_with_motions(arm, tmp_path, capsys):
     assert (data.q[:, 0] >= -0.25 - 0.9 * 1.75).all() and (data.q[:, 0] <= -0.25 + 0.9 * 1.75).all()
     with (out / "train-1.csv").open() as file:
         title, *rows = csv.reader(file)
-    assert title == "t [s],q shoulder [rad],q elbow [rad],qd shoulder [rad/s],qd elbow [rad/s]".split(",")
+    assert title == ["t [s]", "q shoulder [rad]", "q elbow [rad]", "qd shoulder [rad/s]", "qd elbow [rad/s]"]
     table = np.array(rows, float)
     mine = data.trajectory == 0
     assert np.allclose(table, np.column_stack([data.t, data.q, data.qd])[mine], atol=1e-9)

@@ -100,7 +100,7 @@ def test_motions_rest_at_both_ends_and_rates_are_derivatives(task, designed):
     assert np.allclose(ends[0][0], ends[0][1], atol=1e-12)
     assert np.abs(np.array(ends[1:])).max() < 1e-12
     for t in (0.7, 3.1):
-        q, qd, qdd = state(motion, t)
+        _q, qd, qdd = state(motion, t)
         slope = jax.jvp(lambda t: state(motion, t), (t,), (1.0,))[1]
         assert np.allclose(slope[0], qd, atol=1e-12) and np.allclose(slope[1], qdd, atol=1e-12)
 
