@@ -27,7 +27,8 @@ def excitation_figure(
     """
     joints = min(data.degrees_of_freedom, MOST_JOINTS)
     figure = style.blank(height=5.6)
-    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(3.4, 1.2)))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(3.4, 1.2))
+    upper, lower = parts
     axes = upper.subplots(len(ROWS), joints, squeeze=False, sharex=True)
     colours = style.colours_of(data.label)
     for line, (key, word) in zip(axes, ROWS.items(), strict=True):
@@ -55,8 +56,8 @@ def excitation_figure(
     axis.set_ylim(len(conditions) - 0.5, -0.5)
     axis.set_xscale(style.scale_of([each for found in conditions.values() for each in found]))
     axis.set_xlabel("condition of the regressor, columns of unit length")
-    handles = [axes[0, 0].lines[place * 1] for place in range(len(data.label))]
-    style.legend(upper, handles, list(data.label), loc="outside lower center", ncols=6)
+    handles = [axes[0, 0].lines[place] for place in range(len(data.label))]
+    style.legend(figure, handles, list(data.label), loc="outside lower center", ncols=6)
     return figure
 
 

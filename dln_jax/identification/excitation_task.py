@@ -26,9 +26,9 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 SAMPLES = 20
 """Of the shortest period, where motions are designed."""
-DEPENDENT = 1e-3
+DEPENDENT = 1e-2
 """Part of a column that others do not explain, relative to it, up to which it is taken to depend on them: right angles
-that a file writes as 1.57 leave 8e-4."""
+that a file writes as 1.57 leave 8e-4 each."""
 NEGLIGIBLE = 1e-12
 """Columns shorter than this times the longest are zeros that terms leave which cancel."""
 STATES = 300

@@ -176,10 +176,10 @@ def test_used_limits_shrink_towards_the_middle():
 def test_heights_leave_out_what_cannot_sink():
     heights = heights_above(ARM, 0.1)
     assert heights is not None
-    # The first link turns at 0.3 m; the second is half a metre away.
+    # The first link turns about the origin; the second is half a metre away.
     reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-RIGHT, RIGHT)]
-    assert np.allclose(sorted(reach), [0.3 - 0.5 - 0.1, 0.3 + 0.5 - 0.1], atol=1e-12)
-    assert np.allclose(heights(jnp.array([0.0, 0.0])), [0.3 - 0.1], atol=1e-12)
+    assert np.allclose(sorted(reach), [-0.5 - 0.1, 0.5 - 0.1], atol=1e-12)
+    assert np.allclose(heights(jnp.array([0.0, 0.0])), [-0.1], atol=1e-12)
     assert heights_above(trees.serial(*trees.dh_frames([[0, 0, 0.3, 0]]), [LINK]), 0.0) is None
 
 
