@@ -23,6 +23,7 @@ FLOORS = {
     "zoo": 4,
     "datasets": 4,
     "learning": 5,
+    "identification": 6,
     "metrics": 6,
     "deploy": 6,
     "identification": 6,

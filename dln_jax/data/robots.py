@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.urdf import link_inertias, without_inertias
+from dln_jax.data.urdf import link_inertias, velocity_limits, without_inertias
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -36,6 +36,8 @@ class Robot(NamedTuple):
     """rad or m."""
     force_limits: Float[np.ndarray, "d 2"]
     """N m or N, of the motors."""
+    velocity_limits: Any = np.inf
+    """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
 
 
 class _Link(NamedTuple):
@@ -69,7 +71,8 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
         held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
         stated = link_inertias(root)
         mujoco, model = compiled(path, root, held)
-        return _robot(mujoco, model, held, stated)
+        robot = _robot(mujoco, model, held, stated)
+        return robot._replace(velocity_limits=velocity_limits(root, robot.tree.names))
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
