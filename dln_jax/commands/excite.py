@@ -21,14 +21,13 @@ from dln_jax.command_line.running import command_folder
 from dln_jax.data import schema
 from dln_jax.data.motion_tables import write_motion
 from dln_jax.data.robots import Robot, read_robot
+from dln_jax.excitation.candidates import Design, random_designs
+from dln_jax.excitation.design import CRITERIA, as_trajectories, design_set, error_ratio, together
+from dln_jax.excitation.fourier import require_sampling
+from dln_jax.excitation.limits import MotionLimits, heights_above, limits_of_robot, used
+from dln_jax.excitation.task import Task, make_task
 from dln_jax.figures.excitation import excitation_figure
 from dln_jax.files import write_figure, write_json
-from dln_jax.identification import excitation
-from dln_jax.identification.excitation import CRITERIA, together
-from dln_jax.identification.excitation_designs import Design, random_designs
-from dln_jax.identification.excitation_task import Task, make_task
-from dln_jax.identification.fourier import require_sampling
-from dln_jax.identification.motion_limits import MotionLimits, heights_above, limits_of_robot, used
 from dln_jax.mechanics.trees import inertial_parameters, with_payload
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -100,7 +99,7 @@ def main(given: Arguments) -> None:
     with command_folder(given, "excite") as folder:
         drawn = random_designs(prepared.task, (given.trajectories + 1) * given.starts, seed=given.seed)
         with progress(given.trajectories + 1, "motions") as show:
-            train, validation = excitation.design_set(
+            train, validation = design_set(
                 prepared.task, drawn, trajectories=given.trajectories, criterion=given.criterion, say=show
             )
         metrics = numbers(prepared.task, drawn, train, validation)
@@ -165,7 +164,7 @@ def labels(designs: list[Design]) -> list[str]:
 def numbers(task: Task, drawn: list[Design], train: list[Design], validation: Design) -> dict[str, float]:
     """Of what was drawn and what was designed; sets are as many motions taken together."""
     groups = [drawn[place : place + len(train)] for place in range(0, len(drawn) - len(train) + 1, len(train))]
-    ratios = [excitation.error_ratio(train, group) for group in groups]
+    ratios = [error_ratio(train, group) for group in groups]
     return {
         "base_parameters": float(task.columns.size),
         "random_condition_median": float(np.median([each.condition for each in drawn])),
@@ -204,9 +203,8 @@ def write(folder: Path, given: Arguments, prepared: Prepared, designs: list[Desi
 
 def _data(rate: float, prepared: Prepared, designs: list[Design]) -> schema.Trajectories:
     needs = prepared.robot.tree.needs._replace(friction=bool(prepared.robot.damping.any()))
-    return excitation.as_trajectories(
-        designs, labels(designs), prepared.model, prepared.parameters, rate=rate, needs=needs
-    )
+    data = as_trajectories(designs, labels(designs), prepared.model, prepared.parameters, rate=rate, needs=needs)
+    return data._replace(joint_names=np.array(prepared.names))
 
 
 def draw(folder: Path, prepared: Prepared, drawn: list[Design], designs: list[Design]) -> None:

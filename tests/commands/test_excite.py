@@ -11,7 +11,7 @@ from dln_jax.commands import excite
 from dln_jax.data import schema
 from dln_jax.data.motion_tables import write_motion
 from dln_jax.data.robots import read_robot
-from dln_jax.identification.motion_limits import limits_of_robot
+from dln_jax.excitation.limits import limits_of_robot
 from dln_jax.types import InputError
 
 pytest.importorskip("mujoco")

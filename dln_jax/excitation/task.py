@@ -16,8 +16,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.identification.fourier import rest_basis
-from dln_jax.identification.motion_limits import Clearance, Excess, MotionLimits, excess, require_limits
+from dln_jax.excitation.fourier import rest_basis
+from dln_jax.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
 from dln_jax.learning.linear import linearised
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.identification.excitation_task import Task
-from dln_jax.identification.fourier import FourierMotion, harmonic_functions, rest_basis
-from dln_jax.identification.motion_limits import worst
+from dln_jax.excitation.fourier import FourierMotion, harmonic_functions, rest_basis
+from dln_jax.excitation.limits import worst
+from dln_jax.excitation.task import Task
 from dln_jax.types import InputError, require_positive, require_seed
 
 FINER = 10

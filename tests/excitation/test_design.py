@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.identification.excitation import (
+from dln_jax.excitation.candidates import FINER, functions_at, grid, random_designs, states
+from dln_jax.excitation.design import (
     CRITERIA,
     as_trajectories,
     best_design,
@@ -14,10 +15,9 @@ from dln_jax.identification.excitation import (
     make_optimiser,
     together,
 )
-from dln_jax.identification.excitation_designs import FINER, functions_at, grid, random_designs, states
-from dln_jax.identification.excitation_task import independent_columns, linear_force, make_task
-from dln_jax.identification.fourier import FourierMotion, require_sampling, rest_basis, sampled, state
-from dln_jax.identification.motion_limits import MotionLimits, heights_above, used, worst
+from dln_jax.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled, state
+from dln_jax.excitation.limits import MotionLimits, heights_above, used, worst
+from dln_jax.excitation.task import independent_columns, linear_force, make_task
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics

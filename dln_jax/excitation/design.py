@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.identification.excitation_designs import (
+from dln_jax.excitation.candidates import (
     MARGIN,
     Design,
     functions_at,
@@ -29,8 +29,8 @@ from dln_jax.identification.excitation_designs import (
     states,
     weighted,
 )
-from dln_jax.identification.excitation_task import Task
-from dln_jax.identification.fourier import FourierMotion, require_sampling, rest_basis, sampled
+from dln_jax.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled
+from dln_jax.excitation.task import Task
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.augmented_lagrangian import make_minimiser
