@@ -19,19 +19,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial, grow, significantly_better
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, Vector, require_positive
+from dln_jax.types import InputError, Needs, require_positive
 
 LARGEST_DEGREE = 4
 """That is tried."""
@@ -91,12 +90,11 @@ def fit_linear(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(data))
         zero = np.zeros(count(like))
-        # One program for both passes.
-        one = functools.partial(linearised, model)
-        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+        linearise = _linearise(model)  # one program for both passes
+        length = -(-len(data.tau) // -(-len(data.tau) // chunk_size))
 
         def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, chunk_size):
+            for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, length):
                 weighted = columns / scale[:, None]
                 yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
 
@@ -105,7 +103,7 @@ def fit_linear(
         )
         parameters = _unravel(solution.x, like)
         squares = 0.0
-        for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):
+        for columns, predicted, tau in _chunks(linearise, parameters, data, length):
             rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(solution.x))
             if not (abs(columns @ solution.x - predicted) <= rounding).all():
                 raise InputError(
@@ -123,20 +121,6 @@ def fit_linear(
     )
 
 
-def linearised(
-    model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
-) -> tuple[Float[Array, "d P"], Vector]:
-    """Phi = d tau / d theta of one state, columns in the order of `ravel_pytree(parameters)`, and tau."""
-
-    def torque(parameters: Parameters) -> Vector:
-        return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)
-
-    # Reverse mode: d pull-backs, where forward mode would push all P parameters.
-    tau, pull_back = jax.vjp(torque, parameters)
-    (rows,) = jax.vmap(pull_back)(np.eye(tau.shape[0], dtype=tau.dtype))
-    return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
-
-
 def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
     """A tree like another, of the elements of a vector in the order of its leaves; NumPy, so that nothing compiles."""
     leaves, structure = jax.tree.flatten(like)
@@ -145,12 +129,27 @@ def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
     return jax.tree.unflatten(structure, parts)
 
 
-def _chunks(
-    linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
+def linearised_chunks(
+    model: Model, parameters: Parameters, data: Trajectories, length: int = 256
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
+    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
+
+    Of any number of samples by one program, in the dtype of the parameters.
+    """
+    return _chunks(_linearise(model), parameters, data, length)
+
+
+@functools.lru_cache(maxsize=4)
+def _linearise(model: Model) -> Callable:
+    one = functools.partial(linearised, model)
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+
+
+def _chunks(
+    linearise: Callable, parameters: Parameters, data: Trajectories, length: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Phi, the model's tau and the measured tau of so many samples at a time; the last chunk may be shorter."""
     samples = len(data.tau)
-    length = -(-samples // -(-samples // chunk_size))
     for first in range(0, samples, length):
         # The last chunk is filled up with its first sample, so that all are one program.
         rows = np.arange(first, first + length)

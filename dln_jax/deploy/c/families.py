@@ -9,6 +9,7 @@ In coordinates and velocities, x = (q, qd), of every system on which forces act:
 | `energy` | q, qd | energy |
 | `mass_matrix` | q, and qd where M depends on it | M |
 | `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
+| `torque_std`, `outside` | q, qd, qdd | tau_std; outside |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
 In a phase space, of rates and of Hamiltonians, without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p;
@@ -40,6 +41,8 @@ from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flo
 from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.models.model import Model
+from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -132,7 +135,11 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
         raise InputError("the model states no needs; export functions_of_system of its energies")
     needs = needs_from_json(description["needs"])
     energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
-    return functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    functions = functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    if run.uncertainty is not None:
+        known = _of_uncertainty(model, parameters, run.uncertainty)
+        functions |= _with_examples(known, dtype, needs.degrees_of_freedom)
+    return functions
 
 
 def _converted(dtype: Any, leaf: Array) -> Array:
@@ -190,6 +197,11 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     for name, step in {"rk4": discrete.rk4(forward, actuation=actuation), "implicit_midpoint": implicit}.items():
         functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
     return functions
+
+
+def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
+    std = predictive(model, parameters, known.factor, known.noise, known.inflation)
+    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside(model, parameters, known), "outside")}
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
