@@ -7,8 +7,8 @@ J D⁻¹ = U S Vᵀ, noise of variance noise_i² in each torque, and a prior of 
     Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
 
 For ridge = 0 that is the covariance of weighted least squares on the directions that are determined, whatever the
-weights; where all joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. Degrees of freedom
-of joint i are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
+weights; where all joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. Degrees of
+freedom of joint i are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
 """
 
 from collections.abc import Callable, Iterator

@@ -5,8 +5,8 @@
 
 The covariance of the parameters is that of the least-squares fit (`learning.posterior`). For models that are linear in
 them, as `fit_linear` fits them, `ridge=0.0` is exact; a network trained on torques is linearised about its parameters
-(Laplace's approximation) with the ridge of `RIDGES` under which the validation torques are most likely. Of networks with
-more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain, the rest taken as known.
+(Laplace's approximation) with the ridge of `RIDGES` under which the validation torques are most likely. Of networks
+with more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain, the rest taken as known.
 
 What is left over is not white noise but also what the model cannot express, and errors of neighbouring samples are
 alike. Validation therefore scales both parts of the variance of each joint,

@@ -5,9 +5,9 @@ linear in them) the torque of joint i at a state is uncertain by
 
     sd_i² = noise_i² + inflation_i |phi_i F|²,   phi_i = d tau_i / d theta
 
-(MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions of
-Bayesian neural nets via local linearization"). `learning.uncertainty` finds all of it from data. Everything is for one
-state.
+(MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions
+of Bayesian neural nets via local linearization"). `learning.uncertainty` finds all of it from data. Everything is for
+one state.
 """
 
 from collections.abc import Callable

@@ -61,6 +61,8 @@ Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 Named = dict[str, Function]
 DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
 """How names of functions end that are derivatives of others."""
+LARGEST_FACTOR = 250_000
+"""Numbers of a covariance's factor that go into C, where they take some 24 bytes each; a larger one stays in Python."""
 SCALARS = ("energy", "hamiltonian")
 """Functions with one number as their result, whose derivative is a gradient."""
 
@@ -136,7 +138,7 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
     needs = needs_from_json(description["needs"])
     energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
     functions = functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
-    if run.uncertainty is not None:
+    if run.uncertainty is not None and run.uncertainty.factor.size <= LARGEST_FACTOR:
         known = _of_uncertainty(model, parameters, run.uncertainty)
         functions |= _with_examples(known, dtype, needs.degrees_of_freedom)
     return functions
