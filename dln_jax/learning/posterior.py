@@ -21,6 +21,8 @@ from dln_jax.solvers.least_squares import triangular_factor
 
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
 """Phi [n, d, P] and tau_hat - tau [n, d] of some samples at a time."""
+ALONE = 1e-6
+"""Share of the information on a direction that is elsewhere, below which some samples alone determine it."""
 
 
 class Spectrum(NamedTuple):
@@ -75,6 +77,40 @@ def spectrum(
     tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P) if rank_tolerance is None else rank_tolerance
     sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
     return Spectrum(scale, sizes, right.T, [each @ right.T for each in scaled], squares, unit, samples)
+
+
+def left_out(
+    spectrum: Spectrum,
+    noise: Float[np.ndarray, " d"],
+    columns: Float[np.ndarray, "n d P"],
+    residual: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    """Residuals that some training samples would have if they had not been fitted, and their variance by parameters.
+
+    With U their rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r: exact for least squares without a
+    ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
+
+    Args:
+        spectrum: of all training data.
+        noise: as `posterior` finds it.
+        columns: Phi D⁻¹ V of the samples.
+        residual: tau_hat - tau of them.
+    """
+    counts, unit = spectrum.sizes > 0, spectrum.unit
+    along = columns[:, :, counts] / spectrum.sizes[counts]
+    relative = (noise / unit) ** 2
+    U = along / unit[:, None]
+    values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - np.einsum("nip,niq->pq", U, U, optimize=True))
+    # What these samples alone determine is fitted exactly: its residual is zero, and says nothing.
+    inverse = (vectors * np.divide(1, values, out=np.zeros_like(values), where=values > ALONE)) @ vectors.T
+    inner = -np.einsum("nip,i,niq->pq", U, relative, U, optimize=True)
+    for size, triangle in zip(relative, spectrum.triangles, strict=True):
+        share = triangle[:, counts] / spectrum.sizes[counts]
+        inner += size * (share.T @ share)
+    weighted = residual / unit
+    predicted = U @ (inverse @ np.einsum("nip,ni->p", U, weighted))
+    variance = np.einsum("nip,pq,niq->ni", along, inverse @ inner @ inverse, along, optimize=True)
+    return (weighted + predicted) * unit, np.maximum(variance, 0.0)
 
 
 def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:

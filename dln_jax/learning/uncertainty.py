@@ -9,12 +9,13 @@ them, as `fit_linear` fits them, `ridge=0.0` is exact; a network trained on torq
 with more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain, the rest taken as known.
 
 What is left over is not white noise but also what the model cannot express, and errors of neighbouring samples are
-alike. Validation therefore scales both parts of the variance of each joint,
+alike. Motions that were not fitted therefore scale both parts of the variance of each joint,
 
     a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood,
 
 and keeps the simplest that no other betters by more than half the logarithm of the effective samples for each further
-factor (Schwarz 1978): a few seconds of validation that agree with the training leave it as it is.
+factor (Schwarz 1978): a few seconds that agree with the training leave it as it is. These motions are the validation's,
+and for least squares also the training's, each as if it had been left out (`posterior.left_out`).
 """
 
 from typing import NamedTuple
@@ -24,9 +25,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import select
 from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, posterior, spectrum
+from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Domain, Uncertainty
 from dln_jax.solvers.normal_equations import count
@@ -37,6 +39,8 @@ RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
 RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
 """b / a that are tried."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400
+FOLDS = 10
+"""Groups of training trajectories that are left out in turn."""
 MOST_SAMPLES = 2_000
 """Of the validation, spread evenly."""
 STILL = 1e-3
@@ -104,8 +108,9 @@ def estimate(
         )
         fitted = _along(found, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
         judged, residual = _along(found, _rows(model, parameters, held_out, basis))
+        folds = [] if ridge != 0 else _left_out(model, parameters, train, found)
     tried = [
-        _calibrated(posterior(found, each), each, judged, residual, held_out.trajectory)
+        _calibrated(posterior(found, each), each, judged, residual, held_out.trajectory, folds)
         for each in (RIDGES if ridge is None else (ridge,))
     ]
     chosen = min(tried, key=lambda each: each.unlikeliness)
@@ -160,7 +165,8 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
 
     The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
     """
-    parts = [residual[trajectory == index] for index in np.unique(trajectory)]
+    order = np.argsort(trajectory, kind="stable")
+    parts = np.split(residual[order], np.flatnonzero(np.diff(trajectory[order])) + 1)
     whole = sum(float(part @ part) for part in parts)
     total = 1.0
     for lag in range(1, max(map(len, parts))):
@@ -187,15 +193,37 @@ class _Calibrated(NamedTuple):
 
 
 def _calibrated(
-    found: Posterior, ridge: float, rows: np.ndarray, residual: np.ndarray, trajectory: np.ndarray
+    found: Posterior,
+    ridge: float,
+    rows: np.ndarray,
+    residual: np.ndarray,
+    trajectory: np.ndarray,
+    folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> _Calibrated:
     variances = np.sum((rows @ found.along) ** 2, axis=2)
+    parts = [(residual, variances, trajectory), *folds]
+    residual, variances, trajectory = (np.concatenate(each) for each in zip(*parts, strict=True))
     joints = [
         calibration(r, float(noise), variance, effective_samples(r / np.sqrt(noise**2 + variance), trajectory))
         for r, noise, variance in zip(residual.T, found.noise, variances.T, strict=True)
     ]
     a, b, unlikeliness = (np.array(each) for each in zip(*joints, strict=True))
     return _Calibrated(found, ridge, np.sqrt(a) * found.noise, b, float(unlikeliness.mean()))
+
+
+def _left_out(
+    model: Model, parameters: Parameters, train: Trajectories, found: Spectrum
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
+    noise, present = posterior(found, 0.0).noise, np.unique(train.trajectory)
+    if len(present) < 2:
+        return []
+    folds = []
+    for indices in np.array_split(present, min(FOLDS, len(present))):
+        data = select(train, indices)
+        columns, residual = _along(found, _rows(model, parameters, data))
+        folds.append((*left_out(found, noise, columns, residual), data.trajectory))
+    return folds
 
 
 def _rows(model: Model, parameters: Parameters, data: Trajectories, basis: np.ndarray | None = None) -> Rows:

@@ -1,16 +1,18 @@
 """Arms of known frames, and noisy motions of them: torques of rigid bodies, friction, and what no model of ours has."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories, from_arrays
-from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
-from dln_jax.precision import in_float64
 from dln_jax.types import Vector
 
 RIGHT = np.pi / 2
@@ -29,6 +31,8 @@ VELOCITY_SCALE = 0.05
 SECONDS, STEP = 6.0, 0.04
 """Of a motion, and between its samples."""
 
+Plant = Callable[..., Any]
+
 
 def arm(d: int) -> Tree:
     """The first d joints of a Panda, with links that get lighter, and motors."""
@@ -40,23 +44,42 @@ def arm(d: int) -> Tree:
     return serial(*dh_frames(PANDA[:d]), links, armature=np.full(d, 0.05))
 
 
-@in_float64
+def plant(tree: Tree, *, unmodelled: bool) -> Plant:
+    """(q, qd, qdd) [N, d] each -> torques [N, d] of the arm with viscous and dry friction.
+
+    With `unmodelled`, also friction that grows with the weight on a joint and as it slows down (Stribeck).
+    """
+    d = tree.degrees_of_freedom
+    friction = joint_dissipation(
+        np.full(d, 0.2), np.full(d, 0.5), np.linspace(-0.1, 0.1, d), velocity_scale=VELOCITY_SCALE
+    )
+    motion = dynamics(tree_system(tree, friction))
+
+    def torque(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        tau = motion.inverse_dynamics(q, qd, qdd)
+        if not unmodelled:
+            return tau
+        weight = motion.decompose(q, 0 * q, 0 * q).gravity
+        return tau + jnp.tanh(qd / VELOCITY_SCALE) * (0.3 * jnp.exp(-((qd / 0.3) ** 2)) + 0.03 * jnp.abs(weight))
+
+    return jax.jit(jax.vmap(torque), compiler_options=quick_compilation())
+
+
 def motions(
-    tree: Tree, count: int, *, noise: float, unmodelled: bool, seed: int, reach: float = 1.0, speed: float = 1.0
+    torque: Plant, d: int, count: int, *, noise: float, seed: int, reach: float = 1.0, speed: float = 1.0
 ) -> Trajectories:
-    """Motions of four sines a joint with drawn amplitudes, frequencies and phases, with viscous and dry friction.
+    """Motions of four sines a joint with drawn amplitudes, frequencies and phases.
 
     Args:
-        tree: the arm.
+        torque: of a `plant`.
+        d: its joints.
         count: of motions.
         noise: standard deviation of the first torque's noise, N m; it falls to 30 % of that at the last joint.
-        unmodelled: add friction that grows with the weight on a joint and as it slows down (Stribeck).
         seed: of everything drawn.
         reach: multiplies amplitudes.
         speed: multiplies frequencies.
     """
-    d, random = tree.degrees_of_freedom, np.random.default_rng(seed)
-    t = np.arange(0, SECONDS, STEP)
+    random, t = np.random.default_rng(seed), np.arange(0, SECONDS, STEP)
     rate = speed * 2 * np.pi * random.uniform(0.05, 0.5, (count, 1, d, 4))
     size = reach * random.uniform(0.1, 0.5, (count, 1, d, 4))
     phase = rate * t[:, None, None] + random.uniform(0, 2 * np.pi, (count, 1, d, 4))
@@ -64,19 +87,6 @@ def motions(
     q = middle + np.sum(size * np.sin(phase), axis=-1)
     qd, qdd = np.sum(size * rate * np.cos(phase), axis=-1), -np.sum(size * rate**2 * np.sin(phase), axis=-1)
     q, qd, qdd = (each.reshape(-1, d) for each in (q, qd, qdd))
-    friction = joint_dissipation(
-        np.full(d, 0.2), np.full(d, 0.5), np.linspace(-0.1, 0.1, d), velocity_scale=VELOCITY_SCALE
-    )
-    motion = dynamics(tree_system(tree))
-
-    @jax.jit
-    @jax.vmap
-    def torque(q: Vector, qd: Vector, qdd: Vector) -> Vector:
-        tau = motion.inverse_dynamics(q, qd, qdd) + (0.0 if friction is None else friction_force(friction, q, qd))
-        weight = motion.decompose(q, 0 * q, 0 * q).gravity
-        further = 0.3 * jnp.exp(-((qd / 0.3) ** 2)) + 0.03 * jnp.abs(weight)
-        return tau + jnp.tanh(qd / VELOCITY_SCALE) * further if unmodelled else tau
-
     tau = np.asarray(torque(q, qd, qdd))
     tau = tau + noise * np.linspace(1, 0.3, d) * random.normal(size=tau.shape)
     trajectory = np.repeat(np.arange(count), len(t))

@@ -30,7 +30,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
-from dln_jax.studies.uncertainty.arms import UR10, VELOCITY_SCALE, arm, filtered, motions
+from dln_jax.studies.uncertainty.arms import UR10, VELOCITY_SCALE, arm, filtered, motions, plant
 
 LOWEST, HIGHEST = 0.90, 0.98
 """Of the coverage to reach."""
@@ -56,7 +56,7 @@ def judged(
     answer = _answer(model)
     shares, flags = [], []
     for data in (test, far) if far is not None else (test,):
-        tau, sd, out = map(np.asarray, answer(parameters, found.uncertainty, data.q, data.qd, data.qdd))
+        tau, sd, out = answer(parameters, found.uncertainty, data.q, data.qd, data.qdd)
         shares.append(coverage(tau - data.tau, sd, levels=(LEVEL,)).shares[0])
         flags.append(float(out.mean()))
     away = (flags[1], float(shares[1].mean())) if far is not None else (np.nan, np.nan)
@@ -72,7 +72,17 @@ def _answer(model: Model) -> Callable[..., Any]:
         tau = dynamics(model.energies(parameters)).inverse_dynamics(*state)
         return tau, std(*state), outside(model, parameters, known)(*state)
 
-    return jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), compiler_options=quick_compilation())
+    many = jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), compiler_options=quick_compilation())
+
+    def answer(parameters, known, *states):
+        """By pieces of one size, so that tests of any size are one program."""
+        samples, parts = len(states[0]), []
+        for first in range(0, samples, 256):
+            rows = np.minimum(np.arange(first, first + 256), samples - 1)
+            parts.append(many(parameters, known, *(each[rows] for each in states)))
+        return tuple(np.concatenate(each)[:samples] for each in zip(*parts, strict=True))
+
+    return answer
 
 
 def rows_of(name: str, found: Sequence[HeldOut]) -> list[Row]:
@@ -101,10 +111,10 @@ def simulated_arm(name: str, d: int, *, noise: float, unmodelled: bool, splits: 
     """A rigid tree with friction, fitted to 9 motions of 6 s, calibrated on 2, judged on 3; new ones for each split."""
     tree = arm(d)
     model = make_rigid_tree(tree, friction=True, velocity_scale=VELOCITY_SCALE)
-    found = []
+    torque, found = plant(tree, unmodelled=unmodelled), []
     for seed in range(splits):
-        drawn = functools.partial(motions, tree, noise=noise, unmodelled=unmodelled)
-        data, far = drawn(14, seed=2 * seed), drawn(2, seed=2 * seed + 1, reach=2.0, speed=2.0)
+        drawn = functools.partial(motions, torque, d, 14, noise=noise)
+        data, far = drawn(seed=2 * seed), drawn(seed=2 * seed + 1, reach=2.0, speed=2.0)
         train, validation, test = (select(data, each) for each in (range(9), range(9, 11), range(11, 14)))
         found.append(_linear(model, train, validation, test, far))
     return Findings(rows_of(name, found))
