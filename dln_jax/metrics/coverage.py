@@ -5,7 +5,7 @@ between whose negative and itself there is the probability p: 1.96 sd for 95 %.
 """
 
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -32,10 +32,13 @@ def half_width(level: float) -> float:
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 
-def coverage(
-    error: Float[np.ndarray, "N d"], std: Float[np.ndarray, "N d"], levels: tuple[float, ...] = LEVELS
-) -> Coverage:
-    """Shares of errors, predicted less measured, within z_p standard deviations.
+def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Coverage:
+    """Shares of errors within z_p standard deviations.
+
+    Args:
+        error: predicted less measured, [N, d].
+        std: predicted standard deviations, [N, d].
+        levels: p.
 
     Raises:
         InputError: a level outside (0, 1), or shapes that differ.

@@ -128,11 +128,11 @@ def letters(name: str, *, noise: float, splits: int, width: int, steps: int) -> 
     """
     data, scene, found = characters(), two_link_arm(), []
     far = uniform(scene, samples=500, seed=1)
+    model = make_delan(scene.needs, width=width, depth=2, dtype=jnp.float64)
     for seed, labels in enumerate(partition_labels(data, 7, seed=1)[:splits]):
         random = np.random.default_rng(seed)
         noisy = data._replace(tau=data.tau + noise * data.tau.std(axis=0) * random.normal(size=data.tau.shape))
         sets = split_by_labels(noisy, test=labels, seed=seed)
-        model = make_delan(scene.needs, width=width, depth=2, dtype=jnp.float64)
         parameters = fit(problems.problem(model, sets, seeds=seed), GaussNewton(steps=steps)).parameters
         known = estimate(model, parameters, sets.train, sets.validation)
         found.append(judged(model, parameters, known, sets.test, far))
