@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Int
 from dln_jax.compilation import quick_compilation
 from dln_jax.excitation.fourier import rest_basis
 from dln_jax.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
-from dln_jax.learning.linear import linearised
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model, Parameters
 from dln_jax.precision import require_double_precision
 from dln_jax.types import InputError, require_positive, require_seed

@@ -9,6 +9,7 @@ from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.figures.training import training_curve
+from dln_jax.figures.uncertainty import torque_bands
 
 __all__ = [
     "Moments",
@@ -30,6 +31,7 @@ __all__ = [
     "soft_body_frame",
     "surfaces",
     "tip_paths",
+    "torque_bands",
     "training_curve",
     "write_frame_gif",
     "write_motion_gif",

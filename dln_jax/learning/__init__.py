@@ -3,9 +3,10 @@
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
 `dynamics`, `rates`, `motions`, `frames` and `functions` build problems; what is linear in its parameters needs no loop.
+`uncertainty` says what a fitted model does not know.
 """
 
-from dln_jax.learning import dynamics, frames, functions, motions, rates
+from dln_jax.learning import dynamics, frames, functions, motions, rates, uncertainty
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
@@ -43,4 +44,5 @@ __all__ = [
     "objective_of",
     "rates",
     "suited",
+    "uncertainty",
 ]

@@ -19,18 +19,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial, grow, significantly_better
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, Vector, require_positive
+from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
@@ -125,20 +124,7 @@ def fit_linear(
     )
 
 
-def linearised(
-    model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
-) -> tuple[Float[Array, "d P"], Vector]:
-    """Phi = d tau / d theta of one state, columns in the order of `ravel_pytree(parameters)`, and tau."""
-
-    def torque(parameters: Parameters) -> Vector:
-        return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)
-
-    # Reverse mode: d pull-backs, where forward mode would push all P parameters.
-    tau, pull_back = jax.vjp(torque, parameters)
-    (rows,) = jax.vmap(pull_back)(np.eye(tau.shape[0], dtype=tau.dtype))
-    return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
-
-
+@functools.lru_cache(maxsize=4)
 def design(model: Model) -> Callable:
     """(parameters, q, qd, qdd [N, d] each) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
     one = functools.partial(linearised, model)
@@ -166,7 +152,23 @@ def design_chunks(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
     samples = len(data.tau)
-    length = -(-samples // -(-samples // chunk_size))
+    return _chunks(linearise, parameters, data, -(-samples // -(-samples // chunk_size)))
+
+
+def linearised_chunks(
+    model: Model, parameters: Parameters, data: Trajectories, length: int = 256
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
+
+    Of any number of samples by one program, in the dtype of the parameters.
+    """
+    return _chunks(design(model), parameters, data, length)
+
+
+def _chunks(
+    linearise: Callable, parameters: Parameters, data: Trajectories, length: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    samples = len(data.tau)
     for first in range(0, samples, length):
         # The last chunk is filled up with its first sample, so that all are one program.
         rows = np.arange(first, first + length)

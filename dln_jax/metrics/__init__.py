@@ -1,5 +1,6 @@
-"""Numbers about a model: errors, rollouts, definiteness, misfit, latency."""
+"""Numbers about a model: errors, rollouts, definiteness, misfit, latency, coverage."""
 
+from dln_jax.metrics.coverage import Coverage, coverage
 from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, mean_square, normalised_error, predictions
 from dln_jax.metrics.frames import Injection, inject_energy
@@ -19,12 +20,14 @@ from dln_jax.metrics.rollouts import (
 from dln_jax.metrics.soft_body_energies import motion_energies
 
 __all__ = [
+    "Coverage",
     "Definiteness",
     "Injection",
     "Latency",
     "Misfit",
     "Motion",
     "Motions",
+    "coverage",
     "definiteness",
     "energy_error",
     "errors",

@@ -23,6 +23,7 @@ from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
 from dln_jax.runs.dynamics_task import Options, Solver, Task, prepare
+from dln_jax.runs.dynamics_uncertainty import store_uncertainty
 from dln_jax.runs.results import losses, settings_of
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
@@ -52,6 +53,8 @@ def run(given: Options, command: str) -> None:
             )
         parameters, best = best_seed(training, given.seeds)
         save(folder, task.description, parameters)
+        if given.uncertainty:
+            store_uncertainty(folder, task, parameters)
         metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)

@@ -73,6 +73,8 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+    uncertainty: bool = True
+    """Store how uncertain the torque is at any state and whether a state is outside the data, and test both."""
 
 
 class Solver(NamedTuple):

@@ -9,6 +9,7 @@ In coordinates and velocities, x = (q, qd), of every system on which forces act:
 | `energy` | q, qd | energy |
 | `mass_matrix` | q, and qd where M depends on it | M |
 | `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
+| `torque_std`, `outside` | q, qd, qdd | tau_std; outside |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
 In a phase space, of rates and of Hamiltonians, without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p;
@@ -41,6 +42,8 @@ from dln_jax.mechanics.jacobians import Natural
 from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.models.model import Model
+from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -59,6 +62,8 @@ Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 Named = dict[str, Function]
 DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
 """How names of functions end that are derivatives of others."""
+LARGEST_FACTOR = 250_000
+"""Numbers of a covariance's factor that go into C, where they take some 24 bytes each; a larger one stays in Python."""
 SCALARS = ("energy", "hamiltonian")
 """Functions with one number as their result, whose derivative is a gradient."""
 
@@ -146,7 +151,11 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
         raise InputError("the model states no needs; export functions_of_system of its energies")
     needs = needs_from_json(description["needs"])
     energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
-    return functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    functions = functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    if run.uncertainty is not None and run.uncertainty.factor.size <= LARGEST_FACTOR:
+        known = _of_uncertainty(model, parameters, run.uncertainty)
+        functions |= _with_examples(known, dtype, needs.degrees_of_freedom)
+    return functions
 
 
 def _converted(dtype: Any, leaf: Array) -> Array:
@@ -205,6 +214,11 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     for name, step in {"rk4": discrete.rk4(forward, actuation=actuation), "implicit_midpoint": implicit}.items():
         functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
     return functions
+
+
+def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
+    std = predictive(model, parameters, known.factor, known.noise, known.inflation)
+    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside(model, parameters, known), "outside")}
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
