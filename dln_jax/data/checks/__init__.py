@@ -5,6 +5,7 @@
 
 from dln_jax.data.checks.doctor import Examination, examine, quick
 from dln_jax.data.checks.findings import Finding, told
+from dln_jax.data.checks.page import page
 from dln_jax.data.checks.recording import Recording, as_recording, read
 
-__all__ = ["Examination", "Finding", "Recording", "as_recording", "examine", "quick", "read", "told"]
+__all__ = ["Examination", "Finding", "Recording", "as_recording", "examine", "page", "quick", "read", "told"]

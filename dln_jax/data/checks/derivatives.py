@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dln_jax.data.checks.delays import away_from_ends, vertex
 from dln_jax.data.checks.findings import Finding, named
 from dln_jax.data.encoders.smoothing import Smoothed
 from dln_jax.data.schema import Trajectories
@@ -34,7 +35,7 @@ class Match(NamedTuple):
 def match(measured: np.ndarray, derived: np.ndarray, part: np.ndarray, farthest: int) -> Match:
     """How a measured signal follows a derived one: the factor and delay of least squared error."""
     shifts = np.arange(-farthest, farthest + 1)
-    inside = _inside(part, farthest)
+    inside = away_from_ends(part, farthest)
     if len(inside) < 16 or not derived[inside].any():
         return Match(1.0, 0.0, 0.0, 1.0)
     x = derived[inside]
@@ -47,21 +48,6 @@ def match(measured: np.ndarray, derived: np.ndarray, part: np.ndarray, farthest:
     now = relative[farthest]
     least = max(float(relative[best]), float(np.finfo(float).eps))
     return Match(float(products[best, 0] / (x @ x)), place, float(correlation), float(now / least))
-
-
-def vertex(values: np.ndarray, lowest: int) -> float:
-    """Where the parabola through a lowest value and its neighbours has its own lowest, in steps from it."""
-    if not 0 < lowest < len(values) - 1:
-        return 0.0
-    before, here, after = values[lowest - 1 : lowest + 2]
-    curvature = before - 2 * here + after
-    return float(0.5 * (before - after) / curvature) if curvature > 0 else 0.0
-
-
-def _inside(part: np.ndarray, farthest: int) -> np.ndarray:
-    """Samples with so many neighbours on both sides in their own part."""
-    places = np.arange(farthest, len(part) - farthest)
-    return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]
 
 
 def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:

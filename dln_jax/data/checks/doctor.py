@@ -66,7 +66,7 @@ def examine(recording: Recording, robot: Robot | None = None) -> Examination:
     if even is not None:
         findings += _noise(data, even)
         findings += check_derivatives(data, even)
-        farthest = int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
+        farthest = _farthest(even)
         regression = surrogate(even.data, joints, farthest=farthest) if driven else None
         findings += check_degrees(even.data, joints, regression, farthest)
         if regression is not None:
@@ -75,9 +75,18 @@ def examine(recording: Recording, robot: Robot | None = None) -> Examination:
     on_tree = None
     if robot is not None:
         samples = even.data if even is not None else data
-        on_tree = against_tree(samples, robot, recording.names, driven=driven)
+        farthest = 0 if even is None else _farthest(even)
+        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest)
+        # What the tree says of signs and delays is surer.
+        findings = [each for each in findings if each.check != "delay"]
+        if any(each.check == "tree-sign" for each in on_tree.findings):
+            findings = [each for each in findings if each.check != "torque-sign"]
         findings += on_tree.findings
     return Examination(told(findings), recording, even, regression, on_tree, step_of(data.q))
+
+
+def _farthest(even: Smoothed) -> int:
+    return int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
 
 
 def _even(data: Trajectories) -> Smoothed | None:

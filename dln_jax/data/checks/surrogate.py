@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.checks.derivatives import vertex
+from dln_jax.data.checks.delays import away_from_ends, vertex
 from dln_jax.data.schema import Trajectories
 
 MOST = 4000
@@ -37,6 +37,8 @@ class Surrogate(NamedTuple):
     """N m s or N s/m."""
     coulomb: Float[np.ndarray, " d"]
     """N m or N."""
+    velocity_scale: Float[np.ndarray, " d"]
+    """1/s or m/s, on which dry friction is smooth."""
     friction_seen: Float[np.ndarray, " d"]
     """By which factor the squared error grows without both, less one."""
     rest: Float[np.ndarray, "n d"]
@@ -48,7 +50,7 @@ class Surrogate(NamedTuple):
     delays: Float[np.ndarray, " S"]
     """Samples that were tried."""
     delay_error: Float[np.ndarray, " S"]
-    """Unexplained share of the variance at each, mean over joints."""
+    """Unexplained share of the variance at each, geometric mean over joints: those that are explained well decide."""
 
 
 def common_columns(data: Trajectories, joints: Sequence[str]) -> np.ndarray:
@@ -61,7 +63,7 @@ def common_columns(data: Trajectories, joints: Sequence[str]) -> np.ndarray:
 def surrogate(data: Trajectories, joints: Sequence[str], *, farthest: int) -> Surrogate | None:
     """The regression, and the delay up to `farthest` samples at which it is best; `None` with too few samples."""
     d = data.degrees_of_freedom
-    inside = _inside(data.trajectory, farthest)
+    inside = away_from_ends(data.trajectory, farthest)
     shared = 4 * d + 1
     if len(inside) < 4 * (shared + 2):
         return None
@@ -98,18 +100,14 @@ def surrogate(data: Trajectories, joints: Sequence[str], *, farthest: int) -> Su
         a = float(column @ tau) / size if size > 1e-12 * float(np.sum(data.qdd[rows, joint] ** 2)) else 0.0
         out["a"].append(a)
         out["a_seen"].append(a**2 * size / error)
-    error = np.mean(np.minimum(out["late"], 1.0), axis=0)
+    error = np.exp(np.mean(np.log(np.clip(out["late"], 1e-12, 1.0)), axis=0))
     best = int(np.argmin(error))
     return Surrogate(
-        rows, *(np.array(out[key]) for key in ("explained", "a", "a_seen", "v", "f", "f_seen")),
+        rows, *(np.array(out[key]) for key in ("explained", "a", "a_seen", "v", "f")),
+        velocity_scale=SCALE * speed, friction_seen=np.array(out["f_seen"]),
         rest=np.array(out["rest"]).T, delay=float(shifts[best]) + vertex(error, best),
         delay_gain=float(error[farthest] / max(error[best], 1e-20)), delays=shifts.astype(float), delay_error=error,
     )  # fmt: skip
-
-
-def _inside(part: np.ndarray, farthest: int) -> np.ndarray:
-    places = np.arange(farthest, len(part) - farthest)
-    return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]
 
 
 def _scaled(columns: np.ndarray) -> np.ndarray:

@@ -11,17 +11,15 @@ TRUSTED = 0.8
 """Of the variance that the regression has to explain before its word counts."""
 SEEN = 0.05
 """By so much the squared error grows without a term that is there."""
-LATE = 0.5
-"""Samples of delay that are worth a word."""
-LATE_GAIN = 1.3
+LATE = 2.0
+"""Samples of delay that are worth a word: without a robot's description it is known to about one or two."""
+LATE_GAIN = 1.04
 """By which the squared error falls with it."""
 DRY = 0.02
 """Of a torque's standard deviation, from which dry friction is named."""
 
 
-def check_torques(
-    data: Trajectories, joints: tuple[str, ...], friction_stated: bool, found: Surrogate
-) -> list[Finding]:
+def check_torques(data: Trajectories, found: Surrogate, *, friction_stated: bool) -> list[Finding]:
     """What the regression tells of torques."""
     findings = []
     sure = found.explained > TRUSTED
@@ -32,7 +30,7 @@ def check_torques(
     if sure.any() and abs(found.delay) > LATE and found.delay_gain > LATE_GAIN:
         step = float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
         word = "late" if found.delay > 0 else "early"
-        said = f"torques are {abs(found.delay) * step * 1e3:.3g} ms {word} against positions"
+        said = f"torques are about {abs(found.delay) * step * 1e3:.2g} ms {word} against positions"
         findings.append(Finding("warning", "delay", said, "shift one of them in time, or repair the clock of the log"))
     elif not friction_stated:
         findings += _friction(data, found, sure)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dln_jax.data.checks.delays import Delays, away_from_ends, delay_of
 from dln_jax.data.checks.findings import Finding, named
 from dln_jax.data.checks.joints import better_order, limits, named_order, parameters_of, regressor_of
 from dln_jax.data.robots import Robot
@@ -45,6 +46,8 @@ class OnTree(NamedTuple):
     parameters: int
     condition: float
     """Of the scaled columns that count."""
+    delays: Delays | None
+    """Of torques against positions, by any parameters of the tree; `None` without torques."""
 
 
 class _Forces(NamedTuple):
@@ -60,14 +63,28 @@ class _Forces(NamedTuple):
     """Columns of each joint's friction [n, 3]."""
 
 
-def against_tree(data: Trajectories, robot: Robot, names: tuple[str, ...], *, driven: bool) -> OnTree:
-    """Compares samples whose rates are sound with the tree; `names` are the data's joints, where they state them."""
+def against_tree(
+    data: Trajectories, robot: Robot, names: tuple[str, ...], *, driven: bool, farthest: int = 0
+) -> OnTree:
+    """Compares samples whose rates are sound with the tree.
+
+    Args:
+        data: in the robot's order of joints.
+        robot: as described.
+        names: the data's joints, where they state them.
+        driven: whether there are torques.
+        farthest: samples of delay that are tried.
+    """
     found = named_order(robot, names) + limits(data, robot)
-    chosen = np.arange(len(data.t))[:: -(-len(data.t) // MOST)]
+    inside = away_from_ends(data.trajectory, farthest)
+    farthest, inside = (farthest, inside) if len(inside) else (0, np.arange(len(data.t)))
+    chosen = inside[:: -(-len(inside) // MOST)]
     q, qd, qdd, tau = (getattr(data, key)[chosen] for key in ("q", "qd", "qdd", "tau"))
     phi, theta, down = regressor_of(robot.tree), parameters_of(robot.tree), np.asarray(robot.tree.gravity, float)
     friction = _friction_columns(qd)
-    rank, parameters, condition = _excitation(phi(q, qd, qdd, down), friction)
+    columns = _with_friction(phi(q, qd, qdd, down), friction)
+    solution = least_squares.solve(columns, np.zeros(len(columns)), rank_tolerance=RANK, negligible=1e-9)
+    rank, parameters, condition = solution.rank, columns.shape[1], solution.condition
     if condition > ILL:
         said = f"the condition of the regressor is {condition:.3g}"
         found.append(
@@ -75,17 +92,21 @@ def against_tree(data: Trajectories, robot: Robot, names: tuple[str, ...], *, dr
         )
     if not driven:
         unknown = np.full(q.shape[1], np.nan)
-        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, parameters, condition)
+        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, parameters, condition, None)
     still = np.zeros_like(q)
     along = np.stack([phi(q, still, still, axis) @ theta for axis in np.eye(3)], axis=2)
     forces = _Forces(phi(q, qd, qdd, np.zeros(3)) @ theta, along, tau, friction)
     scale, correlation, signs = _by_joint(forces, down)
     estimate, tilt = _gravity(forces, down)
-    signs_found = _signs(correlation, signs, estimate, tilt, down)
-    found += signs_found + _gears(scale, correlation)
-    if not any(each.check in ("order", "tree-sign") for each in found):
-        found += better_order(phi, theta, down, (q, qd, qdd, tau), friction)
-    return OnTree(found, scale, correlation, estimate, rank, parameters, condition)
+    wrong_order = better_order(phi, theta, down, (q, qd, qdd, tau), friction)
+    if wrong_order and not any(each.check == "order" for each in found):
+        found += wrong_order
+    else:
+        found += _signs(correlation, signs, estimate, tilt, down) + _gears(scale, correlation)
+    shifted = np.stack([data.tau[chosen + shift] for shift in range(-farthest, farthest + 1)], axis=2)
+    delays = delay_of(columns, shifted, float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0])))
+    found += delays.findings
+    return OnTree(found, scale, correlation, estimate, rank, parameters, condition, delays)
 
 
 def _friction_columns(qd: np.ndarray) -> list[np.ndarray]:
@@ -94,15 +115,13 @@ def _friction_columns(qd: np.ndarray) -> list[np.ndarray]:
     return [np.column_stack([qd[:, joint], dry[:, joint], np.ones(len(qd))]) for joint in range(qd.shape[1])]
 
 
-def _excitation(columns: np.ndarray, friction: list[np.ndarray]) -> tuple[int, int, float]:
-    """Rank, number of columns and condition of the regressor with viscous, dry friction and offset of each joint."""
+def _with_friction(columns: np.ndarray, friction: list[np.ndarray]) -> np.ndarray:
+    """The regressor with viscous, dry friction and offset of each joint [n d, P]."""
     d = len(friction)
     own = np.zeros((len(columns), d, 3 * d))
     for joint, block in enumerate(friction):
         own[:, joint, 3 * joint : 3 * joint + 3] = block
-    A = np.concatenate([columns, own], axis=2).reshape(len(columns) * d, -1)
-    solution = least_squares.solve(A, np.zeros(len(A)), rank_tolerance=RANK, negligible=1e-9)
-    return solution.rank, A.shape[1], solution.condition
+    return np.concatenate([columns, own], axis=2).reshape(len(columns) * d, -1)
 
 
 def _signs(
