@@ -30,7 +30,9 @@ def cutoff_figure(smoothed: Smoothed) -> Figure:
 def log_figure(examined: Examination) -> Figure:
     """One page: spectra and cut-off, time steps or delay, and the torque that friction has part in, joint by joint."""
     regression, smoothed = examined.regression, examined.smoothed
-    joints = 0 if regression is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)
+    on_tree = examined.on_tree
+    seen = on_tree.friction if on_tree is not None and on_tree.friction is not None else regression
+    joints = 0 if seen is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)
     rows = 1 + -(-joints // COLUMNS)
     figure, axes = style.figure(rows, COLUMNS, height=2.3 * rows + 0.3)
     if smoothed is not None and smoothed.choice is not None:
@@ -44,16 +46,17 @@ def log_figure(examined: Examination) -> Figure:
     else:
         _steps(axes[0, 2], examined)
     for place, axis in enumerate(axes[1:].flat):
-        if regression is None or smoothed is None or place >= joints:
+        if seen is None or smoothed is None or place >= joints:
             axis.set_axis_off()
             continue
-        rows_shown = slice(None, None, -(-len(regression.rows) // MOST_POINTS))
-        qd = smoothed.data.qd[regression.rows, place]
-        axis.plot(qd[rows_shown], regression.rest[rows_shown, place], ".", color="0.6", markersize=1.5)
+        qd = smoothed.data.qd[seen.rows, place]
+        shown = slice(None, None, -(-len(qd) // MOST_POINTS))
+        axis.plot(qd[shown], seen.rest[shown, place], ".", color="0.6", markersize=1.5)
         speeds = np.linspace(qd.min(), qd.max(), 200)
-        dry = regression.coulomb[place] * np.tanh(speeds / regression.velocity_scale[place])
-        axis.plot(speeds, regression.viscous[place] * speeds + dry, color=style.VERMILLION, linewidth=1.3)
-        style.title(axis, f"joint {place + 1}: {regression.explained[place]:.0%} explained")
+        dry = seen.coulomb[place] * np.tanh(speeds / seen.velocity_scale[place])
+        offset = float(np.mean(seen.rest[:, place]))
+        axis.plot(speeds, seen.viscous[place] * speeds + dry + offset, color=style.VERMILLION, linewidth=1.3)
+        style.title(axis, f"joint {place + 1}: {seen.explained[place]:.0%} explained")
         axis.set_xlabel("velocity, 1/s")
         if place % COLUMNS == 0:
             axis.set_ylabel("friction and error, N m")
@@ -65,13 +68,14 @@ def _spectra(axis: Axes, smoothed: Smoothed) -> None:
     if choice is None:
         raise ValueError("the cut-off was given, not chosen")
     for joint, shade in zip(range(choice.spectrum.shape[1]), [*style.CYCLE, *style.CYCLE], strict=False):
-        axis.loglog(choice.f, choice.spectrum[:, joint], color=shade, linewidth=0.8, label=f"joint {joint + 1}")
+        axis.loglog(choice.f, choice.spectrum[:, joint], color=shade, linewidth=0.8, label=f"{joint + 1}")
         if choice.floor[joint] > 0:
             axis.axhline(choice.floor[joint], color=shade, linewidth=0.6, linestyle=":")
-    _mark(axis, smoothed.cutoff)
+    if np.isfinite(smoothed.cutoff):
+        axis.axvline(smoothed.cutoff, color=style.VERMILLION, linewidth=1.0)
     axis.set_xlabel("frequency, Hz")
     axis.set_ylabel("spectrum of q, rad²/Hz")
-    style.legend(axis, ncols=2, handlelength=1.0)
+    style.legend(axis, ncols=2, handlelength=0.8, columnspacing=0.8, loc="lower left", fontsize=6.5)
 
 
 def _expected(axis: Axes, smoothed: Smoothed) -> None:
@@ -81,7 +85,7 @@ def _expected(axis: Axes, smoothed: Smoothed) -> None:
     axis.loglog(choice.tried, np.sqrt(np.maximum(choice.error, 1e-16)), color="black", linewidth=1.2)
     _mark(axis, smoothed.cutoff)
     axis.set_xlabel("cut-off, Hz")
-    axis.set_ylabel("expected error of qdd, relative")
+    axis.set_ylabel("expected error of qdd")
 
 
 def _mark(axis: Axes, cutoff: float) -> None:
@@ -104,7 +108,7 @@ def _delays(axis: Axes, examined: Examination) -> None:
     axis.set_yscale("log")
     axis.axvline(0.0, color="0.7", linewidth=0.8)
     axis.set_xlabel("torques are late by, ms")
-    axis.set_ylabel("unexplained share of torque")
+    axis.set_ylabel("unexplained share")
     style.legend(axis)
 
 

@@ -41,9 +41,8 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         constant = np.array([joint for joint in constant if data.tau[0, joint] != 0], int)
         if len(constant):
             said = f"the torque of {named(constant)} is constant"
-            found.append(
-                Finding("warning", "constant-torque", said, "see that the right channel was logged", tuple(constant))
-            )
+            remedy = "see that the right channel was logged"
+            found.append(Finding("warning", "constant-torque", said, remedy, tuple(map(int, constant))))
         found += _saturated(data, "tau", "torque", "keep away from the motors' limits, or leave those samples out")
     found += _saturated(data, "q", "position", "see whether it is at its stop or the log is clipped; leave that out")
     steps = step_of(data.q)

@@ -3,6 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
+import numpy as np
+from jaxtyping import Int
+
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """error: what is learned will be wrong; warning: worse than it need be; note: good to know."""
@@ -32,7 +35,7 @@ def told(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda each: SEVERITIES.index(each.severity))
 
 
-def named(joints: Sequence[int]) -> str:
+def named(joints: Sequence[int] | Int[np.ndarray, " j"]) -> str:
     """ "joint 3" or "joints 1, 2 and 4", counted from 1 as figures do."""
     numbers = [str(joint + 1) for joint in joints]
     if len(numbers) == 1:

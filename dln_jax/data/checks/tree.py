@@ -31,6 +31,23 @@ FRICTION_SCALE = 0.05
 """Of a joint's typical velocity, on which dry friction is smooth."""
 
 
+class FrictionSeen(NamedTuple):
+    """Torques without what any parameters of a tree explain of them but friction."""
+
+    rows: np.ndarray
+    """Samples [n]."""
+    rest: np.ndarray
+    """Friction and error [n, d], N m or N."""
+    viscous: np.ndarray
+    """[d], N m s or N s/m."""
+    coulomb: np.ndarray
+    """[d], N m or N."""
+    velocity_scale: np.ndarray
+    """[d], 1/s or m/s, on which dry friction is smooth."""
+    explained: np.ndarray
+    """Share of each torque's variance, friction included [d]."""
+
+
 class OnTree(NamedTuple):
     """What a robot's description says of a log."""
 
@@ -48,6 +65,8 @@ class OnTree(NamedTuple):
     """Of the scaled columns that count."""
     delays: Delays | None
     """Of torques against positions, by any parameters of the tree; `None` without torques."""
+    friction: FrictionSeen | None
+    """Beside the parameters of the tree that fit best; `None` without torques."""
 
 
 class _Forces(NamedTuple):
@@ -83,8 +102,7 @@ def against_tree(
     phi, theta, down = regressor_of(robot.tree), parameters_of(robot.tree), np.asarray(robot.tree.gravity, float)
     friction = _friction_columns(qd)
     columns = _with_friction(phi(q, qd, qdd, down), friction)
-    solution = least_squares.solve(columns, np.zeros(len(columns)), rank_tolerance=RANK, negligible=1e-9)
-    rank, parameters, condition = solution.rank, columns.shape[1], solution.condition
+    rank, parameters, condition, seen = _fitted(columns, tau, qd, chosen, driven=driven)
     if condition > ILL:
         said = f"the condition of the regressor is {condition:.3g}"
         found.append(
@@ -92,7 +110,7 @@ def against_tree(
         )
     if not driven:
         unknown = np.full(q.shape[1], np.nan)
-        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, parameters, condition, None)
+        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, parameters, condition, None, None)
     still = np.zeros_like(q)
     along = np.stack([phi(q, still, still, axis) @ theta for axis in np.eye(3)], axis=2)
     forces = _Forces(phi(q, qd, qdd, np.zeros(3)) @ theta, along, tau, friction)
@@ -106,13 +124,35 @@ def against_tree(
     shifted = np.stack([data.tau[chosen + shift] for shift in range(-farthest, farthest + 1)], axis=2)
     delays = delay_of(columns, shifted, float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0])))
     found += delays.findings
-    return OnTree(found, scale, correlation, estimate, rank, parameters, condition, delays)
+    return OnTree(found, scale, correlation, estimate, rank, parameters, condition, delays, seen)
+
+
+def _scales(qd: np.ndarray) -> np.ndarray:
+    return FRICTION_SCALE * np.maximum(np.sqrt(np.mean(qd**2, axis=0)), 1e-12)
 
 
 def _friction_columns(qd: np.ndarray) -> list[np.ndarray]:
-    sizes = FRICTION_SCALE * np.maximum(np.sqrt(np.mean(qd**2, axis=0)), 1e-12)
-    dry = np.tanh(qd / sizes)
+    dry = np.tanh(qd / _scales(qd))
     return [np.column_stack([qd[:, joint], dry[:, joint], np.ones(len(qd))]) for joint in range(qd.shape[1])]
+
+
+def _fitted(
+    columns: np.ndarray, tau: np.ndarray, qd: np.ndarray, chosen: np.ndarray, *, driven: bool
+) -> tuple[int, int, float, FrictionSeen | None]:
+    """Rank, parameters and condition of the columns, and the friction that their fit leaves."""
+    n, d = tau.shape
+    sizes = np.where(tau.std(axis=0) > 0, tau.std(axis=0), 1.0) if driven else np.ones(d)
+    weighted = (columns.reshape(n, d, -1) / sizes[:, None]).reshape(n * d, -1)
+    solution = least_squares.solve(weighted, (tau / sizes).ravel(), rank_tolerance=RANK, negligible=1e-9)
+    if not driven:
+        return solution.rank, columns.shape[1], solution.condition, None
+    left = tau - (columns @ solution.x).reshape(n, d)
+    own = np.split(solution.x[-3 * d :], d)
+    friction = np.stack([block @ own[joint] for joint, block in enumerate(_friction_columns(qd))], axis=1)
+    viscous, coulomb = np.array(own)[:, :2].T
+    explained = 1 - left.var(axis=0) / np.maximum(tau.var(axis=0), np.finfo(float).tiny)
+    seen = FrictionSeen(chosen, left + friction, viscous, coulomb, _scales(qd), explained)
+    return solution.rank, columns.shape[1], solution.condition, seen
 
 
 def _with_friction(columns: np.ndarray, friction: list[np.ndarray]) -> np.ndarray:

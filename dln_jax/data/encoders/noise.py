@@ -13,8 +13,6 @@ from jaxtyping import Float, Int
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median size of a normal variable, in standard deviations."""
-LEVELS = 3
-"""Samples for each level, from which on a channel is taken to move in steps."""
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
@@ -41,7 +39,7 @@ def step_of(values: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
 def _step(channel: np.ndarray) -> float:
     size = np.abs(channel).max(initial=0.0)
     levels = np.unique(np.round(channel, 12 - int(np.ceil(np.log10(size)))) if size > 0 else channel)
-    if len(levels) < 3 or len(levels) * LEVELS > len(channel):
+    if len(levels) < 3:
         return 0.0
     distances = np.diff(levels)
     smallest = float(distances.min())

@@ -24,8 +24,10 @@ from dln_jax.data.encoders.noise import noise_of
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError, require_positive
 
-SHORTEST = 3.0
+SHORTEST = 4.0
 """Periods of the cut-off: shorter stretches are left out."""
+TRIMMED = 1.5
+"""Periods of the cut-off, from which on accelerations are as good as in the middle."""
 PART = "/"
 """Between a trajectory's label and the number of its part."""
 
@@ -78,7 +80,7 @@ def smooth(
         rate: Hz, of equal steps (default: the median of the data's own).
         filter_torque: whether tau goes through the same filter (default: only where samples are left out).
         decimate: every so manyth sample is kept.
-        trim: s that are cut off at both ends of each part (default: one period of the cut-off).
+        trim: s that are cut off at both ends of each part (default: 1.5 periods of the cut-off).
         bridged: times the median step, up to which a gap is interpolated; longer ones cut a trajectory in parts that
             are named LABEL/1, LABEL/2, ...
 
@@ -90,7 +92,8 @@ def smooth(
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     if rate is None:
-        rate = sampling.timing(data.t, data.trajectory).rate
+        # Differences of times are rounded.
+        rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
     pieces = sampling.stretches(data.t, data.trajectory, gap=bridged)
     gaps = len(sampling.stretches(data.t, data.trajectory)) - len(pieces)
@@ -108,15 +111,15 @@ def smooth(
             f"{cutoff:g} Hz: keep more samples, or lower the cut-off"
         )
     filtered = decimate > 1 if filter_torque is None else filter_torque
-    trim = (0.0 if np.isinf(cutoff) else 1 / cutoff) if trim is None else trim
+    trim = (0.0 if np.isinf(cutoff) else TRIMMED / cutoff) if trim is None else trim
     shortest = max(6, round(SHORTEST * rate / cutoff) + 1, 2 * round(trim * rate) + 2 * decimate)
     kept = [index for index in range(len(pieces)) if np.sum(uniform.part == index) >= shortest]
     if not kept:
         raise InputError(
-            f"no stretch without a gap has {shortest} samples, three periods of the cut-off at {rate:g} Hz; record "
+            f"no stretch without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
-    smoothed = _filtered(data, pieces, uniform, kept, cutoff, order, filtered, trim, decimate)
+    smoothed = _filtered(data, pieces, uniform, kept, rate, cutoff, order, filtered, trim, decimate)
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
         smoothed, cutoff, rate, noise_q, noise_tau * share, choice, order, filtered, decimate, trim,
@@ -155,6 +158,7 @@ def _filtered(
     pieces: list[np.ndarray],
     uniform: _Uniform,
     kept: list[int],
+    rate: float,
     cutoff: float,
     order: int,
     filtered: bool,
@@ -162,7 +166,6 @@ def _filtered(
     decimate: int,
 ) -> Trajectories:
     """The kept stretches with rates, trimmed and decimated, each a trajectory of its own."""
-    rate = 1 / float(np.median(np.diff(uniform.t[uniform.part == kept[0]])))
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
     of = [int(data.trajectory[pieces[index][0]]) for index in kept]
     for index in kept:
