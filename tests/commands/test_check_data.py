@@ -28,7 +28,7 @@ def log(tmp_path):
     np.savez(
         path,
         t=np.tile(t, runs),
-        q=q.reshape(-1, 1) + 1e-4 * random.normal(size=(q.size, 1)),
+        q=q.reshape(-1, 1) + 5e-4 * random.normal(size=(q.size, 1)),
         tau=tau.reshape(-1, 1) + 0.02 * random.normal(size=(q.size, 1)),
         trajectory=np.repeat(np.arange(runs), len(t)),
         label=np.array(["a", "b", "c", "d"]),

@@ -110,7 +110,7 @@ def spectra(
         changes = np.diff(part, n=2, axis=0)
         if len(changes) < length:
             changes = np.concatenate([changes, np.zeros((length - len(changes), changes.shape[1]))])
-        f, power = welch(changes, fs=rate, nperseg=length, axis=0, detrend=False)
+        f, power = welch(changes, fs=rate, nperseg=length, axis=0)
         total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
     power = np.asarray(total)[1:] / weight
     return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4

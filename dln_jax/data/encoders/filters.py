@@ -9,10 +9,10 @@ parameters, F(Phi theta) = F(Phi) theta: `low_pass` of the torques calls for `lo
 from a filtered q are not filtered columns, where a force has a wider band than the motion, as dry friction has.
 
 At its ends a filter knows one side only. What is turned round there is what a slow polynomial leaves, which makes
-accelerations at the end some 10 to 40 times better than without; they are as good as elsewhere from 1.5 periods on.
+accelerations at the end 2 to 40 times better than without; they are as good as elsewhere from 1.5 periods on.
 
-Derivatives are those of the quintic spline through the filtered samples: their gain is that of an exact derivative to
-0.1 % up to a quarter of the rate, where central differences lose a third.
+Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
+tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.
 """
 
 import numpy as np
