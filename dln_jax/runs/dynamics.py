@@ -60,7 +60,8 @@ def run(given: Options, command: str) -> None:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
-        write_config(folder, given, **task.description, **optimiser, seeds=task.seeds)
+        filtered = {} if task.cutoff is None else {"cutoff_hz": task.cutoff}
+        write_config(folder, given, **task.description, **optimiser, **filtered, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
             print(f"the run keeps seed {given.seed + best}, the best in validation")
@@ -77,8 +78,8 @@ def announce(task: Task) -> None:
     print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
     if task.needs.joint_friction:
         print(f"friction of joints: {', '.join(task.needs.joint_friction)}")
-    if task.sets.train.estimated:
-        print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
+    for line in task.said:
+        print(line)
     if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:
         print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.solver is not None:

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.optimisers import name_of, optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
+from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
@@ -29,7 +31,7 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
 @dataclass(frozen=True)
-class Options(Limited, Resumable, Drawn, SingleCalls):
+class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     """What to train on, how, and where the results go."""
 
     model: str = "structured-delan"
@@ -104,6 +106,10 @@ class Task(NamedTuple):
     """One, or several in one program."""
     seconds: float
     """Of training, after which to stop."""
+    said: tuple[str, ...] = ()
+    """Where rates come from, and what is wrong with the data."""
+    cutoff: float | None = None
+    """Hz, of the filter that was applied to q; `None` without."""
 
     @property
     def precision(self) -> str:
@@ -128,7 +134,14 @@ def prepare(given: Options) -> Task:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
         )
-    sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
+    data = data._replace(needs=needs)
+    found = checked(data) if given.data is not None else []
+    filtered = smoothed(given, data)
+    said = [*preparation(data, filtered), *found]
+    if filtered is not None:
+        data = filtered.data
+        labels = None if labels is None else labels_of_parts(data, labels)
+    sets = split(data, test=labels, seed=given.seed)
     objective = objective_of(kind, sets.train)
     description, optimiser, reason = model_and_optimiser(given, kind, sets, needs, objective)
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
@@ -139,7 +152,11 @@ def prepare(given: Options) -> Task:
         problem = dynamics.problem(model, sets, objective, seeds=seeds)
         require_finite_start(problem, dynamics.samples(model, sets, objective))
         solver = Solver(optimiser, reason, problem)
-    return Task(name, kind, sets, scene, needs, origin, description, objective, solver, seeds, **limit)
+    cutoff = None if filtered is None else filtered.cutoff
+    return Task(
+        name, kind, sets, scene, needs, origin, description, objective, solver, seeds, **limit,
+        said=tuple(said), cutoff=cutoff,
+    )  # fmt: skip
 
 
 def check_options(given: Options, kind: str) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given, resolved
+from dln_jax.command_line.encoders import checked
 from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.progress import progress
@@ -185,6 +186,8 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
     missing = [key for key in data.estimated if key != "tau"]
     if missing:
         print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
+    if problem.name in (REAL, MEASURED):
+        print("".join(f"{line}\n" for line in checked(data)), end="")
     if problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
         print("momenta p are taken as qd, per unit of inertia")
 
