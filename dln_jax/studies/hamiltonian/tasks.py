@@ -15,9 +15,9 @@ from jax import Array
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import PER_SAMPLE, require_no_copies, select
+from dln_jax.data.stretches import stretches
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.datasets.phase_samples import Part, reference_motion
-from dln_jax.learning.motions import stretches
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.types import Hamiltonian, InputError, Needs
 
