@@ -1,9 +1,9 @@
 """Velocities and accelerations of measured coordinates by local polynomials, and how large their noise is.
 
-Around each sample a polynomial in time is fitted to its neighbours by least squares, whatever their spacing (Savitzky and
-Golay 1964). How many neighbours, is decided for each coordinate by the error at samples that are left out of their own
-fit, e_i / (1 - H_ii) (Allen 1974): few where a motion bends, many where it is noisy. That supposes that the noise of
-samples is independent; where it is not, state `points`.
+Around each sample a polynomial in time is fitted to its neighbours by least squares, whatever their spacing (Savitzky
+and Golay 1964). How many neighbours is decided for each coordinate by the error at samples that are left out of their
+own fit, e_i / (1 - H_ii) (Allen 1974): few where a motion bends, many where it is noisy. That supposes that the noise
+of samples is independent; where it is not, state `points`.
 """
 
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stretches import GAP, stretches
 from dln_jax.types import InputError
@@ -30,6 +31,8 @@ class Smoothed(NamedTuple):
     """Standard deviation of the noise of q, rad or m."""
     points: tuple[int, ...]
     """Neighbours that each coordinate was smoothed over, itself among them."""
+    rows: np.ndarray
+    """Of the samples that were kept."""
 
 
 class _Fits(NamedTuple):
@@ -56,6 +59,7 @@ def smooth_locally(
     Raises:
         InputError: a degree below 2, no more points than that, or no stretch that is long enough.
     """
+    spread("q", data.q)
     least = degree + 2
     if degree < 2:
         raise InputError(f"degree is {degree}; expected at least 2, for an acceleration")
@@ -77,7 +81,7 @@ def smooth_locally(
     smooth = {key: np.stack([getattr(each, key) for each in columns], axis=1) for key in ("q", "qd", "qdd")}
     optional = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity", "t", "trajectory")
     others = {key: array[kept] for key in optional if (array := getattr(data, key)) is not None}
-    return Smoothed(data._replace(**others, **smooth), np.array(noise), tuple(chosen))
+    return Smoothed(data._replace(**others, **smooth), np.array(noise), tuple(chosen), kept)
 
 
 def _sizes(least: int, most: int) -> list[int]:

@@ -2,8 +2,8 @@
 
     residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd
 
-A first fit for `learning.measured_motions`, whose result does not rest on estimated accelerations; and all that is needed
-where accelerations are exact.
+A first fit for `learning.measured_motions`, whose result does not rest on estimated accelerations; and all that is
+needed where accelerations are exact.
 """
 
 import jax.numpy as jnp

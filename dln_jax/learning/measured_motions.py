@@ -10,6 +10,9 @@ eliminated window by window: z_w(theta) is found by Gauss-Newton, and the deriva
 Kaufman (1975, "A variable projection method"), (1 - U Uᵀ) dr_w/dtheta with U a basis of dr_w/dz. The problem's
 parameters are those of the model alone, however many windows there are.
 
+Torques that are off push motions off course. With `Noise.tau` each window has a torque e_w more, constant and unknown,
+and a residual e_w / noise_tau: between matching motions under exact torques, and matching torques of exact motions.
+
 Motion without torques fits any multiple of an energy: a `Gauge` says which one is meant.
 """
 
@@ -58,6 +61,9 @@ class Noise(NamedTuple):
     q: tuple[float, ...] | float
     qd: tuple[float, ...] | float | None = None
     """`None` where velocities were not measured."""
+    tau: tuple[float, ...] | float | None = None
+    """Of the mean torque over a window; `None` where torques are exact. What pushes a motion off course is then an
+    unknown of each window, as its start is."""
 
 
 class Gauge(NamedTuple):
@@ -141,6 +147,10 @@ def problem(
         raise InputError("motions without torques fit any multiple of an energy; give a gauge")
     check_gauge(gauge, d)
 
+    def first(window: tuple[Array, ...]) -> Array:
+        _, q, qd, *_ = window
+        return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
+
     def error(system: Dynamics | PlainDynamics, start: Array, window: tuple[Array, ...]) -> Array:
         return _residual(system, start, window, noise=noise, torque=torque, substeps=substeps)
 
@@ -148,7 +158,7 @@ def problem(
         frozen = dynamics(model.energies(jax.lax.stop_gradient(parameters)))
         system = dynamics(model.energies(parameters))
         left = without_start(
-            lambda start: error(frozen, start, window), lambda start: error(system, start, window), _first(window)
+            lambda start: error(frozen, start, window), lambda start: error(system, start, window), first(window)
         )
         return jnp.append(left, gauge_error(system, gauge))
 
@@ -156,7 +166,7 @@ def problem(
         system = dynamics(model.energies(parameters))
 
         def closest(*window: Array) -> Array:
-            return error(system, nearest(lambda start: error(system, start, window), _first(window)), window)
+            return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
 
         return unmonitored(mean_square(closest, held_out))
 
@@ -216,11 +226,6 @@ def _descended(residual: Callable[[Array], Array], start: Array, steps: int) -> 
     return jax.lax.scan(step, _Descended(start, nothing), length=steps)[0]
 
 
-def _first(window: tuple[Array, ...]) -> Array:
-    _, q, qd, *_ = window
-    return jnp.concatenate([q[0], qd[0]])
-
-
 def _residual(
     system: Dynamics | PlainDynamics,
     start: Array,
@@ -232,11 +237,15 @@ def _residual(
 ) -> Array:
     t, q, qd, tau, weight = window
     d = q.shape[1]
-    states = motion(system, start, t, tau, torque=torque, substeps=substeps)
+    start, push = start[: 2 * d], start[2 * d :]
+    pushed = tau if noise.tau is None else tau + push
+    states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
     size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
     errors = [size * (states[:, :d] - q) / jnp.asarray(noise.q)]
     if noise.qd is not None:
         errors.append(size * (states[:, d:] - qd) / jnp.asarray(noise.qd))
+    if noise.tau is not None:
+        errors.append(push / jnp.asarray(noise.tau))
     return jnp.concatenate([jnp.ravel(each) for each in errors])
 
 

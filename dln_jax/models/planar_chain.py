@@ -1,14 +1,15 @@
-"""Links that turn in one plane, one behind the other, of which no length, mass or inertia is known: a multiple pendulum.
+"""Links that turn in one plane, one behind the other, whose lengths, masses and inertias are unknown.
 
 With absolute angles phi, each link's own, measured from where it hangs,
 
-    T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i (phid_i - phid_{i-1})²
-    V = -sum_i g_i cos phi_i + h_i sin phi_i,   D = sum over joints of ½ b w² + c v log cosh(w / v),   w_i = phid_i - phid_{i-1}
+    T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i w_i²
+    V = -sum_i (g_i cos phi_i + h_i sin phi_i)
+    D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
 
 A is symmetric and B skew. B and h are zero where each centre of mass is on the line to the next joint and the zero of
 the angles is right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum, for
-example, is the acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
+(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum is the
+acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -73,8 +74,8 @@ def make_planar_chain(
     if coordinates not in ("relative", "absolute"):
         raise InputError(f"coordinates are {coordinates!r}; expected 'relative' or 'absolute'")
     # phi = absolute q, and rates of the joints w = relative qd.
-    absolute = np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)
-    relative = np.linalg.inv(np.tril(np.ones((d, d)))) @ absolute
+    absolute: Any = np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)
+    relative: Any = np.linalg.inv(np.tril(np.ones((d, d)))) @ absolute
     triangle, below = np.tril_indices(d), np.tril_indices(d, -1)
 
     def init(key: Array) -> PlanarChainParameters:

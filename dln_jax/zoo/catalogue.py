@@ -22,6 +22,7 @@ from dln_jax.models.hamiltonian import (
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
@@ -121,6 +122,7 @@ CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True)),
     "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(make_trigonometric, Properties(linear=True)),
+    "planar-chain": Entry(make_planar_chain, Properties(linear=True)),
     "feed-forward": Entry(
         make_feed_forward,
         Properties(energy=False),
