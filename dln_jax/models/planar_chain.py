@@ -8,11 +8,11 @@ With absolute angles phi, each link's own, measured from where it hangs,
 
 A is symmetric and B skew. B and h are zero where each centre of mass is on the line to the next joint and the zero of
 the angles is right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum is the
-acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
+(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum is
+the acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ class PlanarChainParameters(NamedTuple):
 def make_planar_chain(
     needs: Needs,
     *,
-    coordinates: Literal["relative", "absolute"] = "relative",
+    coordinates: str = "relative",
     symmetric: bool = True,
     armature: bool = False,
     velocity_scale: float = 0.05,

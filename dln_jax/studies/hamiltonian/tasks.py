@@ -2,8 +2,9 @@
 
 Generated tasks are those of `datasets.hamiltonian_tasks`. Measurements have neither momenta nor rates of them: models
 that have momenta p = dL/dqd of their own are fitted in coordinates and velocities, for others p is taken as qd, the
-momentum per unit of inertia. A single trajectory is predicted over its last fifth, of several every sixth, unless the test is stated;
-what is left is cut into stretches without a gap. Velocities that were not measured are those of local polynomials.
+momentum per unit of inertia. A single trajectory is predicted over its last fifth, of several every sixth, unless the
+test is stated; what is left is cut into stretches without a gap. Velocities that were not measured are those of local
+polynomials.
 """
 
 from pathlib import Path

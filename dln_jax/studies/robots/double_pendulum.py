@@ -6,6 +6,7 @@ viscous and dry friction of both joints) is fitted in three ways, from q, t and 
     least squares      torques of filtered motions, as engineers do it; q and tau filtered alike
     low-passed         the same, but what is filtered is the regressor of less filtered motions, and tau with it
     motions            the windows of `learning.measured_motions`, through an integrator with the torques, which are off
+                       by as much as the low-passed equations are
 
 Filtered coordinates give accelerations that are too small; dry friction is no function of them at all. Low-passing both
 sides of the equation, or not to differentiate at all, leaves that bias out.
@@ -49,7 +50,7 @@ NOISE = 2e-3
 """rad, of q: time stamps are off by about a millisecond."""
 HORIZON, EVERY = 2.2, 0.5
 """s: predicted stretches, and from one start to the next."""
-STEPS = 12
+STEPS = 8
 """Of Gauss-Newton."""
 VELOCITY_SCALE = 0.1
 """rad/s, of dry friction."""
@@ -115,19 +116,19 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, dict[str, fl
 
 def fitted(model: Model, logs: Logs) -> dict[str, Parameters]:
     """The parameters by each of the `WAYS`; one recording selects the iteration of the last."""
-    low_passed = fit_low_passed(model, logs)
+    low_passed, off = fit_low_passed(model, logs)
     present = np.unique(logs.fine.trajectory)
     chosen = present[len(present) // 2]
     windows = [
         cut_measured_windows(select(logs.fine, part), WINDOW) for part in ([*present[present != chosen]], [chosen])
     ]
-    task = measured_motions.problem(model, low_passed, *windows, noise=Noise(NOISE))
+    task = measured_motions.problem(model, low_passed, *windows, noise=Noise(NOISE, tau=off))
     training = fit(task, GaussNewton(STEPS, steps_per_dispatch=STEPS // 2))
     return dict(zip(WAYS, (fit_linear(model, logs.coarse).parameters, low_passed, training.parameters), strict=True))
 
 
-def fit_low_passed(model: Model, logs: Logs) -> Parameters:
-    """Least squares of low-passed equations, each joint's in units of its torque's deviation."""
+def fit_low_passed(model: Model, logs: Logs) -> tuple[Parameters, tuple[float, ...]]:
+    """Least squares of low-passed equations, each joint's in units of its torque's deviation; and what they are off."""
     zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
     scale = logs.coarse.tau.std(axis=0)
     columns, torques = [], []
@@ -137,8 +138,10 @@ def fit_low_passed(model: Model, logs: Logs) -> Parameters:
         Phi = np.asarray(jax.vmap(partial(linearised, model, zero))(*state)[0])
         columns.append((_low_pass(Phi, CUTOFF, RATE) / scale[:, None]).reshape(-1, Phi.shape[-1]))
         torques.append((_low_pass(data.tau, CUTOFF, RATE) / scale).ravel())
-    found = least_squares.solve(np.concatenate(columns), np.concatenate(torques))
-    return ravel_pytree(zero)[1](jnp.asarray(found.x))
+    A, b = np.concatenate(columns), np.concatenate(torques)
+    found = least_squares.solve(A, b)
+    off = scale * np.sqrt(np.mean((A @ found.x - b).reshape(-1, len(scale)) ** 2, axis=0))
+    return ravel_pytree(zero)[1](jnp.asarray(found.x)), tuple(off.tolist())
 
 
 def judged(model: Model, parameters: Parameters, held: Logs, every: Logs) -> dict[str, float]:
