@@ -2,10 +2,11 @@
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `rates`, `motions`, `frames` and `functions` build problems; what is linear in its parameters needs no loop.
+`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems; what is
+linear in its parameters needs no loop.
 """
 
-from dln_jax.learning import dynamics, frames, functions, motions, rates
+from dln_jax.learning import accelerations, dynamics, frames, functions, measured_motions, motions, rates
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
@@ -28,6 +29,7 @@ __all__ = [
     "Progress",
     "Stop",
     "Training",
+    "accelerations",
     "choose_degrees",
     "dynamics",
     "fit",
@@ -37,6 +39,7 @@ __all__ = [
     "grow",
     "identity",
     "match_linear",
+    "measured_motions",
     "motions",
     "objective_of",
     "rates",

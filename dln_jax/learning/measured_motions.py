@@ -7,8 +7,7 @@ energies of `mechanics.equations.dynamics` will do. A window of T samples is mat
 
 where qd has been measured too, and minimise over theta and all starts z_w: sum over windows of |r_w|². Starts are
 eliminated window by window: z_w(theta) is found by Gauss-Newton, and the derivative of what is left of r_w is that of
-Kaufman (1975, "A variable projection method"), (1 - U Uᵀ) dr_w/dtheta with U a basis of dr_w/dz. The problem's
-parameters are those of the model alone, however many windows there are.
+Kaufman (`learning.starts`). The problem's parameters are those of the model alone, however many windows there are.
 
 Torques that are off push motions off course. With `Noise.tau` each window has a torque e_w more, constant and unknown,
 and a residual e_w / noise_tau: between matching motions under exact torques, and matching torques of exact motions.
@@ -16,8 +15,7 @@ and a residual e_w / noise_tau: between matching motions under exact torques, an
 Motion without torques fits any multiple of an energy: a `Gauge` says which one is meant.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,15 +27,12 @@ from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stretches import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.learning.starts import nearest, without_start
 from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
-from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, require_positive
-
-START_STEPS = 3
-"""Of Gauss-Newton, from the measured to the nearest start."""
 
 
 class MeasuredWindows(NamedTuple):
@@ -188,42 +183,6 @@ def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[
         return jnp.zeros(0)
     M = system.mass_matrix(jnp.asarray(gauge.q))
     return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1)
-
-
-def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
-    """What is left of a residual at its nearest start, with Kaufman's derivative by all that `frozen` does not see.
-
-    Args:
-        frozen: start -> residual, as a constant function.
-        residual: the same function, of the parameters too.
-        start: to begin at.
-    """
-    at = jax.lax.stop_gradient(_descended(frozen, start, START_STEPS))
-    left = residual(at.start)
-    change = left - jax.lax.stop_gradient(left)  # zero, but for its derivative
-    return left - at.slope @ solve(at.slope.T @ at.slope, at.slope.T @ change)
-
-
-def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = START_STEPS) -> Array:
-    """A start of lower residual, by steps of Gauss-Newton."""
-    return _descended(residual, start, steps).start
-
-
-class _Descended(NamedTuple):
-    start: Array
-    slope: Array
-    """Of the residual by the start, where the last step began."""
-
-
-def _descended(residual: Callable[[Array], Array], start: Array, steps: int) -> _Descended:
-    linearised = jax.jacfwd(lambda start: (residual(start),) * 2, has_aux=True)
-
-    def step(at: _Descended, _: Any) -> tuple[_Descended, None]:
-        slope, value = linearised(at.start)
-        return _Descended(at.start - solve(slope.T @ slope, slope.T @ value), slope), None
-
-    nothing = jnp.zeros((jax.eval_shape(residual, start).shape[0], start.shape[0]), start.dtype)
-    return jax.lax.scan(step, _Descended(start, nothing), length=steps)[0]
 
 
 def _residual(

@@ -9,7 +9,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given, resolved
+from dln_jax.command_line.arguments import (
+    Unstated,
+    choice,
+    positive_numbers,
+    refuse_given,
+    require_positive_if_given,
+    resolved,
+)
 from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.progress import progress
@@ -113,7 +120,7 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     needs = None if given.needs is None else needs_from_option(given.needs)
     if given.task != MEASURED:
         refuse_given(given, ["test", "noise"], "for measured")
-    stated = Stated(needs, given.test, None if given.noise is None else noise_from_option(given.noise))
+    stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
     names = ("width", "depth", "activation", "degree", "coordinates")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}
@@ -124,20 +131,6 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     check(problem, description, seed=given.seed)
     training = {"seed": given.seed, "optimiser": optimiser, "steps": given.steps}
     return problem, description, training | resolved(given, {"seconds": math.inf})
-
-
-def noise_from_option(text: str) -> tuple[float, ...]:
-    """Positive numbers, separated by commas."""
-    try:
-        numbers = tuple(float(each) for each in text.split(","))
-    except ValueError:
-        raise InputError(
-            f"--noise is {text!r:.60}; expected one number, or one for each coordinate: 0.001,0.002"
-        ) from None
-    for number in numbers:
-        if not 0 < number < math.inf:
-            raise InputError(f"--noise has {number}; expected positive, finite numbers")
-    return numbers
 
 
 def check_suited(given: Options, problem: Problem, description: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.learning.motions import Weights, cut_windows
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.predictions import cut_stretches, predict_measured, prediction_metrics
+from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, prediction_metrics
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.planar_chain import PlanarChainParameters, make_planar_chain
 from dln_jax.models.trigonometric import make_trigonometric

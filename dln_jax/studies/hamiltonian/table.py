@@ -14,8 +14,8 @@ from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
 from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.measured_predictions import predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
-from dln_jax.metrics.predictions import predict_measured, prediction_metrics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.studies.case import Case, Findings, by_case, rows_of
 from dln_jax.studies.hamiltonian import pixels

@@ -23,8 +23,8 @@ from dln_jax.data.stretches import stretches
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.datasets.phase_samples import Part, reference_motion
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
+from dln_jax.metrics.measured_predictions import cut_stretches
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.metrics.predictions import cut_stretches
 from dln_jax.types import Hamiltonian, InputError, Needs
 
 REAL, MEASURED, PIXELS = "real-pendulum", "measured", "pixels"

@@ -30,7 +30,7 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.linear import fit_linear, linearised
 from dln_jax.learning.measured_motions import Noise, cut_measured_windows
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.predictions import cut_stretches, predict_measured, valid_times
+from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, valid_times
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.solvers import least_squares

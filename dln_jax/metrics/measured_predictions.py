@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning import motions
-from dln_jax.learning.measured_motions import START_STEPS, MeasuredWindows, motion, nearest
+from dln_jax.learning import motions, starts
+from dln_jax.learning.measured_motions import MeasuredWindows, motion
+from dln_jax.learning.starts import nearest
 from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics, flow
@@ -27,7 +28,7 @@ from dln_jax.metrics.rollouts import valid_prediction_time
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
-START_GUESSES = 2 * START_STEPS
+START_STEPS = 2 * starts.STEPS
 """Steps of Gauss-Newton to the start of a prediction."""
 
 
@@ -133,7 +134,7 @@ def _predict(model: Model, parameters, t, q, qd, tau, *, scale, fitted: int, tor
         def error(start):
             return jnp.ravel((moved(start, t[first], tau[first])[:, :d] - q[first]) / jnp.asarray(scale))
 
-        start = nearest(error, jnp.concatenate([q[0], qd[0]]), steps=START_GUESSES)
+        start = nearest(error, jnp.concatenate([q[0], qd[0]]), steps=START_STEPS)
         states, moves = jax.jvp(lambda start: moved(start, t, tau), (start,), (jnp.ones(2 * d),))
         growth = jnp.log(jnp.linalg.norm(moves[-1]) / jnp.linalg.norm(moves[0])) / (t[-1] - t[0])
         return states[:, :d], states[:, d:], growth, drift(states, t, tau)
