@@ -2,11 +2,20 @@
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `rates`, `motions`, `frames` and `functions` build problems; what is linear in its parameters needs no loop.
-`uncertainty` says what a fitted model does not know.
+`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems; what is
+linear in its parameters needs no loop. `uncertainty` says what a fitted model does not know.
 """
 
-from dln_jax.learning import dynamics, frames, functions, motions, rates, uncertainty
+from dln_jax.learning import (
+    accelerations,
+    dynamics,
+    frames,
+    functions,
+    measured_motions,
+    motions,
+    rates,
+    uncertainty,
+)
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
@@ -30,6 +39,7 @@ __all__ = [
     "Progress",
     "Stop",
     "Training",
+    "accelerations",
     "choose_degrees",
     "dynamics",
     "fit",
@@ -40,6 +50,7 @@ __all__ = [
     "grow",
     "identity",
     "match_linear",
+    "measured_motions",
     "motions",
     "objective_of",
     "rates",

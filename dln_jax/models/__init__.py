@@ -12,6 +12,7 @@ from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.latent_phase import make_latent_phase
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
@@ -29,6 +30,7 @@ __all__ = [
     "make_latent_phase",
     "make_pairwise_hamiltonian",
     "make_phase_network",
+    "make_planar_chain",
     "make_polynomial_hamiltonian",
     "make_rigid_tree",
     "make_separable_hamiltonian",

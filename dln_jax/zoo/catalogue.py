@@ -25,6 +25,7 @@ from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.networks import Scale
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.residual import make_residual, make_with_residual
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -181,6 +182,7 @@ CATALOGUE = {
     "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
     "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(with_friction_laws(make_trigonometric, linear=True), Properties(linear=True)),
+    "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
     "rigid-tree-residual": Entry(make_stored_residual, Properties()),
     "feed-forward": Entry(

@@ -36,6 +36,7 @@ MODELS = {
     "rigid-tree-residual": {
         **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
     },
+    "planar-chain": {"needs": FREE._replace(gravity=True, friction=True), "armature": True},
     "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
     "structured-hnn": {"needs": MIXED, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": MIXED, **CONVEX},
