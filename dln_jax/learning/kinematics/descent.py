@@ -1,0 +1,95 @@
+"""Levenberg-Marquardt on joint frames, a few iterations in one program."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.learning.kinematics.frames import Frames, displaced, free_directions
+from dln_jax.learning.kinematics.projection import Projection, Samples, Structure, project
+
+LENGTH = 0.3
+"""m that weigh as much as a radian in the damping."""
+LARGEST_STEP = 0.6
+"""rad, and as much of `LENGTH`: longer steps are cut."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
+"""Relative to the mean of the normal matrix' diagonal; at the most, no step is found that descends."""
+FEWER, MORE = 0.2, 5.0
+"""By which damping changes after a step that descends, and after one that does not."""
+CHUNK = 10
+"""Iterations in a program."""
+SETTLED = 1e-4
+"""Relative decrease over a chunk below which a descent has ended."""
+
+
+class State(NamedTuple):
+    """Of a descent."""
+
+    frames: Frames
+    at: Projection
+    damping: Any
+
+
+class Descent(NamedTuple):
+    """The compiled programs of a problem."""
+
+    start: Callable[[Frames, Samples, Array], State]
+    """(frames, samples, unit) -> state."""
+    iterate: Callable[[State, Samples, Array], State]
+    """`CHUNK` iterations."""
+
+
+def compiled(structure: Structure, *, ridge: float) -> Descent:
+    """Programs for a structure; each compiles once for a number of samples."""
+    places = free_directions(structure.parents, structure.joints)
+    lengths = np.where(places % 6 < 3, 1.0, LENGTH)
+    d = len(structure.joints)
+
+    def start(frames: Frames, samples: Samples, unit: Array) -> State:
+        at = project(structure, frames, samples, unit, ridge=ridge)
+        return State(frames, at, jnp.asarray(FIRST_DAMPING, at.loss.dtype))
+
+    def iteration(state: State, samples: Samples, unit: Array) -> State:
+        normal = state.at.normal
+        typical = jnp.trace(normal) / len(places)
+        damped = normal + state.damping * typical * jnp.diag(lengths**-2.0)
+        step = jnp.linalg.solve(damped, state.at.slope)
+        step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.max(jnp.abs(step) / lengths))
+        frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
+        at = project(structure, frames, samples, unit, ridge=ridge)
+        lower = at.loss < state.at.loss  # not where it is NaN
+        damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
+        kept = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), (state.frames, state.at))
+        return State(*kept, damping)
+
+    def iterate(state: State, samples: Samples, unit: Array) -> State:
+        return lax.fori_loop(0, CHUNK, lambda _, state: iteration(state, samples, unit), state)
+
+    options = quick_compilation()
+    return Descent(jax.jit(start, compiler_options=options), jax.jit(iterate, compiler_options=options))
+
+
+def descend(
+    programs: Descent,
+    frames: Frames,
+    samples: Samples,
+    unit: Any,
+    *,
+    iterations: int,
+    expired: Callable[[], bool] = lambda: False,
+) -> State:
+    """Iterates until the loss settles, no step descends, the iterations are used up, or time is."""
+    samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
+    state = programs.start(jax.tree.map(jnp.asarray, frames), samples, unit)
+    before = np.inf
+    for _ in range(0, iterations, CHUNK):
+        state = programs.iterate(state, samples, unit)
+        now = float(state.at.loss)
+        if not now < before * (1 - SETTLED) or float(state.damping) >= MOST_DAMPING or expired():
+            break
+        before = now
+    return state
