@@ -34,31 +34,23 @@ class State(NamedTuple):
     damping: Any
 
 
-class Descent(NamedTuple):
-    """The compiled programs of a problem."""
-
-    start: Callable[[Frames, Samples, Array], State]
-    """(frames, samples, unit) -> state."""
-    iterate: Callable[[State, Samples, Array], State]
-    """`CHUNK` iterations."""
+Program = Callable[[State, Samples, Array], State]
+"""(state, samples, unit of each joint's torque) -> the state after `CHUNK` iterations."""
 
 
-def compiled(structure: Structure, *, ridge: float) -> Descent:
-    """Programs for a structure; each compiles once for a number of samples."""
+def compiled(structure: Structure, *, ridge: float) -> Program:
+    """The program of a structure, which compiles once for a number of samples."""
     places = free_directions(structure.parents, structure.joints)
     lengths = np.where(places % 6 < 3, 1.0, LENGTH)
     d = len(structure.joints)
-
-    def start(frames: Frames, samples: Samples, unit: Array) -> State:
-        at = project(structure, frames, samples, unit, ridge=ridge)
-        return State(frames, at, jnp.asarray(FIRST_DAMPING, at.loss.dtype))
 
     def iteration(state: State, samples: Samples, unit: Array) -> State:
         normal = state.at.normal
         typical = jnp.trace(normal) / len(places)
         damped = normal + state.damping * typical * jnp.diag(lengths**-2.0)
         step = jnp.linalg.solve(damped, state.at.slope)
-        step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.max(jnp.abs(step) / lengths))
+        longest = jnp.max(jnp.abs(step) / lengths)
+        step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.maximum(longest, LARGEST_STEP))
         frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
         at = project(structure, frames, samples, unit, ridge=ridge)
         lower = at.loss < state.at.loss  # not where it is NaN
@@ -69,12 +61,25 @@ def compiled(structure: Structure, *, ridge: float) -> Descent:
     def iterate(state: State, samples: Samples, unit: Array) -> State:
         return lax.fori_loop(0, CHUNK, lambda _, state: iteration(state, samples, unit), state)
 
-    options = quick_compilation()
-    return Descent(jax.jit(start, compiler_options=options), jax.jit(iterate, compiler_options=options))
+    return jax.jit(iterate, compiler_options=quick_compilation())
+
+
+def unseen(frames: Frames, linear: int, directions: int) -> State:
+    """A state from which the first iteration looks at the frames as they are, and steps nowhere."""
+    d = len(frames.positions)
+    at = Projection(
+        loss=jnp.asarray(jnp.inf),
+        squares=jnp.zeros(d),
+        linear=jnp.zeros(linear),
+        normal=jnp.eye(directions),
+        slope=jnp.zeros(directions),
+    )
+    return State(jax.tree.map(jnp.asarray, frames), at, jnp.asarray(FIRST_DAMPING / FEWER))
 
 
 def descend(
-    programs: Descent,
+    program: Program,
+    structure: Structure,
     frames: Frames,
     samples: Samples,
     unit: Any,
@@ -84,10 +89,11 @@ def descend(
 ) -> State:
     """Iterates until the loss settles, no step descends, the iterations are used up, or time is."""
     samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
-    state = programs.start(jax.tree.map(jnp.asarray, frames), samples, unit)
+    directions = len(free_directions(structure.parents, structure.joints))
+    state = unseen(frames, structure.linear_count, directions)
     before = np.inf
     for _ in range(0, iterations, CHUNK):
-        state = programs.iterate(state, samples, unit)
+        state = program(state, samples, unit)
         now = float(state.at.loss)
         if not now < before * (1 - SETTLED) or float(state.damping) >= MOST_DAMPING or expired():
             break

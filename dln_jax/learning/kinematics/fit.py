@@ -3,20 +3,20 @@
 import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.kinematics.descent import Descent, State, compiled, descend
+from dln_jax.learning.kinematics.descent import Program, State, compiled, descend
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.learning.kinematics.projection import Samples, Structure, design, inertias_of
 from dln_jax.learning.kinematics.search import ALIKE, Search, agreeing, search
 from dln_jax.learning.objectives import torque_scale
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.serial_tree import SerialTreeParameters, make_serial_tree, rotation_vector
 from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
@@ -94,11 +94,8 @@ def fit_tree(
     require_positive(ridge=ridge, most_samples=most_samples, samples=settings.samples)
     if needs.degrees_of_freedom != train.degrees_of_freedom:
         raise InputError(f"the needs have {needs.degrees_of_freedom} joints, the data {train.degrees_of_freedom}")
-    # The factory checks the rest.
-    factory = functools.partial(
-        make_serial_tree, needs, parents=parents, acceleration=acceleration, velocity_scale=velocity_scale
-    )
-    factory()
+    # The model's factory checks the rest.
+    make_serial_tree(needs, parents=parents, acceleration=acceleration, velocity_scale=velocity_scale)
     began = time.perf_counter()
     d = needs.degrees_of_freedom
     order = tuple(range(-1, d - 1)) if parents is None else tuple(parents)
@@ -106,25 +103,27 @@ def fit_tree(
     structure = Structure(order, needs.joints, acceleration, needs.friction, velocity_scale)
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(train))
-        programs = compiled(structure, ridge=ridge)
-        found = search(structure, programs, _some(train, settings.samples, settings.seed), scale, settings)
+        program = compiled(structure, ridge=ridge)
+        found = search(structure, program, _some(train, settings.samples, settings.seed), scale, settings)
         lowest = float(found[0].at.loss)
         report(f"{len(found)} descents, {agreeing(found)} of them to the lowest loss, {lowest:.3g}")
         every = _some(train, most_samples, settings.seed)
-        refined = [_refined(programs, each, every, scale, settings) for each in _finalists(found, validation)]
-        solved = [_solved(structure, state, unit, train, rank_tolerance) for state, unit in refined]
-        model = factory(dtype=jnp.float64)
-        errors = [_joint_errors(model, parameters, train) for parameters, _ in solved]
-        judged = [_joint_errors(model, parameters, validation or train).sum() for parameters, _ in solved]
+        refined = [_refined(program, structure, each, every, scale, settings) for each in _finalists(found, validation)]
+        columns = _columns(structure)
+        solved = [_solved(columns, state, unit, train, rank_tolerance) for state, unit in refined]
+        pairs = [(state.frames, solution.x) for (state, _), solution in zip(refined, solved, strict=True)]
+        errors = [_joint_errors(columns, *pair, train) for pair in pairs]
+        judged = [_joint_errors(columns, *pair, validation or train).sum() for pair in pairs]
         best = int(np.argmin(judged))
-    (parameters, solution), (state, _) = solved[best], refined[best]
+        (frames, linear), solution = pairs[best], solved[best]
+        parameters = _parameters(structure, frames, linear)
     return TreeFit(
         parameters=parameters,
-        frames=jax.tree.map(np.asarray, state.frames),
+        frames=jax.tree.map(np.asarray, frames),
         torque_mse=float(errors[best].sum()),
         joint_mse=errors[best],
         validation_error=float("nan") if validation is None else float(judged[best]),
-        parameter_count=len(state.at.slope) + len(solution.x),
+        parameter_count=len(refined[best][0].at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
         losses=np.array([float(each.at.loss) for each in found]),
@@ -153,45 +152,59 @@ def _finalists(found: list[State], validation: Trajectories | None) -> list[Stat
 
 
 def _refined(
-    programs: Descent, state: State, samples: Samples, scale: Float[np.ndarray, " d"], settings: Search
+    program: Program,
+    structure: Structure,
+    state: State,
+    samples: Samples,
+    scale: Float[np.ndarray, " d"],
+    settings: Search,
 ) -> tuple[State, Float[np.ndarray, " d"]]:
     """The descent carried on with all samples, and then with units of the torque that each joint leaves over."""
     unit = scale
     for last in range(ROUNDS + 1):
-        state = descend(programs, state.frames, samples, unit, iterations=settings.iterations)
+        state = descend(program, structure, state.frames, samples, unit, iterations=settings.iterations)
         if last < ROUNDS:
             unit = np.maximum(unit * np.sqrt(np.asarray(state.at.squares)), LEAST_NOISE * scale)
     return state, unit
 
 
 def _solved(
-    structure: Structure, state: State, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
-) -> tuple[SerialTreeParameters, least_squares.Solution]:
+    columns: Callable, state: State, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
+) -> least_squares.Solution:
     """The linear parameters of given frames from all data, by singular values."""
-    columns = jax.jit(jax.vmap(functools.partial(design, structure, state.frames)))
 
-    def equations(length: int = 4096) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for first in range(0, len(data.tau), length):
-            rows = slice(first, first + length)
-            Phi = np.asarray(columns(data.q[rows], data.qd[rows], data.qdd[rows])) / unit[:, None]
-            yield Phi.reshape(-1, Phi.shape[-1]), (data.tau[rows] / unit).ravel()
+    def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for Phi, tau in _designs(columns, state.frames, data):
+            yield (Phi / unit[:, None]).reshape(-1, Phi.shape[-1]), (tau / unit).ravel()
 
-    solution = least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
-    d = len(structure.joints)
-    inertial = len(structure.inertial)
-    armature, *friction = solution.x[inertial:].reshape(-1, d)
-    turns = np.array([rotation_vector(each) for each in np.asarray(state.frames.rotations)])
-    parameters = SerialTreeParameters(
-        turns,
-        np.asarray(state.frames.positions),
-        np.asarray(inertias_of(structure, jnp.asarray(solution.x))),
-        armature,
-        *(friction or (None, None, None)),
-    )
-    return jax.tree.map(jnp.asarray, parameters), solution
+    return least_squares.solve_chunks(equations(), rank_tolerance=rank_tolerance, negligible=1e-12)
 
 
-def _joint_errors(model: Any, parameters: SerialTreeParameters, data: Trajectories) -> Float[np.ndarray, " d"]:
+def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
     """Mean squared error of each joint's torque."""
-    inverse = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
-    return np.mean((np.asarray(inverse(data.q, data.qd, data.qdd)) - data.tau) ** 2, axis=0)
+    squares = [np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, tau in _designs(columns, frames, data)]
+    return np.sum(squares, axis=0) / len(data.tau)
+
+
+def _columns(structure: Structure) -> Callable:
+    """(frames, q, qd, qdd) -> Phi [N, d, P]."""
+    batched = jax.vmap(functools.partial(design, structure), in_axes=(None, 0, 0, 0))
+    return jax.jit(batched, compiler_options=quick_compilation())
+
+
+def _designs(
+    columns: Callable, frames: Frames, data: Trajectories, *, length: int = 4096
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Phi [n, d, P] and tau [n, d] of so many samples at a time."""
+    for first in range(0, len(data.tau), length):
+        rows = slice(first, first + length)
+        yield np.asarray(columns(frames, data.q[rows], data.qd[rows], data.qdd[rows])), data.tau[rows]
+
+
+def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
+    """Of the model."""
+    armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
+    turns = np.array([rotation_vector(each) for each in np.asarray(frames.rotations)])
+    inertias = inertias_of(structure, jnp.asarray(linear))
+    parts = (turns, frames.positions, inertias, armature, *(friction or (None, None, None)))
+    return SerialTreeParameters(*(None if part is None else jnp.asarray(part) for part in parts))

@@ -42,8 +42,8 @@ def rough_frames(sketch: Frames, random: np.random.Generator, *, angle: float, l
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
     """Places in a flat step [d, 6] of the numbers that torques may show; the others are gauges.
 
-    A link's frame may turn about and slide along its own z, so that four numbers are left: two tilts of the axis and two
-    shifts across it. A prismatic joint's axis, and the base's, have a direction and no place.
+    A link's frame may turn about and slide along its own z, so that four numbers are left: two tilts of the axis, and
+    two shifts across it. A prismatic joint's axis, and the base's, have a direction and no place.
     """
     places = []
     for link, (parent, kind) in enumerate(zip(parents, joints, strict=True)):

@@ -48,6 +48,11 @@ class Structure(NamedTuple):
         kept = (OF_REVOLUTE if kind == "revolute" else OF_PRISMATIC for kind in self.joints)
         return np.concatenate([10 * link + own for link, own in enumerate(kept)])
 
+    @property
+    def linear_count(self) -> int:
+        """P, of the linear parameters."""
+        return len(self.inertial) + len(self.joints) * (4 if self.friction else 1)
+
 
 class Samples(NamedTuple):
     """States and torques, [N, d] each."""

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.learning.kinematics.descent import Descent, State, descend
+from dln_jax.learning.kinematics.descent import Program, State, descend
 from dln_jax.learning.kinematics.frames import Frames, random_frames, rough_frames, turned_round
 from dln_jax.learning.kinematics.projection import Samples, Structure
 from dln_jax.types import require_positive, require_seed
@@ -50,13 +50,13 @@ class Search(NamedTuple):
 
 
 def search(
-    structure: Structure, programs: Descent, samples: Samples, unit: Float[np.ndarray, " d"], settings: Search
+    structure: Structure, program: Program, samples: Samples, unit: Float[np.ndarray, " d"], settings: Search
 ) -> list[State]:
     """The ends of all descents, the lowest first.
 
     Args:
         structure: what is known of the tree.
-        programs: of the structure.
+        program: of the structure.
         samples: to explain, those of the data that the search sees.
         unit: of each joint's torque.
         settings: how much is tried.
@@ -68,7 +68,9 @@ def search(
     require_positive(**counts, sketch_angle=settings.sketch_angle, sketch_length=settings.sketch_length)
     require_seed(settings.seed)
     until = time.perf_counter() + settings.seconds
-    end = functools.partial(_end, programs, samples, unit, settings.iterations, lambda: time.perf_counter() > until)
+    end = functools.partial(
+        _end, program, structure, samples, unit, settings.iterations, lambda: time.perf_counter() > until
+    )
     found: list[State] = []
     with ThreadPoolExecutor(settings.threads) as pool:
         for wave in _waves(structure, settings):
@@ -108,10 +110,16 @@ def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames
 
 
 def _end(
-    programs: Descent, samples: Samples, unit: Any, iterations: int, expired: Callable[[], bool], frames: Frames
+    program: Program,
+    structure: Structure,
+    samples: Samples,
+    unit: Any,
+    iterations: int,
+    expired: Callable[[], bool],
+    frames: Frames,
 ) -> State:
     with jax.enable_x64(True):  # a setting of each thread
-        return descend(programs, frames, samples, unit, iterations=iterations, expired=expired)
+        return descend(program, structure, frames, samples, unit, iterations=iterations, expired=expired)
 
 
 def _sorted(found: list[State]) -> list[State]:

@@ -2,8 +2,8 @@
 
 `recursions` writes every link out, so that zeros of known frames cost nothing. Here no frame is known. A scan carries,
 in each link's frame, the motions of the link for a unit rate of every joint (the columns of its Jacobian), its own
-motion, and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008); each link then
-has its forces by itself. Joints are about z, for one state.
+motion, and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008); each link has
+its forces by itself then. Joints are about z, for one state.
 """
 
 from collections.abc import Sequence
