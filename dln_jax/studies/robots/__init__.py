@@ -1,0 +1,1 @@
+"""What is measured of robots: identification, tracking, learned trees, real logs and speed."""

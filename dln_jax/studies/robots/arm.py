@@ -1,0 +1,165 @@
+"""A seven-axis arm that MuJoCo simulates, and the logs of it that an engineer would have.
+
+Frames are those of a Panda (modified Denavit-Hartenberg rows). Links have masses and centres like its own and moments
+of ellipsoids about the centre; motors have armature; joints have viscous friction and, in one case, dry friction.
+MuJoCo holds dry friction as a constraint, so that no law of ours is exact. A PD controller at 1 kHz follows Fourier
+series, of which 125 samples a second are logged, with noise of encoders and of torques.
+"""
+
+import importlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robots import INSTALL, Robot
+from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial
+from dln_jax.types import InputError
+
+D = 7
+RIGHT = np.pi / 2
+ROWS = (
+    *((0, 0, 0.333, 0), (-RIGHT, 0, 0, 0), (RIGHT, 0, 0.316, 0), (RIGHT, 0.0825, 0, 0)),
+    *((-RIGHT, -0.0825, 0.384, 0), (RIGHT, 0, 0, 0), (RIGHT, 0.088, 0, 0)),
+)
+"""alpha, a, d, theta; rad and m."""
+MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
+"""kg."""
+CENTRES = (
+    *((0.004, 0.002, -0.175), (-0.003, -0.029, 0.003), (0.028, 0.039, -0.067), (-0.053, 0.104, 0.027)),
+    *((-0.012, 0.041, -0.038), (0.060, -0.014, -0.011), (0.011, -0.004, 0.062)),
+)
+"""m, in the link's frame."""
+SPREADS = (
+    *((0.08, 0.08, 0.04), (0.05, 0.05, 0.04), (0.06, 0.06, 0.04), (0.06, 0.06, 0.05)),
+    *((0.09, 0.08, 0.03), (0.04, 0.04, 0.04), (0.03, 0.03, 0.03)),
+)
+"""Standard deviations of the mass along axes through the centre, m."""
+ARMATURE = (0.2, 0.2, 0.2, 0.2, 0.07, 0.07, 0.07)
+"""kg m²."""
+VISCOUS = (1.0, 1.0, 0.8, 0.8, 0.4, 0.3, 0.2)
+"""N m s."""
+COULOMB = (1.0, 1.2, 0.8, 0.8, 0.5, 0.4, 0.3)
+"""N m."""
+STIFFNESS = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])
+"""Of the PD controller, N m/rad."""
+DAMPING = np.array([50.0, 50.0, 50.0, 50.0, 30.0, 25.0, 15.0])
+"""N m s/rad."""
+MIDDLE = np.array([0.0, 0.0, 0.0, -1.5, 0.0, 1.9, 0.0])
+REACH = np.array([1.4, 0.9, 1.4, 0.75, 1.4, 0.95, 1.4])
+"""Half the range of motions about the middle, rad."""
+HARMONICS, PERIOD = 5, 10.0
+STEP, EVERY = 0.001, 8
+"""s of the controller, and its steps to a logged sample."""
+ENCODER_NOISE = 1e-4
+"""Standard deviation, rad."""
+TORQUE_NOISE = np.array([0.5, 0.5, 0.4, 0.4, 0.2, 0.1, 0.1])
+"""Standard deviation, N m."""
+
+
+class Motion(NamedTuple):
+    """References of a motion of T steps of the controller, each [T, d]."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+
+
+class Log(NamedTuple):
+    """Samples of one simulated motion, free of noise, each [N, d]."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+    """Of the motors."""
+    reference: np.ndarray
+    """q that was asked for."""
+
+
+def arm(*, coulomb: bool) -> Robot:
+    """The arm, with or without dry friction."""
+    links = [
+        inertial_parameters(m, c, m * (np.sum(np.square(s)) * np.eye(3) - np.diag(np.square(s))))
+        for m, c, s in zip(MASSES, CENTRES, SPREADS, strict=True)
+    ]
+    tree: Tree = serial(*dh_frames(ROWS), links, armature=np.array(ARMATURE))
+    free = np.tile([-np.inf, np.inf], (D, 1))
+    return Robot(tree, np.array(VISCOUS), np.array(COULOMB) * coulomb, free, free)
+
+
+def motion(random: np.random.Generator) -> Motion:
+    """A Fourier series of drawn amplitudes within the reach of every joint, over one period from standstill."""
+    t = STEP * np.arange(int(PERIOD / STEP))
+    frequencies = 2 * np.pi / PERIOD * np.arange(1, HARMONICS + 1)
+    sines, cosines = random.uniform(-1, 1, (2, D, HARMONICS)) / np.arange(1, HARMONICS + 1) ** 0.5
+    angles = frequencies[:, None] * t
+    # A window over the first and last second lets every motion begin and end at rest.
+    rise = np.clip(np.minimum(t, PERIOD - t), 0, 1)
+    window = rise**3 * (10 - 15 * rise + 6 * rise**2)
+    series = (sines @ np.sin(angles) + cosines @ np.cos(angles)).T * window[:, None]
+    largest = np.abs(series).max(axis=0)
+    q = MIDDLE + series * REACH * random.uniform(0.6, 1.0, D) / largest
+    qd = np.gradient(q, STEP, axis=0, edge_order=2)
+    return Motion(q, qd, np.gradient(qd, STEP, axis=0, edge_order=2))
+
+
+def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None) -> Log:
+    """The arm in MuJoCo under PD control, with torques [T, d] fed forward if any; every eighth step is logged.
+
+    Raises:
+        InputError: MuJoCo is missing.
+    """
+    mujoco, model, data = _simulator(robot)
+    data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
+    # Rates of the simulation are those of its last step, half a step behind its coordinates.
+    rates = np.diff(wanted.q, axis=0, prepend=wanted.q[:1]) / STEP
+    logged = []
+    for step, (q, qd) in enumerate(zip(wanted.q, rates, strict=True)):
+        tau = STIFFNESS * (q - data.qpos) + DAMPING * (qd - data.qvel)
+        data.ctrl[:] = tau if feed_forward is None else tau + feed_forward[step]
+        mujoco.mj_forward(model, data)
+        if step % EVERY == 0:
+            logged.append(np.stack([data.qpos, data.qvel, data.qacc, data.ctrl, q]))
+        mujoco.mj_step(model, data)
+    return Log(*np.stack(logged, axis=1))
+
+
+def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
+    """Torques [T, d] that the arm takes on its references, by MuJoCo's inverse dynamics, dry friction included."""
+    mujoco, model, data = _simulator(robot)
+    tau = []
+    for state in zip(*wanted, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = state
+        mujoco.mj_inverse(model, data)
+        tau.append(np.array(data.qfrc_inverse))
+    return np.stack(tau)
+
+
+def _simulator(robot: Robot) -> tuple[Any, Any, Any]:
+    try:
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError:
+        raise InputError(f"MuJoCo simulates the arm and is missing; {INSTALL}") from None
+    model = mujoco.MjModel.from_xml_string(mjcf(robot, time_step=STEP))
+    return mujoco, model, mujoco.MjData(model)
+
+
+def trajectories(logs: list[Log]) -> Trajectories:
+    """Logs as data that know everything, free of noise."""
+    counts = [len(log.q) for log in logs]
+    arrays = {key: np.concatenate([getattr(log, key) for log in logs]) for key in ("q", "qd", "qdd", "tau")}
+    t = np.concatenate([STEP * EVERY * np.arange(count) for count in counts])
+    return from_arrays({"t": t, "trajectory": np.repeat(np.arange(len(logs)), counts), **arrays})
+
+
+def measured(data: Trajectories, random: np.random.Generator) -> dict[str, np.ndarray]:
+    """What a log has: q of encoders and torques of motors, both noisy, by the keys of the schema; no rates."""
+    return {
+        "t": data.t,
+        "q": data.q + random.normal(size=data.q.shape) * ENCODER_NOISE,
+        "tau": data.tau + random.normal(size=data.tau.shape) * TORQUE_NOISE,
+        "trajectory": data.trajectory,
+        "label": data.label,
+    }
