@@ -23,6 +23,7 @@ from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, require_network, require_positive
@@ -41,6 +42,13 @@ class Properties(NamedTuple):
     """It is a function of (q, p), which Hamilton's equations fit to data with momenta."""
     linear: bool = False
     """Its parameters enter linearly, so that one least-squares problem fits them."""
+    searched: bool = False
+    """A search of its own finds its parameters (`learning.kinematics`)."""
+
+    @property
+    def direct(self) -> bool:
+        """Whether it is fitted without an optimiser."""
+        return self.linear or self.searched
 
 
 class Entry(NamedTuple):
@@ -121,6 +129,7 @@ CATALOGUE = {
     "structured-delan": Entry(make_delan, Properties(definite=True)),
     "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(make_trigonometric, Properties(linear=True)),
+    "learned-tree": Entry(make_serial_tree, Properties(searched=True)),
     "feed-forward": Entry(
         make_feed_forward,
         Properties(energy=False),

@@ -55,8 +55,9 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
         at = project(structure, frames, samples, unit, ridge=ridge)
         lower = at.loss < state.at.loss  # not where it is NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
-        kept = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), (state.frames, state.at))
-        return State(*kept, damping)
+        before = (state.frames, state.at)
+        frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
+        return State(frames, at, damping)
 
     def iterate(state: State, samples: Samples, unit: Array) -> State:
         return lax.fori_loop(0, CHUNK, lambda _, state: iteration(state, samples, unit), state)

@@ -23,8 +23,8 @@ def scanned_regressor(
     parents: Sequence[int],
     joints: Sequence[JointKind],
     gravity: Any,
-    rotations: Float[Array, "d 3 3"],
-    positions: Float[Array, "d 3"],
+    rotations: Any,
+    positions: Any,
     q: Vector,
     qd: Vector,
     qdd: Vector,
@@ -35,8 +35,8 @@ def scanned_regressor(
         parents: as of a `Tree`.
         joints: kinds.
         gravity: [3], m/s².
-        rotations: of the links at q = 0, in the frames that they hang on.
-        positions: likewise, m.
+        rotations: [d, 3, 3], of the links at q = 0 in the frames that they hang on.
+        positions: [d, 3], likewise, m.
         q: with `qd` and `qdd` the state.
     """
 
@@ -56,9 +56,9 @@ def scanned_forces(
     parents: Sequence[int],
     joints: Sequence[JointKind],
     gravity: Any,
-    rotations: Float[Array, "d 3 3"],
-    positions: Float[Array, "d 3"],
-    inertias: Float[Array, "d 10"],
+    rotations: Any,
+    positions: Any,
+    inertias: Any,
     q: Vector,
     qd: Vector,
     qdd: Vector,
@@ -80,8 +80,8 @@ def _spatial(
     parents: Sequence[int],
     joints: Sequence[JointKind],
     gravity: Any,
-    rotations: Array,
-    positions: Array,
+    rotations: Any,
+    positions: Any,
     q: Vector,
     qd: Vector,
     qdd: Vector,

@@ -15,7 +15,8 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.datasets.robot_arms import lip_trajectories
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
-from dln_jax.mechanics.equations import System, dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64
@@ -80,7 +81,9 @@ def known(arm: Arm, *, friction: bool, every: int = 10, tests: Sequence[int] = T
     return Outcome(nmse, joint_mse, 0, 0, fit.seconds)
 
 
-def unseen_errors(arm: Arm, system: System, *, friction: bool, tests: Sequence[int]) -> Float[np.ndarray, "T d"]:
+def unseen_errors(
+    arm: Arm, system: RecursiveSystem, *, friction: bool, tests: Sequence[int]
+) -> Float[np.ndarray, "T d"]:
     """nMSE by test motion and joint, against torques without noise."""
     test = lip_trajectories(arm, tests, friction=friction, noise=0.0)
     errors = (_torques(system, test) - test.tau) ** 2
@@ -88,7 +91,7 @@ def unseen_errors(arm: Arm, system: System, *, friction: bool, tests: Sequence[i
     return np.array([errors[motion].mean(axis=0) / test.tau[motion].var(axis=0) for motion in motions])
 
 
-def _torques(system: System, data: Trajectories) -> Float[np.ndarray, "N d"]:
+def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "N d"]:
     inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
     return np.asarray(inverse(data.q, data.qd, data.qdd))
 
