@@ -15,6 +15,7 @@ from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "make_polynomial_hamiltonian",
     "make_rigid_tree",
     "make_separable_hamiltonian",
+    "make_serial_tree",
     "make_structured_hamiltonian",
     "make_trigonometric",
     "with_joint_friction",

@@ -47,7 +47,7 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     (default: what the scene or the file states, else revolute joints with gravity)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
-    gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
+    gauss-newton while its equations are small. The trigonometric model and the learned tree need none."""
     width: Unstated[int] = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
     depth: Unstated[int] = None
@@ -101,7 +101,7 @@ class Task(NamedTuple):
     """Of the model, for `dln_jax.zoo.build`."""
     objective: Objective
     solver: Solver | None
-    """`None` for the trigonometric model, which is one least-squares problem."""
+    """`None` for models that have a fit of their own."""
     seeds: int | tuple[int, ...]
     """One, or several in one program."""
     seconds: float
@@ -163,13 +163,12 @@ def check_options(given: Options, kind: str) -> None:
     """Refuses options that the model does not read."""
     require_positive(seeds=given.seeds)
     require_seed(given.seed, given.seeds)
-    if CATALOGUE[kind].properties.linear:
-        if given.seeds > 1:
-            raise InputError(f"--seeds is {given.seeds}, but one least-squares problem has no seeds; leave it out")
-        names = (*OF_NETWORKS, *OF_ADAM, "steps", "seconds", "target")
-        refuse_given(given, names, "for networks; the trigonometric model is one least-squares problem")
-        if given.optimizer != "auto":
-            raise InputError("the trigonometric model is one least-squares problem; leave --optimizer out")
+    properties = CATALOGUE[kind].properties
+    if properties.searched:
+        check_direct_options(given, ("degree",), "the learned tree", "has a search of its own")
+        return
+    if properties.linear:
+        check_direct_options(given, ("seconds",), "the trigonometric model", "is one least-squares problem")
         return
     refuse_given(given, ["degree"], "for the trigonometric model")
     if given.target is not None:
@@ -177,6 +176,15 @@ def check_options(given: Options, kind: str) -> None:
             raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
         refuse_given(given, ["width", "depth"], "what --target grows")
         require_positive(target=given.target)
+
+
+def check_direct_options(given: Options, others: tuple[str, ...], model: str, why: str) -> None:
+    """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
+    if given.seeds > 1:
+        raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
+    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
+    if given.optimizer != "auto":
+        raise InputError(f"{model} {why}; leave --optimizer out")
 
 
 def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
@@ -197,6 +205,8 @@ def model_and_optimiser(
     check_options(given, kind)
     properties, adam = CATALOGUE[kind].properties, given.optimizer == "adam"
     precision = given.precision or ("f32" if adam else "f64")
+    if properties.searched:
+        return describe_for(kind, sets.train, needs, precision=precision), None, ""
     if properties.linear:
         degree = 1 if given.degree is None else given.degree
         return describe_for(kind, sets.train, needs, precision=precision, degree=degree), None, ""

@@ -29,6 +29,7 @@ from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.residual import make_residual, make_with_residual
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, ResidualTerm, require_network, require_positive
@@ -47,6 +48,13 @@ class Properties(NamedTuple):
     """It is a function of (q, p), which Hamilton's equations fit to data with momenta."""
     linear: bool = False
     """Its parameters enter linearly, so that one least-squares problem fits them."""
+    searched: bool = False
+    """A search of its own finds its parameters (`learning.kinematics`)."""
+
+    @property
+    def direct(self) -> bool:
+        """Whether it is fitted without an optimiser."""
+        return self.linear or self.searched
 
 
 class Entry(NamedTuple):
@@ -185,6 +193,7 @@ CATALOGUE = {
     "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
     "rigid-tree-residual": Entry(make_stored_residual, Properties()),
+    "learned-tree": Entry(make_serial_tree, Properties(searched=True)),
     "feed-forward": Entry(
         with_friction_laws(make_feed_forward),
         Properties(energy=False),

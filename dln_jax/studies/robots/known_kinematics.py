@@ -30,7 +30,7 @@ USUAL_SCALE = 0.01
 """rad/s, of the rival's dry friction, which it does not fit."""
 DECIMATE = 3
 CLEAN, SEEN = 1e-12, 1.65e-3
-"""nMSE to reach: clean data of an arm with viscous friction; noisy ones with dry friction, which a regressor reached."""
+"""nMSE to reach: of clean data with viscous friction, and of noisy ones with dry friction, which a regressor reached."""
 TRACKING = 1.1
 """Times the error with true parameters."""
 
