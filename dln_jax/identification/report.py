@@ -7,6 +7,7 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.base import Determinacy
 from dln_jax.identification.identify import Identification
+from dln_jax.solvers.levenberg_marquardt import Status
 
 STILL = 0.01
 """rad or m: a joint that moves by less does not move."""
@@ -80,6 +81,11 @@ def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) 
     ]
     if friction and found.consistent is None:
         lines.append(f"negative, which no joint is: {', '.join(friction)}; ask for consistent parameters")
+    if found.consistent is not None and found.consistent.status == Status.RUNNING:
+        lines.append(
+            f"bodies that exist still came closer to the data after {found.consistent.iterations} iterations; "
+            "the table shows how close they are"
+        )
     return lines
 
 
