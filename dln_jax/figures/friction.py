@@ -80,7 +80,8 @@ def friction_laws() -> Figure:
         "offset": {"offset": 0.05},
     }
     forces = {
-        name: sum(size * unit_force(law, rates, shape) for law, size in each.items()) for name, each in sums.items()
+        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in each.items()]), axis=0)
+        for name, each in sums.items()
     }
     link = jnp.ones_like(rates)
     forces["load, 1 N m carried"] = carrying(Load(0.25, shape.velocity_scale), rates, link) - link
