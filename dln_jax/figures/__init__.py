@@ -3,7 +3,7 @@
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time
 from dln_jax.figures.dynamics import force_decomposition, tip_paths
-from dln_jax.figures.friction import friction_curves
+from dln_jax.figures.friction import friction_curves, friction_laws
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
 from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
@@ -22,6 +22,7 @@ __all__ = [
     "error_against_time",
     "force_decomposition",
     "friction_curves",
+    "friction_laws",
     "function_curves",
     "heat_maps",
     "injection_figure",

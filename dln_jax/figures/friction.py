@@ -1,12 +1,15 @@
-"""Friction of joints against their rates: curves of laws or fits, with measured points behind."""
+"""Friction of joints against their rates: curves of fits, with measured points behind, and the laws side by side."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.figures import style
+from dln_jax.mechanics.friction import FrictionShape, unit_force
+from dln_jax.mechanics.loaded import Load, carrying
 
 MOST_POINTS = 4000
 """Of a joint that are drawn."""
@@ -48,6 +51,7 @@ def friction_curves(
             colour = style.CYCLE[place % len(style.CYCLE)]
             axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
         axis.axhline(0, color="black", linewidth=0.5)
+        axis.locator_params(axis="x", nbins=5)
         if d > 1:
             style.title(axis, names[joint] if names else f"joint {joint + 1}")
         if joint >= d - columns:
@@ -56,3 +60,29 @@ def friction_curves(
             axis.set_ylabel(f"friction, {force_unit}")
     style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(arrays), 4))
     return figure
+
+
+def friction_laws() -> Figure:
+    """Each law with typical numbers, over the rate of one joint: `docs/friction.png`."""
+    shape = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.15, sigmoid_slope=12.0, sigmoid_shift=0.05)
+    rates = jnp.linspace(-0.6, 0.6, 1201)
+    sums: dict[str, dict[str, float]] = {
+        "viscous": {"viscous": 1.0},
+        "coulomb": {"coulomb": 0.5},
+        "coulomb + stribeck": {"coulomb": 0.5, "stribeck": 0.4},
+        "asymmetric": {
+            "viscous_forward": 0.2,
+            "viscous_backward": 0.9,
+            "coulomb_forward": 0.35,
+            "coulomb_backward": 0.15,
+        },
+        "sigmoid": {"sigmoid": 1.0},
+        "offset": {"offset": 0.05},
+    }
+    forces = {
+        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in each.items()]), axis=0)
+        for name, each in sums.items()
+    }
+    link = jnp.ones_like(rates)
+    forces["load, 1 N m carried"] = carrying(Load(0.25, shape.velocity_scale), rates, link) - link
+    return friction_curves({name: (rates[:, None], force[:, None]) for name, force in forces.items()})
