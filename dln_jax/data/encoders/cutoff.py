@@ -26,10 +26,10 @@ CANDIDATES = 200
 """Cut-offs that are tried."""
 TOP = 0.45
 """Of the rate: where the best cut-off would be no lower, nothing is to be filtered."""
+MOVES = 2.0
+"""Standard deviations of noise, by more than which a joint has to move."""
 WORTH = 1e-4
 """Relative error of unfiltered accelerations, below which nothing is to be filtered either."""
-HOPELESS = 0.5
-"""Of the squared accelerations: where no cut-off leaves a smaller error, there is no motion to be seen."""
 
 
 class Choice(NamedTuple):
@@ -76,15 +76,15 @@ def choose_cutoff(
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
     sizes = weight @ signal
-    moves = sizes > 0
+    moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
+    if not moves.any():
+        raise InputError("no joint moves by more than its noise; a cut-off takes motions: give one, or look at q")
     error = np.empty(CANDIDATES)
     for place, cutoff in enumerate(tried):
         H = gain(f, float(cutoff), order)[:, None]
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
-        error[place] = np.mean(left[moves] / sizes[moves]) if moves.any() else np.inf
+        error[place] = np.mean(left[moves] / sizes[moves])
     best = int(np.argmin(error))
-    if not error[best] < HOPELESS:
-        raise InputError("no joint moves by more than its noise; a cut-off takes motions: give one, or look at q")
     raw = np.mean((weight @ np.broadcast_to(floor, spectrum.shape))[moves] / sizes[moves])
     cutoff = float(tried[best]) if best < CANDIDATES - 1 and raw > WORTH**2 else np.inf
     return Choice(cutoff, tried, error, f, spectrum, floor)
