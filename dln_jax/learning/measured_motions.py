@@ -181,7 +181,7 @@ def check_gauge(gauge: Gauge | None, d: int) -> None:
 
 
 def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
-    """How far the mass matrix is from the gauge, relatively and in units of `GAUGE_TOLERANCE` [1]; empty without one, or without energies."""
+    """How far the mass matrix is from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without one or energies."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
     M = system.mass_matrix(jnp.asarray(gauge.q))
