@@ -34,6 +34,9 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Scalar, require_positive
 
+GAUGE_TOLERANCE = 0.01
+"""Relative distance from a gauge that counts as one standard deviation; it can be met exactly, and is."""
+
 
 class MeasuredWindows(NamedTuple):
     """W equally long windows; the shorter ones repeat their last sample, with weight zero."""
@@ -178,11 +181,11 @@ def check_gauge(gauge: Gauge | None, d: int) -> None:
 
 
 def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
-    """How far the mass matrix is from the gauge, relatively [1]; empty without one, or without energies."""
+    """How far the mass matrix is from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without one or energies."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
     M = system.mass_matrix(jnp.asarray(gauge.q))
-    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1)
+    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
 
 
 def _residual(

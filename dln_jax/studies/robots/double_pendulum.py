@@ -77,7 +77,7 @@ def ten_parameters() -> Model:
 def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
     """Torque errors and valid prediction times of each way on recordings held out: median and worst of the splits.
 
-    The bound of the motions is the least squares' number. `torque_nmse` is that of torques which filtered motions take,
+    The bounds of the others are the least squares' numbers. `torque_nmse` is that of torques which filtered motions take,
     `torque_nmse_low_passed` that of torques of less filtered motions, low-passed beside the measured ones.
     """
     logs = read(path)
@@ -88,7 +88,7 @@ def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
             values, rival = ([each[name][quantity] for each in found] for name in (way, WAYS[0]))
             worst = np.min if longer else np.max
             for suffix, of in (("", np.median), ("_worst", worst)):
-                bound = float(of(rival)) if way == "motions" else None
+                bound = float(of(rival)) if way != WAYS[0] else None
                 row = Row(f"double-pendulum/{way}", quantity + suffix, float(of(values)), unit, None, bound, longer)
                 listed.append(row)
     return listed
