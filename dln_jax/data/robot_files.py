@@ -6,13 +6,13 @@ moves, and the inertias of what is fixed to it are taken out. What a format has 
 
 import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robots import compiled, parsed
+from dln_jax.data.robots import joint_names, opened, parsed
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
@@ -29,6 +29,7 @@ def write_robot(
     *,
     damping: Any = None,
     coulomb: Any = None,
+    hold: Mapping[str, float] | Sequence[str] = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
     """Writes the file `original` with the inertias of a tree, its armature where the format has it, and friction.
@@ -39,6 +40,8 @@ def write_robot(
         tree: with the joints of that file, by name.
         damping: viscous friction of each joint [d], N m s or N s/m; by default as it was.
         coulomb: dry friction [d], N m or N; by default as it was.
+        hold: joints that the tree was read without, as `read_robot` has it. What hangs on them counts to the link
+            before them, where it is while they are held.
         remarks: lines of the comment at the file's top.
 
     Raises:
@@ -49,21 +52,28 @@ def write_robot(
     if path.exists() and original.exists() and path.samefile(original):
         raise InputError(f"{path} is the file that was read; give another name, so that it stays as it is")
     root = parsed(original)
-    _, model = compiled(original, copy.deepcopy(root))
-    names = [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
+    _, model, held = opened(original, copy.deepcopy(root), hold)
+    names = [name for name in joint_names(model) if name not in held]
     if list(tree.names) != names:
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")
     for name, theta in zip(names, np.asarray(tree.inertias, float), strict=True):
         if theta.any() and np.linalg.eigvalsh(pseudo_inertia(theta))[0] <= 0:
             raise InputError(f"the link behind joint '{name}' is no body that exists; write consistent parameters")
     remarks = (LUMPS, *remarks)
+    if held:
+        where = ", ".join(f"{name} at {position!r}" for name, position in held.items())
+        remarks = (*remarks, f"Held while this was identified, and counted to the link before (rad or m): {where}.")
     friction = {"damping": damping, "coulomb": coulomb}
     if root.tag == "robot":
         if np.any(tree.armature):
             numbers = ", ".join(f"{name} {value!r}" for name, value in zip(names, _floats(tree.armature), strict=True))
             remarks = (*remarks, f"Armature, for which URDF has no place (kg m² or kg): {numbers}.")
-        _into_urdf(root, tree, **friction)
+        _into_urdf(root, tree, held, **friction)
     else:
+        if held:
+            raise InputError(
+                f"{original}: joints of an MJCF file are held, whose bodies would have no mass; take them out of it"
+            )
         _into_mjcf(original, root, model, tree, **friction)
     comment = ET.Comment("\n  " + "\n  ".join(line.replace("--", "- -") for line in remarks) + "\n")
     comment.tail = "\n"
@@ -71,12 +81,12 @@ def write_robot(
     write_bytes(path, ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
-def _into_urdf(root: ET.Element, tree: Tree, *, damping: Any, coulomb: Any) -> None:
+def _into_urdf(root: ET.Element, tree: Tree, held: Collection[str], *, damping: Any, coulomb: Any) -> None:
     links = {link.get("name"): link for link in root.findall("link")}
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     fixed: dict[Any, list[Any]] = {}
     for joint in joints.values():
-        if joint.get("type") not in MOVING:
+        if joint.get("type") not in MOVING or joint.get("name") in held:
             fixed.setdefault(_link(joint, "parent"), []).append(_link(joint, "child"))
     for k, name in enumerate(tree.names):
         joint = joints[name]

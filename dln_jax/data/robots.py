@@ -4,6 +4,7 @@ What is seen or collides is not read: meshes need not be there, unless a body's 
 """
 
 import fnmatch
+import functools
 import importlib
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Mapping, Sequence
@@ -65,19 +66,30 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
     """
     path, root = Path(path), parsed(Path(path))
     try:
-        if root.tag == "mujoco":
-            mujoco, model = compiled(path, root)
-            return _robot(mujoco, model, _matching(hold, _names(model)), None)
-        held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
-        stated = link_inertias(root)
-        mujoco, model = compiled(path, root, held)
+        stated = link_inertias(root) if root.tag == "robot" else None
+        velocities = functools.partial(velocity_limits, root)
+        mujoco, model, held = opened(path, root, hold)
         robot = _robot(mujoco, model, held, stated)
-        return robot._replace(velocity_limits=velocity_limits(root, robot.tree.names))
+        return robot._replace(velocity_limits=velocities(robot.tree.names)) if root.tag == "robot" else robot
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
 
-def _names(model: Any) -> list[str]:
+def opened(
+    path: Path, root: ET.Element, hold: Mapping[str, float] | Sequence[str]
+) -> tuple[Any, Any, dict[str, float]]:
+    """MuJoCo, its model of a file with this outer element, and the positions of joints that are held, by name.
+
+    Of a URDF without shapes and inertias; errors as `read_robot`.
+    """
+    if root.tag == "mujoco":
+        mujoco, model = _compiled(path, root, ())
+        return mujoco, model, _matching(hold, joint_names(model))
+    held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
+    return (*_compiled(path, root, held), held)
+
+
+def joint_names(model: Any) -> list[str]:
     """Of MuJoCo's joints."""
     return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
 
@@ -110,17 +122,13 @@ def parsed(path: Path) -> ET.Element:
     return root
 
 
-def compiled(path: Path, root: ET.Element, held: Collection[str] = ()) -> tuple[Any, Any]:
-    """MuJoCo, and its model of a file with this outer element, without shapes and inertias of a URDF.
-
-    Errors as `read_robot`.
-    """
+def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any, Any]:
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
         raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
     try:
-        return mujoco, _compiled(mujoco, path, root, held)
+        return mujoco, _model(mujoco, path, root, held)
     except InputError:
         raise
     except ValueError as error:
@@ -128,7 +136,7 @@ def compiled(path: Path, root: ET.Element, held: Collection[str] = ()) -> tuple[
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
 
 
-def _compiled(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> Any:
+def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> Any:
     if root.tag == "mujoco":
         return mujoco.MjModel.from_xml_path(str(path))
     for joint in root.iter("joint"):
@@ -163,7 +171,7 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[st
 
 
 def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[str, np.ndarray] | None) -> Robot:
-    names = _names(model)
+    names = joint_names(model)
     _require_tree(mujoco, model, names, held)
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     links: list[_Link] = []

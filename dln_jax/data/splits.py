@@ -27,6 +27,11 @@ def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajector
     return data._replace(**kept)
 
 
+def every(data: Trajectories, step: int) -> Trajectories:
+    """Every so manyth sample."""
+    return data._replace(**{key: getattr(data, key)[::step] for key in PER_SAMPLE if getattr(data, key) is not None})
+
+
 def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
     """Each trajectory cut into so many blocks of time, which are trajectories of their own, "LABEL[0]" and so on.
 

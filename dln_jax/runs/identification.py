@@ -1,27 +1,31 @@
 """Identifying a robot into a run folder: parameters and what is known of them, errors on what is held out, files."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
-import jax
 import numpy as np
-from jax import Array
-from jaxtyping import Float
 
 from dln_jax.command_line.running import command_folder, write_config
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.robot_files import write_robot
 from dln_jax.figures.identification import friction_curves, torque_by_joint
 from dln_jax.files import write_bytes, write_figure, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import normalised_error
-from dln_jax.models.model import Parameters
-from dln_jax.runs.identification_task import Case, Options, prepare
+from dln_jax.runs.identification_additions import (
+    ADDED,
+    Predict,
+    Predictions,
+    add_residual,
+    judge_residual,
+    predictor,
+    residual_lines,
+    shape_lines,
+    store_uncertainty,
+    stored_description,
+)
+from dln_jax.runs.identification_task import Case, Options, prepare, with_shapes
 from dln_jax.runs.results import print_numbers
 from dln_jax.types import InputError
 from dln_jax.zoo.run import save
@@ -40,6 +44,7 @@ def run(given: Options, command: str) -> None:
     with command_folder(given, command) as folder:
         announce(given, case)
         began = time.perf_counter()
+        case = with_shapes(given, case)
         found = identify(
             case.model,
             case.known,
@@ -50,19 +55,26 @@ def run(given: Options, command: str) -> None:
             consistent=given.consistent,
             regularisation=given.regularisation,
         )
+        kept = parameters_of(found.theta, case.known)
+        added = add_residual(case, kept) if given.residual else None
         seconds = time.perf_counter() - began
-        save(folder, case.description, parameters_of(found.theta, case.known))
-        predict = predictor(case)
+        description = stored_description(case, added)
+        save(folder, description, kept if added is None else added.parameters)
+        predict = predictor(case.model)
         metrics, predicted = evaluate(case, found, predict)
+        if added is not None and added.settings:
+            predicted[ADDED] = judge_residual(case, added, metrics)
+        if given.uncertainty:
+            metrics |= store_uncertainty(folder, case, found, added)
         write_json(folder / "metrics.json", {**metrics, "identify_seconds": seconds})
         write_json(folder / "parameters.json", {"base": base_rows(found), "parameters": parameter_rows(found)})
         write_bytes(folder / "report.txt", text(found).encode())
         if given.figures:
             draw(folder, case, found, predict, predicted[KEPT])
         lines = [*findings(found, case.sets.train, case.names), *write_file(folder, given, case, found)]
-        write_config(folder, given, **case.description)
+        write_config(folder, given, **description)
         print_result(case, found, predicted)
-        print(*summary(found), *lines, sep="\n")
+        print(*summary(found), *shape_lines(case), *residual_lines(added), *lines, sep="\n")
         print(f"run folder: {folder} (every parameter: report.txt)")
 
 
@@ -74,30 +86,10 @@ def announce(given: Options, case: Case) -> None:
     print(f"{given.data.name}: {len(train.t)} samples fitted, {len(test.t)} held out ({held})")
     if train.joint_names is None:
         print("the data name no joints: taken to be in this order (key joint_names)")
-    if train.estimated:
-        print(f"not in the data: {', '.join(train.estimated)}; rates are finite differences, which amplify noise")
-
-
-class Predictions(NamedTuple):
-    """Of held-out samples."""
-
-    torque: Float[np.ndarray, "N d"]
-    friction: Float[np.ndarray, "N d"]
-    """Its part."""
-
-
-Predict = Callable[[Parameters, np.ndarray, np.ndarray, np.ndarray], Predictions]
-
-
-def predictor(case: Case) -> Predict:
-    """(parameters, q, qd, qdd [N, d] each) -> torques, and friction among them; compiled once for one N."""
-
-    def one(parameters: Parameters, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
-        motion = dynamics(case.model.energies(parameters))
-        return motion.inverse_dynamics(q, qd, qdd), motion.friction(q, qd)
-
-    every = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
-    return lambda *arguments: Predictions(*map(np.asarray, every(*arguments)))
+    for line in case.said:
+        print(line)
+    if case.held:
+        print(f"held still: {', '.join(case.held)}")
 
 
 def evaluate(
@@ -131,7 +123,7 @@ def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept
     """Writes the figures."""
     test, names, units = case.sets.test, case.names, units_of(case)
     write_figure(folder / "torque.png", torque_by_joint(test, kept.torque, names, units))
-    if case.friction:
+    if case.laws:
         # All joints at once, each through its own range: friction of one does not depend on others.
         rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
         still = np.zeros_like(rates)
@@ -160,7 +152,7 @@ def write_file(folder: Path, given: Options, case: Case, found: Identification) 
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
         remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
     try:
-        write_robot(path, given.robot, tree, **friction, remarks=tuple(remarks))
+        write_robot(path, given.robot, tree, **friction, hold=case.held, remarks=tuple(remarks))
     except InputError as error:
         return [f"no {path.name}: {error}"]
     lacks = " without armature, for which URDF has no place (a comment in it states it)" * (path.suffix == ".urdf")

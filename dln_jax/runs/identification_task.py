@@ -2,33 +2,43 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.arguments import Unstated, choice, names_in, require_positive_if_given
+from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema
+from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import in_blocks, label_indices, require_no_copies, select
+from dln_jax.data.splits import every, in_blocks, label_indices, require_no_copies, select
 from dln_jax.identification.consistent import REGULARISATION
+from dln_jax.learning.friction import fit_friction
+from dln_jax.mechanics.friction import LAWS, FrictionShape, require_laws, shape_of
 from dln_jax.mechanics.trees import tree_to_json
-from dln_jax.models.model import Model, Parameters
-from dln_jax.types import InputError
+from dln_jax.models.model import Parameters
+from dln_jax.models.rigid_tree import USUAL
+from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
 BLOCKS = 10
 """Of one trajectory, where there is no other to be judged by."""
+IDENTIFIED = tuple(law for law in LAWS if law != "load")
+"""Laws that forces are linear in the coefficients of."""
+NO_FRICTION = "none"
+MOST_SAMPLES = 4_000
+"""Of which the shapes of friction are found."""
 HELD_OUT = slice(2, None, 5)
 """Of trajectories or blocks: the third of every five."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Folder, Drawn):
+class Options(Folder, Drawn, Filtered):
     """The robot, the data, and how it is identified."""
 
     robot: Path
@@ -38,10 +48,18 @@ class Options(Folder, Drawn):
     test: Unstated[str] = None
     """Labels of the held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
     blocks of time)."""
-    friction: bool = True
-    """Viscous and dry friction and an offset of each joint are identified, too."""
-    velocity_scale: float = 0.01
-    """rad/s or m/s at which dry friction has three quarters of its force; it is not fitted."""
+    hold: Unstated[str] = None
+    """Joints of the file that do not move, such as those of a gripper, comma separated; "*finger*" names all with
+    finger in their name (default: none)."""
+    friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = ",".join(USUAL)
+    """Laws of friction of each joint, whose coefficients are identified, too (default: viscous,coulomb,offset)."""
+    velocity_scale: Unstated[float] = None
+    """rad/s or m/s at which dry friction has three quarters of its force (default: fitted, one for each joint; so are
+    the other numbers that friction is not linear in)."""
+    uncertainty: bool = True
+    """Say of any state how uncertain its torque is, and whether it is outside the data; held against what is held out."""
+    residual: bool = False
+    """Add a small network for what the rigid robot leaves unexplained, if held-out motions ask for one."""
     noise: Unstated[str] = None
     """Standard deviation of each joint's torque, N m or N, comma separated (default: estimated)."""
     robust: bool = False
@@ -68,40 +86,84 @@ class Case(NamedTuple):
     names: tuple[str, ...]
     sets: Sets
     description: Description
-    model: Model
+    model: Any
     known: Parameters
     """Of the file."""
     noise: np.ndarray | None
     """Where it is stated."""
+    held: tuple[str, ...]
+    """Joints that do not move."""
+    said: tuple[str, ...]
+    """On where rates come from, and what was noticed of the log."""
 
     @property
-    def friction(self) -> bool:
-        """Whether it is identified."""
-        return self.description["needs"]["friction"]
+    def laws(self) -> tuple[FrictionLaw, ...]:
+        """Of the friction that is identified."""
+        return tuple(self.description["needs"]["joint_friction"])
 
 
 def prepare(given: Options) -> Case:
     """Reads and checks everything that the options name, before anything is written."""
-    robot = read_robot(given.robot)
-    d = robot.tree.degrees_of_freedom
+    held = tuple(name.strip() for name in given.hold.split(",")) if given.hold else ()
+    robot = read_robot(given.robot, hold=held)
+    laws = () if given.friction == NO_FRICTION else tuple(names_in("--friction", given.friction, IDENTIFIED))
+    require_laws(laws, "--friction")
+    require_positive_if_given(given, ["velocity_scale"])
     try:
         data = with_joints(schema.load(given.data), robot.tree.names)
     except InputError as error:
         raise InputError(str(error) if str(given.data) in str(error) else f"{given.data}: {error}") from None
-    needs = robot.tree.needs._replace(friction=given.friction)
-    description = describe(
-        "rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), velocity_scale=given.velocity_scale
-    )
+    if "tau" in data.estimated:
+        raise InputError(f"{given.data}: the data have no tau; identification takes measured torques")
+    found = smoothed(given, data)
+    said = (*preparation(data, found), *checked(data))
+    labels = [label.strip() for label in given.test.split(",")] if given.test else None
+    if found is not None:
+        labels = labels and labels_of_parts(found.data, labels)
+        data = found.data._replace(joint_names=data.joint_names)
+    needs = robot.tree.needs._replace(joint_friction=cast(tuple[FrictionLaw, ...], laws))
+    scale = {} if given.velocity_scale is None else {"velocity_scale": given.velocity_scale}
+    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
+    noise = noises(given.noise, robot.tree.degrees_of_freedom)
+    sets = split(data, labels)
+    return with_description(Case(robot, robot.tree.names, sets, description, None, None, noise, held, said))
+
+
+def with_description(case: Case, **changes: Any) -> Case:
+    """The case with other keywords of its model, which is built anew."""
+    description = {**case.description, **changes}
     model = build(description)
     known = model.init(jax.random.key(0))
-    stated = {"viscous": robot.damping, "coulomb": robot.coulomb}
+    stated = {"viscous": case.robot.damping, "coulomb": case.robot.coulomb}
     known = known._replace(
         **{name: jnp.asarray(values) for name, values in stated.items() if getattr(known, name) is not None}
     )
-    return Case(robot, robot.tree.names, split(data, given.test), description, model, known, noises(given.noise, d))
+    return case._replace(description=description, model=model, known=known)
 
 
-def split(data: Trajectories, test: str | None) -> Sets:
+def with_shapes(given: Options, case: Case) -> Case:
+    """The case with friction curves whose shapes the training data show, and as it is where none is to be found."""
+    held = () if given.velocity_scale is None else ("velocity_scale",)
+    if not set(shape_of(case.laws)) - set(held):
+        return case
+    thin = -(-len(case.sets.train.t) // MOST_SAMPLES)
+    start = FrictionShape(**({} if given.velocity_scale is None else {"velocity_scale": given.velocity_scale}))
+    fitted = fit_friction(
+        case.robot.tree, every(case.sets.train, thin), case.laws, shape=start, held=held, noise=case.noise
+    )
+    return with_description(case, **{name: values.tolist() for name, values in fitted.shape.items()})
+
+
+def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
+    """What a residual is fitted to, and every fourth trajectory or block, by which its size is chosen."""
+    present = np.unique(train.trajectory)
+    chosen = present[1::4]
+    if not len(chosen):
+        raise InputError("--residual takes two trajectories or blocks to fit at least; record more motions")
+    return select(train, np.setdiff1d(present, chosen)), select(train, chosen)
+
+
+def split(data: Trajectories, test: list[str] | None) -> Sets:
     """Held-out trajectories, or blocks of time where there is one trajectory only."""
     if len(np.unique(data.trajectory)) == 1:
         if test is not None:
@@ -110,7 +172,7 @@ def split(data: Trajectories, test: str | None) -> Sets:
     present = np.unique(data.trajectory)
     held = present[HELD_OUT] if len(present) > 2 else present[-1:]
     if test is not None:
-        held = label_indices(data, [label.strip() for label in test.split(",")])
+        held = label_indices(data, test)
     rest = np.setdiff1d(present, held)
     if not len(rest) or not len(np.intersect1d(held, present)):
         raise InputError("--test leaves no trajectory to fit, or none to judge by; name fewer, or others")

@@ -13,6 +13,7 @@ import numpy as np
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.data.splits import every
 from dln_jax.identification import identify, parameters_of
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.equations import dynamics
@@ -30,7 +31,7 @@ USUAL_SCALE = 0.01
 """rad/s, of the rival's dry friction, which it does not fit."""
 DECIMATE = 3
 CLEAN, SEEN = 1e-12, 1.65e-3
-"""nMSE to reach: of clean data with viscous friction, and of noisy ones with dry friction, which a regressor reached."""
+"""nMSE to reach: clean data, viscous friction; noisy ones with dry friction, which a regressor reached."""
 TRACKING = 1.1
 """Times the error with true parameters."""
 
@@ -162,12 +163,6 @@ def curves_of(by_method: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
 def logs(robot: Any, random: np.random.Generator, count: int) -> Trajectories:
     """Drawn motions that the arm follows under PD control, free of noise."""
     return trajectories([follow(robot, motion(random)) for _ in range(count)])
-
-
-def every(data: Trajectories, step: int) -> Trajectories:
-    """Every so manyth sample of exact data."""
-    kept = {key: getattr(data, key)[::step] for key in ("t", "q", "qd", "qdd", "tau", "trajectory")}
-    return data._replace(**kept)
 
 
 def error(torque: Torque, test: Trajectories) -> np.ndarray:
