@@ -7,8 +7,8 @@
 4. Ends are trimmed, where a filter knows one side only, and every k-th sample is kept.
 
 Torques are left as they are by default: least squares average their noise away, while filtered torques of a model with
-dry friction belong to no state, see `filters`. On a simulated seven-axis arm filtered torques cost a factor of 1.1 at
-10 Hz and of 1.9 at 4 Hz (docs/encoder-data.md).
+dry friction belong to no state, see `filters`: on a simulated seven-axis arm they cost a factor of 1.6
+(`studies.encoder_data`).
 """
 
 from collections.abc import Sequence
