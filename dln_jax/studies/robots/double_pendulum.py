@@ -77,8 +77,8 @@ def ten_parameters() -> Model:
 def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
     """Torque errors and valid prediction times of each way on recordings held out: median and worst of the splits.
 
-    The bounds of the others are the least squares' numbers. `torque_nmse` is that of torques which filtered motions take,
-    `torque_nmse_low_passed` that of torques of less filtered motions, low-passed beside the measured ones.
+    The bounds of the others are the least squares' numbers. `torque_nmse` is that of torques which filtered motions
+    take, `torque_nmse_low_passed` that of torques of less filtered motions, low-passed beside the measured ones.
     """
     logs = read(path)
     found = [split_numbers(logs, labels) for labels in held_out]
