@@ -29,6 +29,7 @@ MODELS = {
     "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
     "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
+    "learned-tree": {"needs": SWING, "velocity_scale": 0.1},
     "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
     "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},
