@@ -1,4 +1,4 @@
-"""What identification adds to a rigid robot: a network for what it leaves unexplained, and how uncertain torques are."""
+"""What identification adds to a rigid robot: a network for what that leaves unexplained, and how sure torques are."""
 
 from collections.abc import Callable
 from pathlib import Path

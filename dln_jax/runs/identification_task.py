@@ -57,7 +57,7 @@ class Options(Folder, Drawn, Filtered):
     """rad/s or m/s at which dry friction has three quarters of its force (default: fitted, one for each joint; so are
     the other numbers that friction is not linear in)."""
     uncertainty: bool = True
-    """Say of any state how uncertain its torque is, and whether it is outside the data; held against what is held out."""
+    """Say of any state how uncertain its torque is, and whether it is outside the data."""
     residual: bool = False
     """Add a small network for what the rigid robot leaves unexplained, if held-out motions ask for one."""
     noise: Unstated[str] = None

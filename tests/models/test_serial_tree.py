@@ -17,12 +17,19 @@ NEEDS = Needs(joints=KINDS, friction=True)
 def test_forces_and_accelerations_agree_and_friction_acts():
     model = make_serial_tree(NEEDS)
     parameters = model.init(jax.random.key(0))._replace(viscous=jnp.array([0.1, 0.2, 0.3]))
-    functions = dynamics(model.energies(parameters))
-    q, qd, qdd = np.random.default_rng(0).normal(size=(3, 3))
-    tau = functions.inverse_dynamics(q, qd, qdd)
-    np.testing.assert_allclose(functions.forward_dynamics(q, qd, tau), qdd, atol=1e-9)
+    q, qd, qdd = map(jnp.asarray, np.random.default_rng(0).normal(size=(3, 3)))
+    tau = jax.jit(dynamics(model.energies(parameters)).inverse_dynamics)(q, qd, qdd)
+    found = jax.jit(dynamics(model.energies(parameters)).forward_dynamics)(q, qd, tau)
+    np.testing.assert_allclose(found, qdd, atol=1e-9)
     without = dynamics(make_serial_tree(NEEDS._replace(friction=False)).energies(parameters))
-    np.testing.assert_allclose(tau - without.inverse_dynamics(q, qd, qdd), parameters.viscous * qd, atol=1e-12)
+    difference = tau - jax.jit(without.inverse_dynamics)(q, qd, qdd)
+    np.testing.assert_allclose(difference, parameters.viscous * qd, atol=1e-12)
+
+
+@jax.jit
+def torque(parameters):
+    q, qd, qdd = map(jnp.asarray, np.random.default_rng(2).normal(size=(3, 3)))
+    return dynamics(make_serial_tree(NEEDS).energies(parameters)).inverse_dynamics(q, qd, qdd)
 
 
 @pytest.mark.parametrize("link", range(3))
@@ -42,11 +49,9 @@ def test_a_links_frame_may_turn_about_and_slide_along_its_axis(link, slide):
         rotations[link + 1] = back @ rotations[link + 1]
         positions[link + 1] = back @ (positions[link + 1] - shift)
     turns = np.array([rotation_vector(each) for each in rotations])
-    other = parameters._replace(turns=jnp.asarray(turns), positions=jnp.asarray(positions), inertias=inertias)
-    state = np.random.default_rng(2).normal(size=(3, 3))
-    expected = dynamics(model.energies(parameters)).inverse_dynamics(*state)
-    found = dynamics(model.energies(other._replace(inertias=jnp.asarray(inertias)))).inverse_dynamics(*state)
-    np.testing.assert_allclose(found, expected, atol=1e-11)
+    changed = {"turns": turns, "positions": positions, "inertias": inertias}
+    other = parameters._replace(**{name: jnp.asarray(each) for name, each in changed.items()})
+    np.testing.assert_allclose(torque(other), torque(parameters), atol=1e-11)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 2.0, 3.0, np.pi])

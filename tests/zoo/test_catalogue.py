@@ -39,6 +39,7 @@ MODELS = {
         **{"terms": ["potential", "dissipation", "inertia"], **SMALL, "torque_scale": 0.5},
     },
     "planar-chain": {"needs": SWING, "symmetric": False, "velocity_scale": 0.1},
+    "learned-tree": {"needs": SWING, "velocity_scale": 0.1},
     "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
     "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},
