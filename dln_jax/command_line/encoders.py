@@ -1,5 +1,6 @@
 """Options of commands that read logs, and what is said of a log before it is learned from."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,9 +66,14 @@ def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
     return lines
 
 
-def checked(data: Trajectories) -> list[str]:
-    """What the quick part of `check_data` finds, a line each; none where nothing is found."""
-    lines = [finding.line for finding in quick(data)]
+def checked(data: Trajectories, *, without: Collection[str] = ()) -> list[str]:
+    """What the quick part of `check_data` finds, a line each; none where nothing is found.
+
+    Args:
+        data: as they are in the file.
+        without: names of checks that say nothing to this command.
+    """
+    lines = [finding.line for finding in quick(data) if finding.check not in without]
     return [*lines, "python -m scripts.check_data --data FILE says more"] if lines else []
 
 

@@ -67,10 +67,12 @@ def test_a_run_folder_like_every_other(identified):
     assert names == {
         *(".lock", "config.json", "metrics.json", "model.json", "model.safetensors", "parameters.json", "report.txt"),
         *("torque.png", "friction.png", "arm_identified.urdf"),
+        *("uncertainty.json", "uncertainty.safetensors", "uncertainty.png"),
     }
     metrics = json.loads((identified / "metrics.json").read_text())
     assert all(isinstance(value, int | float) for value in metrics.values())
     assert metrics["nmse"] < 1.1 * metrics["least_squares_nmse"] + 1e-4 < metrics["file_nmse"]
+    assert metrics["coverage_95_share"] > 0.85
     assert metrics["noise_joint_1"] == pytest.approx(0.05, rel=0.15)
     assert json.loads((identified / "config.json").read_text())["consistent"] is True
     stored = json.loads((identified / "parameters.json").read_text())

@@ -45,7 +45,7 @@ def _friction(data: Trajectories, found: Surrogate, sure: np.ndarray) -> list[Fi
         return []
     sizes = ", ".join(f"{found.coulomb[joint]:.2g}" for joint in rubbing)
     said = f"friction is seen at {named(rubbing)} (dry: about {sizes})"
-    remedy = 'state it: --needs \'{"joints": [...], "friction": true}\''
+    remedy = 'state it: --needs \'{"joints": [...], "joint_friction": ["viscous", "coulomb"]}\''
     return [Finding("note", "friction", said, remedy, tuple(map(int, rubbing)))]
 
 
