@@ -152,7 +152,7 @@ def test_trajectories_are_held_out_whole():
     data = schema.from_arrays({**arrays, "t": np.tile(np.arange(10.0), 6), "trajectory": np.repeat(np.arange(6), 10)})
     sets = split(data, None)
     assert sorted(set(sets.test.trajectory)) == [2] and not sets.blocks
-    assert sorted(set(split(data, "0, 5").test.trajectory)) == [0, 5]
+    assert sorted(set(split(data, ["0", "5"]).test.trajectory)) == [0, 5]
     one = schema.from_arrays(
         {**{key: x[:50] for key, x in arrays.items()}, "t": np.arange(50.0), "trajectory": np.zeros(50)}
     )
