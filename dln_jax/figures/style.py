@@ -41,7 +41,7 @@ MODELS: dict[str, tuple[str, str]] = {
     **dict.fromkeys((TRUTH, "plant"), ("black", ".")),
     "published": (REFERENCE, "x"),
 }
-"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, direct ones purple."""
+"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""
 UNKNOWN = ("#555555", "h")
 
 
