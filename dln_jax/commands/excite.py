@@ -74,7 +74,7 @@ class Arguments(Folder, Drawn):
     height: Unstated[float] = None
     """Of a plane, m, above which the origin of every link that moves stays (default: no plane)."""
     payload: Unstated[float] = None
-    """Mass fixed to the last link, kg (default: none)."""
+    """Mass fixed to the last link, kg (default: 0)."""
     payload_position: str = "0,0,0"
     """Of its centre in the frame of the last joint, m."""
     seed: int = 0

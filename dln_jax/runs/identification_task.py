@@ -52,7 +52,7 @@ class Options(Folder, Drawn, Filtered):
     blocks of time)."""
     hold: Unstated[str] = None
     """Joints of the file that do not move, such as those of a gripper, comma separated; "*finger*" names all with
-    finger in their name (default: none)."""
+    finger in their name (default: all joints move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = ",".join(USUAL)
     """Laws of friction of each joint, whose coefficients are identified, too (default: viscous,coulomb,offset)."""
     velocity_scale: Unstated[float] = None

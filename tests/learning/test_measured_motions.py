@@ -126,12 +126,9 @@ def test_momenta_of_the_model_beat_velocities_in_their_place(passive):
     data, noise = passive
     model, parameters = as_velocities(data, noise)
     before = predicted_for(model, parameters, data, momenta=True)["vpt_seconds"]
-    for better in (
-        make_trigonometric(NEEDS, degree=1),
-        make_structured_hamiltonian(NEEDS, width=8, depth=1, dtype=jnp.float64),
-    ):
-        _, training = trained(better, data, noise, 20)
-        assert predicted_for(better, training.parameters, data)["vpt_seconds"] > 1.5 * before
+    better = make_trigonometric(NEEDS, degree=1)
+    _, training = trained(better, data, noise, 20)
+    assert predicted_for(better, training.parameters, data)["vpt_seconds"] > 1.5 * before
 
 
 def test_torques_tell_the_scale():
@@ -140,7 +137,7 @@ def test_torques_tell_the_scale():
     task = measured_motions.problem(
         CHAIN, far, windows_of(select(data, range(5))), windows_of(select(data, [5])), noise=Noise(NOISE, tau=0.01)
     )
-    found = fit(task, GaussNewton(6, steps_per_dispatch=3)).parameters
+    found = fit(task, GaussNewton(30)).parameters
     np.testing.assert_allclose(found.moments, TRUE.moments, rtol=0.03)
     np.testing.assert_allclose(found.weight, TRUE.weight, rtol=0.03)
 
@@ -154,11 +151,10 @@ def test_mistakes_are_named(passive):
         ({"gauge": Gauge((0.0, 0.0), -1.0)}, "gauge_mass is -1"),
         ({"noise": Noise(0.0)}, "noise_q is 0"),
         ({"substeps": 0}, "substeps is 0"),
-        ({"torque": "guessed"}, "torque is 'guessed'"),
     ]
     for changed, message in refused:
         known = {"noise": Noise(NOISE), "gauge": GAUGE} | changed
-        with pytest.raises((InputError, Exception), match=message):
+        with pytest.raises(InputError, match=message):
             task = measured_motions.problem(CHAIN, start, windows, windows, **known)
             task.residual(start, *(array[0] for array in task.arrays))
     with pytest.raises(InputError, match="has 200 samples to predict"):
