@@ -37,7 +37,7 @@ MODELS = {
         **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
     },
     "planar-chain": {"needs": FREE._replace(gravity=True, friction=True), "armature": True},
-    "learned-tree": {"needs": MIXED},
+    "learned-tree": {"needs": MIXED._replace(actuation=None)},
     "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
     "structured-hnn": {"needs": MIXED, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": MIXED, **CONVEX},
