@@ -41,6 +41,10 @@ CholeskyFactor = Callable[[Array], Array]
 """q -> lower triangular L [d, d] with M(q) = L Lᵀ."""
 
 JointKind = Literal["revolute", "prismatic"]
+FrictionLaw = Literal["viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load"]
+"""Laws of friction in a joint; `mechanics.friction` has their formulas."""
+ResidualTerm = Literal["potential", "dissipation", "inertia"]
+"""Energies that a residual may have; `mechanics.residual` says what each explains."""
 
 
 class InputError(ValueError):
@@ -92,6 +96,13 @@ class Needs(NamedTuple):
     """Whether there is a Rayleigh dissipation function D(q, qd)."""
     actuation: tuple[tuple[float, ...], ...] | None = None
     """Rows of the matrix B [d, u] in tau = B control; `None` when each coordinate has its own motor."""
+    joint_friction: tuple[FrictionLaw, ...] = ()
+    """Laws of the friction that acts in every joint; `friction` is a dissipation of another form, learned."""
+    joint_map: tuple[tuple[float, ...], ...] | None = None
+    """Rows of the matrix J [d, d] in joint rates = J qd, where coordinates are not those of the joints, such as angles
+    from the vertical; `None` where they are."""
+    velocity_scale: float = 0.01
+    """v of the joints' dry friction, which is smooth below, in rad/s or m/s."""
 
     @property
     def degrees_of_freedom(self) -> int:

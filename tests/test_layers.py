@@ -25,6 +25,8 @@ FLOORS = {
     "learning": 5,
     "metrics": 6,
     "deploy": 6,
+    "excitation": 6,
+    "identification": 6,
     "figures": 7,
     "locomotion": 8,
     "command_line": 8,

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import math
 import re
 from collections.abc import Iterable, Mapping
 from types import NoneType
@@ -108,3 +109,15 @@ def _complaint(box: str) -> str:
     sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
     section = sections[0] if framed else sections[min(1, len(sections) - 1)]
     return " ".join(section.split()).rstrip(".")
+
+
+def positive_numbers(option: str, text: str) -> tuple[float, ...]:
+    """The numbers of an option that takes several, separated by commas; `InputError` unless positive and finite."""
+    try:
+        numbers = tuple(float(each) for each in text.split(","))
+    except ValueError:
+        raise InputError(f"{option} is {text!r:.60}; expected numbers, separated by commas") from None
+    for number in numbers:
+        if not 0 < number < math.inf:
+            raise InputError(f"{option} has {number}; expected positive, finite numbers")
+    return numbers

@@ -3,14 +3,18 @@
 What is seen or collides is not read: meshes need not be there, unless a body's mass comes from its shapes alone.
 """
 
+import fnmatch
+import functools
 import importlib
 import xml.etree.ElementTree as ET
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.data.urdf import link_inertias, velocity_limits, without_inertias
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -33,6 +37,8 @@ class Robot(NamedTuple):
     """rad or m."""
     force_limits: Float[np.ndarray, "d 2"]
     """N m or N, of the motors."""
+    velocity_limits: Any = np.inf
+    """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
 
 
 class _Link(NamedTuple):
@@ -43,67 +49,134 @@ class _Link(NamedTuple):
     axis: np.ndarray
 
 
-def read_robot(path: str | Path) -> Robot:
+def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = ()) -> Robot:
     """The robot of a URDF or MJCF file.
 
+    Inertias of a URDF are taken as they are stated, also those that no body could have.
+
+    Args:
+        path: of the file.
+        hold: joints that do not move, such as those of a gripper: names, where they are at zero, or positions by name,
+            rad or m. "*finger*" names all that have finger in their name. What hangs on them is fixed.
+
     Raises:
-        InputError: MuJoCo is missing; the file is not there, broken or cyclic; a joint is of another kind than
-            revolute, continuous or prismatic, or follows another; nothing moves; or a link that moves has no mass.
+        InputError: MuJoCo is missing; the file is not there, broken or cyclic; a joint that is not held is of another
+            kind than revolute, continuous or prismatic, or follows another; one that is held is not there; nothing
+            moves; or a link that moves has no mass.
     """
+    path, root = Path(path), parsed(Path(path))
     try:
-        mujoco: Any = importlib.import_module("mujoco")
-    except ImportError:
-        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
-    path = Path(path)
+        stated = link_inertias(root) if root.tag == "robot" else None
+        velocities = functools.partial(velocity_limits, root)
+        mujoco, model, held = opened(path, root, hold)
+        robot = _robot(mujoco, model, held, stated)
+        return robot._replace(velocity_limits=velocities(robot.tree.names)) if root.tag == "robot" else robot
+    except InputError as error:
+        raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+
+
+def opened(
+    path: Path, root: ET.Element, hold: Mapping[str, float] | Sequence[str]
+) -> tuple[Any, Any, dict[str, float]]:
+    """MuJoCo, its model of a file with this outer element, and the positions of joints that are held, by name.
+
+    Of a URDF without shapes and inertias; errors as `read_robot`.
+    """
+    if root.tag == "mujoco":
+        mujoco, model = _compiled(path, root, ())
+        return mujoco, model, _matching(hold, joint_names(model))
+    held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
+    return (*_compiled(path, root, held), held)
+
+
+def joint_names(model: Any) -> list[str]:
+    """Of MuJoCo's joints."""
+    return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
+
+
+def _matching(hold: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
+    """Positions of the joints that are held, by their whole names."""
+    positions = hold if isinstance(hold, Mapping) else dict.fromkeys(hold, 0.0)
+    found: dict[str, float] = {}
+    for pattern, position in positions.items():
+        matching = fnmatch.filter(names, pattern)
+        if not matching:
+            raise InputError(f"there is no joint '{pattern}' to hold; it has {', '.join(names)}")
+        found |= dict.fromkeys(matching, float(position))
+    return found
+
+
+def parsed(path: Path) -> ET.Element:
+    """The outer element of a URDF or MJCF file, comments included; errors as `read_robot`."""
     if not path.is_file() or path.stat().st_size > LARGEST:
         raise InputError(f"{path}: no file of up to {LARGEST >> 20} MiB; give one of a robot, URDF or MJCF")
     content = path.read_bytes()
     if b"<!ENTITY" in content:
         raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
     try:
-        root = ET.fromstring(content)
+        root = ET.fromstring(content, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     except ET.ParseError as error:
         raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    return root
+
+
+def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any, Any]:
     try:
-        model = _compiled(mujoco, path, root)
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError:
+        raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
+    try:
+        return mujoco, _model(mujoco, path, root, held)
+    except InputError:
+        raise
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
-    try:
-        return _robot(mujoco, model)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
-def _compiled(mujoco: Any, path: Path, root: ET.Element) -> Any:
-    if root.tag == "robot":
-        for joint in root.iter("joint"):
-            if joint.find("mimic") is not None:
+def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> Any:
+    if root.tag == "mujoco":
+        return mujoco.MjModel.from_xml_path(str(path))
+    for joint in root.iter("joint"):
+        for mimic in joint.findall("mimic"):
+            if joint.get("name") not in held:
                 raise InputError(
-                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely"
+                    f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
+                    "hold it, and the one that it follows"
                 )
-        for link in root.iter("link"):
-            for shape in [*link.findall("visual"), *link.findall("collision")]:
-                link.remove(shape)
-        return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-    return mujoco.MjModel.from_xml_path(str(path))
+            joint.remove(mimic)
+    return mujoco.MjModel.from_xml_string(ET.tostring(without_inertias(root), encoding="unicode"))
 
 
-def _robot(mujoco: Any, model: Any) -> Robot:
-    names = [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
-    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
+def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[str]) -> None:
+    """Raises `InputError` unless joints that are not held move freely, about or along one axis each."""
     others = {int(mujoco.mjtJoint.mjJNT_BALL): "a ball", int(mujoco.mjtJoint.mjJNT_FREE): "free"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
-        if kind in others:
-            raise InputError(f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints")
-    if model.neq or model.ntendon:
-        raise InputError("it has equality constraints or tendons, which close loops; expected a tree")
-    if not 0 < model.njnt <= MOST_JOINTS:
-        raise InputError(f"it has {model.njnt} joints; expected 1 to {MOST_JOINTS} that move")
+        if kind in others and name not in held:
+            raise InputError(
+                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: hold it, if so"
+            )
+    moving = {k for k, name in enumerate(names) if name not in held}
+    # Equal joints, and tendons over joints, tie nothing where all of those are held.
+    joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
+    tied = {int(k) for each in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in each}
+    if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
+        raise InputError(
+            "it has equality constraints or tendons, which close loops; expected a tree: hold the joints that they tie"
+        )
+    if not 0 < len(moving) <= MOST_JOINTS:
+        raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")
+
+
+def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[str, np.ndarray] | None) -> Robot:
+    names = joint_names(model)
+    _require_tree(mujoco, model, names, held)
+    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     links: list[_Link] = []
     inertias: list[np.ndarray] = []
+    moving: list[int] = []
     # Frame of each body in that of the link that it moves with, -1 for the ground.
     carried: list[tuple[int, np.ndarray, np.ndarray]] = [(-1, np.eye(3), np.zeros(3))]
     for body in range(1, model.nbody):
@@ -114,28 +187,52 @@ def _robot(mujoco: Any, model: Any) -> Robot:
             # The link's frame is at the joint; the body's is behind it.
             anchor = model.jnt_pos[joint]
             axis = np.array(model.jnt_axis[joint])
+            if names[joint] in held:
+                R, p = _held(mujoco, kinds.get(int(model.jnt_type[joint])), anchor, axis, held[names[joint]], R, p)
+                continue
+            moving.append(joint)
             links.append(_Link(parent, kinds[int(model.jnt_type[joint])], R, p + R @ anchor, axis))
             inertias.append(np.zeros(10))
             parent = len(links) - 1
             R, p = np.eye(3), -anchor
         carried.append((parent, R, p))
-        if parent >= 0 and model.body_mass[body] > 0:
-            turn = _matrix(mujoco, model.body_iquat[body])
-            about = turn @ np.diag(model.body_inertia[body]) @ turn.T
-            theta = inertial_parameters(model.body_mass[body], model.body_ipos[body], about)
+        theta = _body(mujoco, model, body) if stated is None else stated.get(model.body(body).name, np.zeros(10))
+        if parent >= 0 and theta.any():
             inertias[parent] = inertias[parent] + moved(theta, R, p)
+    names = [names[joint] for joint in moving]
     for link, name in enumerate(names):
         if not _moves_mass(links, inertias, link):
             raise InputError(f"joint '{name}' moves no mass; expected an <inertial> for the link behind it")
     parents, joints, rotations, positions, axes = zip(*links, strict=True)
     tree = make_tree(
         parents, joints, rotations, positions, axes, inertias,
-        armature=np.asarray(model.dof_armature), gravity=np.asarray(model.opt.gravity), names=names,
+        armature=model.dof_armature[model.jnt_dofadr[moving]], gravity=np.asarray(model.opt.gravity), names=names,
     )  # fmt: skip
-    inside = np.array([-np.inf, np.inf])
-    ranges = np.where(np.asarray(model.jnt_limited, bool)[:, None], model.jnt_range, inside)
-    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[:, None], model.jnt_actfrcrange, inside)
-    return Robot(tree, np.array(model.dof_damping), np.array(model.dof_frictionloss), ranges, forces)
+    inside, dofs = np.array([-np.inf, np.inf]), model.jnt_dofadr[moving]
+    ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], inside)
+    forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], inside)
+    return Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+
+
+def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
+    """The inertial parameters of a body of MuJoCo's in its frame."""
+    turn = _matrix(mujoco, model.body_iquat[body])
+    about = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    return np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
+
+
+def _held(
+    mujoco: Any, kind: str | None, anchor: np.ndarray, axis: np.ndarray, position: float, R: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The frame of a body behind a joint that is held, as that of one fixed."""
+    if kind == "prismatic":
+        return R, p + R @ axis * position
+    if kind is None or position == 0:
+        return R, p
+    quaternion = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quaternion, axis, position)
+    turn = _matrix(mujoco, quaternion)
+    return R @ turn, p + R @ (anchor - turn @ anchor)
 
 
 def _moves_mass(links: list[_Link], inertias: list[np.ndarray], link: int) -> bool:

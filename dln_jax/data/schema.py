@@ -11,6 +11,7 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
 | `trajectory` | [N] int | | index of the trajectory that a sample belongs to; any number >= 0 without `label` |
 | `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
+| `joint_names` | [d] str | | optional, the joint of each column |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
@@ -24,12 +25,13 @@ import numpy as np
 from dln_jax.data import archive
 from dln_jax.data.archive import numeric
 from dln_jax.files import is_file, matches, writing
+from dln_jax.mechanics.friction import require_laws
 from dln_jax.types import InputError, JointKind, Needs
 
 JOINTS = get_args(JointKind)
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
-KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "needs")
+KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "joint_names", "needs")
 LARGEST_INDEX = 2**53
 """Up to which float64 tells whole numbers apart."""
 
@@ -50,6 +52,7 @@ class Trajectories(NamedTuple):
     tau_coriolis: np.ndarray | None = None
     tau_gravity: np.ndarray | None = None
     needs: Needs | None = None
+    joint_names: np.ndarray | None = None
     estimated: tuple[str, ...] = ()
     """Keys that were absent: rates estimated by finite differences, torques taken as zero."""
 
@@ -111,7 +114,10 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
         raise InputError(
             f"needs states {needs.degrees_of_freedom} joints, but q has {q.shape[1]} columns; make them agree"
         )
-    return Trajectories(t=t, trajectory=trajectory, label=label, needs=needs, estimated=tuple(estimated), **checked)
+    names = _joint_names(arrays["joint_names"], q.shape[1]) if "joint_names" in arrays else None
+    return Trajectories(
+        t=t, trajectory=trajectory, label=label, needs=needs, joint_names=names, estimated=tuple(estimated), **checked
+    )
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
@@ -168,17 +174,43 @@ def needs_from_json(stated: Any) -> Needs:
     for key in ("gravity", "friction"):
         if not isinstance(stated.get(key, False), bool):
             raise InputError(f"needs: {key} is {reprlib.repr(stated[key])}; expected true or false")
-    actuation = stated.get("actuation")
-    if actuation is not None:
-        rows = actuation if isinstance(actuation, list | tuple) else ()
-        lengths = {len(row) if isinstance(row, list | tuple) else 0 for row in rows}
-        if len(rows) != len(joints) or len(lengths) != 1 or not all(lengths):
-            shape = f"[{len(joints)}, u] with u >= 1, rows of one length"
-            raise InputError(f"needs: actuation is {reprlib.repr(actuation)}; expected {shape}, or null")
-        if not all(matches(entry, float) for row in rows for entry in row):
-            raise InputError(f"needs: actuation is {reprlib.repr(actuation)}; expected finite numbers")
-        actuation = tuple(tuple(float(entry) for entry in row) for row in rows)
-    return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation})
+    actuation = _rows("actuation", stated.get("actuation"), len(joints))
+    joint_map = _rows("joint_map", stated.get("joint_map"), len(joints))
+    if joint_map is not None and (len(joint_map[0]) != len(joints) or np.linalg.matrix_rank(joint_map) < len(joints)):
+        square = f"[{len(joints)}, {len(joints)}] that can be inverted"
+        raise InputError(
+            f"needs: joint_map is {reprlib.repr(stated['joint_map'])}; expected a matrix {square}, or null"
+        )
+    laws = stated.get("joint_friction", [])
+    if not isinstance(laws, list | tuple):
+        raise InputError(f"needs: joint_friction is {reprlib.repr(laws)}; expected a list of laws such as 'viscous'")
+    require_laws(laws, "needs: joint_friction")
+    velocity = stated.get("velocity_scale", Needs._field_defaults["velocity_scale"])
+    if not (matches(velocity, float) and velocity > 0):
+        raise InputError(f"needs: velocity_scale is {reprlib.repr(velocity)}; expected a positive number, rad/s or m/s")
+    friction = {"joint_friction": tuple(laws), "joint_map": joint_map, "velocity_scale": float(velocity)}
+    return Needs(**{**stated, "joints": tuple(joints), "actuation": actuation, **friction})
+
+
+def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
+    """A matrix with a row for each joint."""
+    if stated is None:
+        return None
+    rows = stated if isinstance(stated, list | tuple) else ()
+    lengths = {len(row) if isinstance(row, list | tuple) else 0 for row in rows}
+    if len(rows) != joints or len(lengths) != 1 or not all(lengths):
+        shape = f"[{joints}, u] with u >= 1, rows of one length"
+        raise InputError(f"needs: {key} is {reprlib.repr(stated)}; expected {shape}, or null")
+    if not all(matches(entry, float) for row in rows for entry in row):
+        raise InputError(f"needs: {key} is {reprlib.repr(stated)}; expected finite numbers")
+    return tuple(tuple(float(entry) for entry in row) for row in rows)
+
+
+def _joint_names(given: Any, d: int) -> np.ndarray:
+    names = np.asarray(given)
+    if names.dtype.kind not in "US" or names.shape != (d,) or len(set(names.tolist())) < d:
+        raise InputError(f"joint_names has type {names.dtype} and shape {names.shape}; expected {d} different strings")
+    return names.astype(str)
 
 
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:

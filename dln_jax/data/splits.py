@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.types import InputError, require_seed
+from dln_jax.types import InputError, require_positive, require_seed
 
 PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 
@@ -25,6 +25,31 @@ def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajector
     samples = np.isin(data.trajectory, indices)
     kept = {key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None}
     return data._replace(**kept)
+
+
+def every(data: Trajectories, step: int) -> Trajectories:
+    """Every so manyth sample."""
+    return data._replace(**{key: getattr(data, key)[::step] for key in PER_SAMPLE if getattr(data, key) is not None})
+
+
+def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
+    """Each trajectory cut into so many blocks of time, which are trajectories of their own, "LABEL[0]" and so on.
+
+    Rates that were estimated stay as they are. Neighbouring blocks are nearly alike at their common end.
+
+    Raises:
+        InputError: a trajectory with fewer samples than blocks.
+    """
+    require_positive(blocks=blocks)
+    numbers, labels = np.empty_like(data.trajectory), []
+    for index in np.unique(data.trajectory):
+        samples = np.flatnonzero(data.trajectory == index)
+        if len(samples) < blocks:
+            raise InputError(f"trajectory '{data.label[index]}' has {len(samples)} samples; expected at least {blocks}")
+        for block, part in enumerate(np.array_split(samples, blocks)):
+            numbers[part] = len(labels)
+            labels.append(f"{data.label[index]}[{block}]")
+    return data._replace(trajectory=numbers, label=np.array(labels))
 
 
 def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:

@@ -3,11 +3,13 @@
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time
 from dln_jax.figures.dynamics import force_decomposition, tip_paths
+from dln_jax.figures.friction import friction_curves, friction_laws
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
 from dln_jax.figures.phase_space import injection_figure, motion_figure
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.figures.training import training_curve
+from dln_jax.figures.uncertainty import torque_bands
 
 __all__ = [
     "Moments",
@@ -19,6 +21,8 @@ __all__ = [
     "ensemble",
     "error_against_time",
     "force_decomposition",
+    "friction_curves",
+    "friction_laws",
     "function_curves",
     "heat_maps",
     "injection_figure",
@@ -28,6 +32,7 @@ __all__ = [
     "soft_body_frame",
     "surfaces",
     "tip_paths",
+    "torque_bands",
     "training_curve",
     "write_frame_gif",
     "write_motion_gif",

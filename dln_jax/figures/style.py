@@ -31,6 +31,7 @@ MODELS: dict[str, tuple[str, str]] = {
     "structured-hnn": (VERMILLION, "^"),
     "black-box-hnn": (ORANGE, "v"),
     "trigonometric": (GREEN, "D"),
+    "learned-tree": ("#117733", "d"),
     "feed-forward": (PURPLE, "X"),
     "separable-hnn": ("#B2182B", "^"),
     "pairwise-hnn": ("#882255", "P"),
@@ -40,7 +41,7 @@ MODELS: dict[str, tuple[str, str]] = {
     **dict.fromkeys((TRUTH, "plant"), ("black", ".")),
     "published": (REFERENCE, "x"),
 }
-"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models green, direct networks purple."""
+"""Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""
 UNKNOWN = ("#555555", "h")
 
 

@@ -2,14 +2,25 @@
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `rates`, `motions`, `frames` and `functions` build problems; what is linear in its parameters needs no loop.
+`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems; what is
+linear in its parameters needs no loop. `uncertainty` says what a fitted model does not know.
 """
 
-from dln_jax.learning import dynamics, frames, functions, motions, rates
+from dln_jax.learning import (
+    accelerations,
+    dynamics,
+    frames,
+    functions,
+    measured_motions,
+    motions,
+    rates,
+    uncertainty,
+)
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, suited
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
+from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.growth import grow
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
@@ -28,17 +39,21 @@ __all__ = [
     "Progress",
     "Stop",
     "Training",
+    "accelerations",
     "choose_degrees",
     "dynamics",
     "fit",
+    "fit_friction",
     "fit_linear",
     "frames",
     "functions",
     "grow",
     "identity",
     "match_linear",
+    "measured_motions",
     "motions",
     "objective_of",
     "rates",
     "suited",
+    "uncertainty",
 ]

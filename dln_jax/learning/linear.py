@@ -19,19 +19,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial, grow, significantly_better
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model, Parameters
-from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.solvers import least_squares
 from dln_jax.solvers.normal_equations import count
-from dln_jax.types import InputError, Needs, Vector, require_positive
+from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
 """That is tried."""
@@ -41,6 +40,10 @@ ROUNDING = 1e-10
 """Error, relative to the torque, below which no basis is better than another."""
 # Phi theta may differ from the model's force by the rounding of its sum, relative to the sum of absolute terms.
 _LINEARITY_TOLERANCE = 1e-9
+_NOT_LINEAR = (
+    "the model's torque is not linear in its parameters, as a linear fit expects: "
+    "take make_trigonometric, or train this model by its residuals"
+)
 
 
 class LinearFit(NamedTuple):
@@ -91,28 +94,26 @@ def fit_linear(
     with jax.enable_x64(True):
         scale = np.asarray(torque_scale(data))
         zero = np.zeros(count(like))
-        # One program for both passes.
-        one = functools.partial(linearised, model)
-        linearise = jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
+        linearise = design(model)  # one program for both passes
 
         def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-            for columns, _, tau in _chunks(linearise, _unravel(zero, like), data, chunk_size):
+            for columns, _, tau in design_chunks(linearise, unravelled(zero, like), data, chunk_size):
                 weighted = columns / scale[:, None]
                 yield weighted.reshape(-1, zero.size), (tau / scale).ravel()
 
         solution = least_squares.solve_chunks(
             equations(), ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible
         )
-        parameters = _unravel(solution.x, like)
-        squares = 0.0
-        for columns, predicted, tau in _chunks(linearise, parameters, data, chunk_size):
-            rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(solution.x))
-            if not (abs(columns @ solution.x - predicted) <= rounding).all():
-                raise InputError(
-                    "the model's torque is not linear in its parameters, as a linear fit expects: "
-                    "take make_trigonometric, or train this model by its residuals"
-                )
+        parameters = unravelled(solution.x, like)
+        squares = weighted = bound = 0.0
+        for columns, predicted, tau in design_chunks(linearise, parameters, data, chunk_size):
+            rounding = require_linear(columns, solution.x, predicted)
             squares += float(np.sum((predicted - tau) ** 2))
+            weighted += float(np.sum(((predicted - tau) / scale) ** 2))
+            bound += float(np.sum((rounding / scale) ** 2))
+        # A force that is homogeneous in its parameters passes sample by sample; its residual is another.
+        if not abs(weighted**0.5 - solution.residual) <= bound**0.5:
+            raise InputError(_NOT_LINEAR)
     return LinearFit(
         parameters=jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), parameters, like),
         parameter_count=zero.size,
@@ -123,21 +124,22 @@ def fit_linear(
     )
 
 
-def linearised(
-    model: Model, parameters: Parameters, q: Vector, qd: Vector, qdd: Vector
-) -> tuple[Float[Array, "d P"], Vector]:
-    """Phi = d tau / d theta of one state, columns in the order of `ravel_pytree(parameters)`, and tau."""
-
-    def torque(parameters: Parameters) -> Vector:
-        return dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd)
-
-    # Reverse mode: d pull-backs, where forward mode would push all P parameters.
-    tau, pull_back = jax.vjp(torque, parameters)
-    (rows,) = jax.vmap(pull_back)(np.eye(tau.shape[0], dtype=tau.dtype))
-    return jnp.concatenate([leaf.reshape(tau.shape[0], -1) for leaf in jax.tree.leaves(rows)], axis=1), tau
+@functools.lru_cache(maxsize=4)
+def design(model: Model) -> Callable:
+    """(parameters, q, qd, qdd [N, d] each) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
+    one = functools.partial(linearised, model)
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
-def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
+def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """By how much rounding may part Phi theta from the model's force; `InputError` where more does."""
+    rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(theta))
+    if not (abs(columns @ theta - predicted) <= rounding).all():
+        raise InputError(_NOT_LINEAR)
+    return rounding
+
+
+def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
     """A tree like another, of the elements of a vector in the order of its leaves; NumPy, so that nothing compiles."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
@@ -145,12 +147,28 @@ def _unravel(vector: np.ndarray, like: Parameters) -> Parameters:
     return jax.tree.unflatten(structure, parts)
 
 
-def _chunks(
+def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
     samples = len(data.tau)
-    length = -(-samples // -(-samples // chunk_size))
+    return _chunks(linearise, parameters, data, -(-samples // -(-samples // chunk_size)))
+
+
+def linearised_chunks(
+    model: Model, parameters: Parameters, data: Trajectories, length: int = 256
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
+
+    Of any number of samples by one program, in the dtype of the parameters.
+    """
+    return _chunks(design(model), parameters, data, length)
+
+
+def _chunks(
+    linearise: Callable, parameters: Parameters, data: Trajectories, length: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    samples = len(data.tau)
     for first in range(0, samples, length):
         # The last chunk is filled up with its first sample, so that all are one program.
         rows = np.arange(first, first + length)
@@ -171,18 +189,19 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
         InputError: the basis of degree 1 is too large, or what `fit_linear` refuses.
     """
     d = needs.degrees_of_freedom
+    make = CATALOGUE["trigonometric"].factory
     target = ROUNDING**2 * float(np.mean(np.sum(validation.tau**2, axis=1)))
 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
-            model = make_trigonometric(needs, degree=degrees)
+            model = make(needs, degree=degrees)
             found = fit_linear(model, train)
             judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
             errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
         return found, np.sum(np.asarray(errors) ** 2, axis=1)
 
     def fits(degree: int) -> bool:
-        size = count(jax.eval_shape(make_trigonometric(needs, degree=degree).init, jax.random.key(0)))
+        size = count(jax.eval_shape(make(needs, degree=degree).init, jax.random.key(0)))
         return size <= min(MOST_PARAMETERS, train.tau.size)
 
     most = next((n - 1 for n in range(2, LARGEST_DEGREE + 1) if not fits(n)), LARGEST_DEGREE)

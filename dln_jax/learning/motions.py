@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import GAP, window_indices
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.mechanics.dynamics import Flow, PlainFlow
 from dln_jax.mechanics.equations import flow
@@ -32,8 +33,6 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, require_positive
 
-GAP = 1.5
-"""Times the median time step: a longer step is a gap."""
 START_STEPS = 3
 """Of Gauss-Newton, to the start of a validation window."""
 
@@ -60,22 +59,6 @@ class Weights(NamedTuple):
     """Of qd and pd; `None` leaves measured rates out."""
 
 
-def stretches(data: Trajectories, *, gap: float = GAP) -> list[np.ndarray]:
-    """Indices of the samples of each stretch without a gap, in order.
-
-    Raises:
-        InputError: a gap that is not longer than the median time step.
-    """
-    if not gap > 1:
-        raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
-    same = np.diff(data.trajectory) == 0
-    steps = np.diff(data.t)
-    if not same.any():
-        raise InputError("no trajectory has two samples; windows need motions: record some")
-    broken = ~same | (steps > gap * np.median(steps[same]))
-    return np.split(np.arange(len(data.t)), np.flatnonzero(broken) + 1)
-
-
 def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
     """Consecutive windows of `length` samples; each begins with the sample that the one before it ends with.
 
@@ -84,19 +67,9 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
     Raises:
         InputError: a length below 2, no momenta, or no two samples without a gap between them.
     """
-    if length < 2:
-        raise InputError(f"length is {length}; expected a window of at least 2 samples")
     if data.p is None:
         raise InputError("the data have no p; add momenta, or rates in their place (per unit of mass)")
-    pieces = [
-        stretch[first : first + length]
-        for stretch in stretches(data, gap=gap)
-        for first in range(0, len(stretch) - 1, length - 1)
-    ]
-    if not pieces:
-        raise InputError("there are no two samples without a gap between them; record longer motions")
-    indices = np.stack([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
-    weight = np.stack([np.arange(length) < len(piece) for piece in pieces]).astype(float)
+    indices, weight = window_indices(data, length, gap=gap)
     state = np.concatenate([data.q, data.p], axis=1)[indices]
     rate = None if data.pd is None else np.concatenate([data.qd, data.pd], axis=1)[indices]
     t = data.t[indices]

@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from dln_jax.data.magnitudes import on_device, spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.dynamics import friction_force
-from dln_jax.mechanics.equations import Canonical, System, dynamics, hamiltonian_of
+from dln_jax.mechanics.equations import Energies, System, driving_force, dynamics, hamiltonian_of
 from dln_jax.types import InputError, Vector
 from dln_jax.zoo.catalogue import CATALOGUE
 
@@ -61,11 +60,9 @@ def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
     return jnp.concatenate([_scale(key, getattr(data, key), f"{key} {still}") for key in ("qd", "qdd")])
 
 
-def _canonical_residual(system: Canonical, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
+def _canonical_residual(system: Energies, q: Vector, qd: Vector, qdd: Vector, p: Vector, tau: Vector) -> Array:
     H = hamiltonian_of(system)
-    pd = tau - jax.grad(H)(q, p)
-    if system.dissipation is not None:
-        pd -= friction_force(system.dissipation, q, qd)
+    pd = driving_force(system, q, qd, tau) - jax.grad(H)(q, p)
     velocity, acceleration = jax.jvp(jax.grad(H, argnums=1), (q, p), (qd, pd))
     return jnp.concatenate([velocity - qd, acceleration - qdd])
 

@@ -8,6 +8,7 @@
 | `LagrangianSystem` | L, D | `mechanics.lagrangian` |
 | `NaturalHamiltonian` | factor of M⁻¹, V, D | `mechanics.natural_hamiltonian` |
 | `HamiltonianSystem` | H, D | `mechanics.hamiltonian` |
+| `LoadedSystem` | any of these, and friction by load | `mechanics.loaded` |
 | `InverseForward` | none: tau and qdd | `mechanics.plain` |
 | `PhaseRates` | none: (qd, pd) | `mechanics.plain` |
 
@@ -18,24 +19,40 @@ from typing import Any, overload
 
 import jax.numpy as jnp
 
-from dln_jax.mechanics import closed_form, hamiltonian, lagrangian, natural, natural_hamiltonian, plain, recursive
+from dln_jax.mechanics import (
+    closed_form,
+    hamiltonian,
+    lagrangian,
+    loaded,
+    natural,
+    natural_hamiltonian,
+    plain,
+    recursive,
+)
 from dln_jax.mechanics.arguments import vectors
 from dln_jax.mechanics.closed_form import ClosedForm
-from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
+from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow, friction_force
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
 from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.types import Hamiltonian, InputError
+from dln_jax.types import Hamiltonian, InputError, Vector
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
 """Energies that are given in momenta."""
-Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical
+Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical | LoadedSystem
 Driven = Energies | InverseForward
 """Systems on which forces act."""
 System = Driven | PhaseRates
+
+
+def _loaded_dynamics(system: LoadedSystem, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
+    link = dynamics(system.link, degrees_of_freedom=degrees_of_freedom)
+    return loaded.dynamics(system, link, degrees_of_freedom=degrees_of_freedom)
+
 
 _DYNAMICS: dict[type, Any] = {
     NaturalSystem: natural.dynamics,
@@ -44,6 +61,7 @@ _DYNAMICS: dict[type, Any] = {
     LagrangianSystem: lagrangian.dynamics,
     NaturalHamiltonian: natural_hamiltonian.dynamics,
     HamiltonianSystem: hamiltonian.dynamics,
+    LoadedSystem: _loaded_dynamics,
     InverseForward: plain.dynamics,
 }
 
@@ -91,9 +109,19 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
 
     def hamilton(q, p):
         q, p = vectors(d, q=q, p=p)
+        if isinstance(system, LoadedSystem):
+            qd = hamiltonian.velocity(H, q, p)
+            return hamiltonian.time_derivative(H, q, p, driving_force(system, q, qd, jnp.zeros_like(q)))
         return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
 
     return Flow(hamilton, lambda q, p: H(*vectors(d, q=q, p=p)))
+
+
+def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
+    """What of a generalised force is left to move the system [d], friction overcome."""
+    if isinstance(system, LoadedSystem):
+        return loaded.link_force(system, q, qd, tau)
+    return tau if system.dissipation is None else tau - friction_force(system.dissipation, q, qd)
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
@@ -111,6 +139,8 @@ def hamiltonian_of(system: Energies) -> Hamiltonian:
             return hamiltonian.legendre(recursive.lagrangian(system), iterations=1)
         case LagrangianSystem():
             return hamiltonian.legendre(system.lagrangian)
+        case LoadedSystem():
+            return hamiltonian_of(system.link)
 
 
 def _names(*types: type) -> str:

@@ -25,6 +25,7 @@ from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import friction_force
 from dln_jax.mechanics.equations import Driven, Energies, dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.mechanics.plain import InverseForward
@@ -65,7 +66,7 @@ def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Ar
 def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vector) -> tuple[Vector, Jacobians]:
     """qdd [d] under a generalised force; and dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
     motion = dynamics(system)
-    if isinstance(system, HamiltonianSystem | InverseForward):
+    if isinstance(system, HamiltonianSystem | LoadedSystem | InverseForward):
 
         def accelerate(*state: Vector) -> tuple[Vector, Vector]:
             qdd = motion.forward_dynamics(*state)

@@ -1,7 +1,8 @@
-"""Numbers about a model: errors, rollouts, definiteness, misfit, latency."""
+"""Numbers about a model: errors, rollouts, definiteness, misfit, latency, coverage."""
 
+from dln_jax.metrics.coverage import Coverage, coverage
 from dln_jax.metrics.definiteness import Definiteness, definiteness
-from dln_jax.metrics.errors import errors, mean_square, predictions
+from dln_jax.metrics.errors import errors, mean_square, normalised_error, predictions
 from dln_jax.metrics.frames import Injection, inject_energy
 from dln_jax.metrics.latency import Latency, medians_in_turns, one_step
 from dln_jax.metrics.misfit import Misfit, velocity_misfit
@@ -19,12 +20,14 @@ from dln_jax.metrics.rollouts import (
 from dln_jax.metrics.soft_body_energies import motion_energies
 
 __all__ = [
+    "Coverage",
     "Definiteness",
     "Injection",
     "Latency",
     "Misfit",
     "Motion",
     "Motions",
+    "coverage",
     "definiteness",
     "energy_error",
     "errors",
@@ -35,6 +38,7 @@ __all__ = [
     "medians_in_turns",
     "motion_energies",
     "motion_errors",
+    "normalised_error",
     "normalised_state_error",
     "one_step",
     "predict",

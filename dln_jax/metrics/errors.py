@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import hamiltonian
@@ -64,6 +65,14 @@ def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, fl
         if truth is not None:
             result[f"{name}_mse"] = mean_square(predicted[f"tau_{name}"] - truth)
     return result
+
+
+def normalised_error(
+    predicted: Float[np.ndarray, "N d"], measured: Float[np.ndarray, "N d"]
+) -> Float[np.ndarray, " d"]:
+    """nMSE of each joint: mean squared error over the variance of what was measured; NaN where that is zero."""
+    variance = np.var(measured, axis=0)
+    return np.mean((predicted - measured) ** 2, axis=0) / np.where(variance > 0, variance, np.nan)
 
 
 def mean_square(error: np.ndarray) -> float:

@@ -10,7 +10,7 @@ a sample of a smooth function, so that even the true plant leaves such a referen
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.driven import Torque, driven, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.integrators import advance, rk4
-from dln_jax.rollout import rollout
 from dln_jax.types import InputError, Vector, require_positive
-
-Torque = Literal["held", "interpolated"]
 
 
 class Motion(NamedTuple):
@@ -53,7 +50,7 @@ def follow(
     Raises InputError for no substeps, or a `torque` of another name.
     """
     require_positive(substeps=substeps)
-    return _drive(dynamics, q0, qd0, tau[:-1], _slopes(tau, t, torque), jnp.diff(t), substeps)
+    return _drive(dynamics, q0, qd0, tau[:-1], torque_slopes(tau, t, torque), jnp.diff(t), substeps)
 
 
 def recorded_motions(
@@ -83,7 +80,7 @@ def recorded_motions(
         def drive(q0, qd0, tau, t, slopes):
             return _drive(dynamics, q0, qd0, tau[:-1], slopes, jnp.diff(t), substeps)
 
-        slopes = jnp.stack([jax.vmap(functools.partial(_slopes, torque=torque))(tau, t) for torque in torques])
+        slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in torques])
         return jax.vmap(lambda slopes: jax.vmap(drive)(q0, qd0, tau, t, slopes))(slopes)
 
     arrays = (jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t))
@@ -192,35 +189,16 @@ def rollout_metrics(
     return metrics
 
 
-def _slopes(tau: Float[Array, "T d"], t: Float[Array, " T"], torque: Torque) -> Float[Array, "T-1 d"]:
-    """Rates of the torque inside each interval; zero where it is held, and where time stands still."""
-    if torque not in ("held", "interpolated"):
-        raise InputError(f"torque is {torque!r}; expected 'held' or 'interpolated'")
-    changes = jnp.diff(tau, axis=0)
-    if torque == "held":
-        return jnp.zeros_like(changes)
-    durations = jnp.diff(t)[:, None]
-    return jnp.where(durations > 0, changes / jnp.where(durations > 0, durations, 1.0), 0.0)
-
-
 def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, substeps: int) -> Motion:
-    """RK4 through intervals with torque tau[k] + slopes[k] s, s from the interval's start; work is a third state."""
+    """The motion through intervals with torque tau[k] + slopes[k] s; the work done is a third state."""
 
-    def interval(state, drive):
-        tau, slope, duration = drive
+    def rate(state, tau):
+        q, qd, _ = state
+        # The work's rate is that of the energy: friction counts.
+        at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
+        return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
 
-        def field(s, state):
-            q, qd, _ = state
-            driving = tau + s * slope
-            # The work's rate is that of the energy: friction counts.
-            at_work = driving - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else driving
-            return qd, dynamics.forward_dynamics(q, qd, driving), qd @ at_work
-
-        return advance(rk4(field), jnp.zeros_like(duration), state, duration, substeps=substeps), None
-
-    start = (q0, qd0, jnp.zeros_like(q0[0]))
-    _, later = rollout(interval, start, (tau, slopes, durations))
-    return Motion(*(jnp.concatenate([first[None], rest]) for first, rest in zip(start, later, strict=True)))
+    return Motion(*driven(rate, (q0, qd0, jnp.zeros_like(q0[0])), tau, slopes, durations, substeps=substeps))
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:

@@ -35,7 +35,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     Raises:
         InputError: a scene with friction, a degree below 2, or more than `MOST_TERMS` terms.
     """
-    if needs.friction:
+    if needs.friction or needs.joint_friction:
         raise InputError(
             "the polynomial Hamiltonian conserves energy; take a dissipative model for needs with friction"
         )

@@ -1,69 +1,110 @@
 """A tree of rigid bodies with known frames, whose inertias, armature and friction are the parameters.
 
 Forces are linear in them, so that `learning.linear.fit_linear(..., negligible=1e-12)` identifies all at once.
-
 Data determine combinations of the eleven numbers a joint only ("base parameters"); a fit gives the shortest solution
 that predicts the same forces, which need not be bodies that exist.
+
+What friction is not linear in, its shape and what load takes, is given where the model is made:
+`learning.friction.fit_friction` finds it.
 """
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.friction import (
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    joint_dissipation,
+    require_laws,
+    require_shape,
+)
+from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.loaded import Load
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.energies import tree_system
 from dln_jax.models.model import Model
-from dln_jax.types import require_positive
+from dln_jax.types import FrictionLaw, InputError
+
+USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
+"""What `friction=True` stands for."""
+Number = float | tuple[float, ...]
+"""One for all joints, or one for each."""
 
 
 class RigidTreeParameters(NamedTuple):
-    """Of a tree of d joints; friction is `None` where there is none."""
+    """Of a tree of d joints: all that forces are linear in. Friction is `None` where there is none."""
 
     inertias: Any
     """[d, 10], as `mechanics.trees.PARAMETERS`."""
     armature: Any
     """[d], kg m² or kg."""
-    viscous: Any
-    """[d], N m s or N s/m."""
-    coulomb: Any
-    """[d], N m or N."""
-    offset: Any
-    """[d], N m or N."""
+    viscous: Any = None
+    """[d], and so on, as in `FrictionCoefficients`."""
+    coulomb: Any = None
+    offset: Any = None
+    stribeck: Any = None
+    viscous_forward: Any = None
+    viscous_backward: Any = None
+    coulomb_forward: Any = None
+    coulomb_backward: Any = None
+    sigmoid: Any = None
+
+    @property
+    def friction(self) -> FrictionCoefficients:
+        """Those of the joints."""
+        return FrictionCoefficients(**{name: getattr(self, name) for name in FrictionCoefficients._fields})
 
 
 def make_rigid_tree(
-    tree: Tree, *, friction: bool = False, velocity_scale: float = 0.01, dtype: DTypeLike = jnp.float64
+    tree: Tree,
+    *,
+    friction: bool | tuple[FrictionLaw, ...] = False,
+    velocity_scale: Number = 0.01,
+    stribeck_velocity: Number = 0.1,
+    sigmoid_slope: Number = 10.0,
+    sigmoid_shift: Number = 0.0,
+    load: Number = 0.0,
+    dtype: DTypeLike = jnp.float64,
 ) -> Model:
     """A model with the frames of a tree.
 
     Args:
-        tree: whose inertias and armature are where the parameters start.
-        friction: viscous and dry friction and an offset of each joint are parameters too.
-        velocity_scale: of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
+        tree: whose inertias and armature are where the parameters start; friction starts at zero.
+        friction: laws whose coefficients are parameters too, as in `mechanics.friction.laws`; True: `USUAL`.
+        velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
+        load: share of the load law, 0 <= μ < 1; not fitted, and the forces are not linear in the parameters with it.
         dtype: of the parameters.
 
     Raises:
-        InputError: a scale that is not positive.
+        InputError: an unknown law, two that are the same friction, a velocity or slope that is not positive, or a share
+            outside [0, 1), or without its law.
     """
-    require_positive(velocity_scale=velocity_scale)
+    laws = USUAL if friction is True else friction or ()
+    require_laws(laws, "friction")
+    shape = FrictionShape(velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift)
+    shape = FrictionShape(*(np.asarray(each) if isinstance(each, tuple) else each for each in shape))
+    require_shape(shape)
+    shares = load if isinstance(load, tuple) else (load,)
+    if not all(0 <= share < 1 for share in shares):
+        raise InputError(f"load is {load}; expected a share of at least 0 and less than 1, or one for each joint")
+    if any(shares) and "load" not in laws:
+        raise InputError(f"load is {load}, but friction has {', '.join(laws) or 'no law'}; add 'load' to friction")
     d = tree.degrees_of_freedom
+    names = coefficients_of(laws)
 
     def init(key: Array) -> RigidTreeParameters:
-        none = jnp.zeros(d, dtype) if friction else None
-        return RigidTreeParameters(
-            jnp.asarray(tree.inertias, dtype), jnp.asarray(tree.armature, dtype), none, none, none
-        )
+        none = {name: jnp.zeros(d, dtype) for name in names}
+        return RigidTreeParameters(jnp.asarray(tree.inertias, dtype), jnp.asarray(tree.armature, dtype), **none)
 
-    def energies(parameters: RigidTreeParameters) -> RecursiveSystem:
+    def energies(parameters: RigidTreeParameters) -> Any:
         fitted = tree._replace(inertias=parameters.inertias, armature=parameters.armature)
-        dissipation = None
-        if friction:
-            coefficients = parameters.viscous, parameters.coulomb, parameters.offset
-            dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
-        return tree_system(fitted, dissipation)
+        dissipation = joint_dissipation(**parameters.friction._asdict(), **shape._asdict()) if names else None
+        carried = Load(jnp.asarray(load), shape.velocity_scale) if any(shares) else None
+        return with_friction(tree_system(fitted), dissipation, carried)
 
     return Model(init, energies)

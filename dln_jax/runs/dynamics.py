@@ -1,10 +1,7 @@
 """Training a task of dynamics into a run folder: the model, its errors, its speed, and what is to be said of it."""
 
-import time
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.command_line.optimisers import name_of
@@ -16,18 +13,17 @@ from dln_jax.learning import dynamics
 from dln_jax.learning.engine.checkpoint import Checkpoint
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
-from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.learning.linear import choose_degrees, fit_linear
+from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import TORQUE
-from dln_jax.precision import data_type
+from dln_jax.runs.direct_fits import fit_directly
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
 from dln_jax.runs.dynamics_task import Options, Solver, Task, prepare
+from dln_jax.runs.dynamics_uncertainty import store_uncertainty
 from dln_jax.runs.results import losses, settings_of
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 
 
@@ -41,7 +37,7 @@ def run(given: Options, command: str) -> None:
     with command_folder(given, command) as folder:
         announce(task)
         if task.solver is None:
-            task, training = fit_trigonometric(task, grown=given.degree is None)
+            task, training = fit_directly(task, given)
         elif given.target is not None:
             task, training = grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume)
         else:
@@ -52,12 +48,15 @@ def run(given: Options, command: str) -> None:
             )
         parameters, best = best_seed(training, given.seeds)
         save(folder, task.description, parameters)
+        if given.uncertainty:
+            store_uncertainty(folder, task, parameters)
         metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
-        write_config(folder, given, **task.description, **optimiser, seeds=task.seeds)
+        filtered = {} if task.cutoff is None else {"cutoff_hz": task.cutoff}
+        write_config(folder, given, **task.description, **optimiser, **filtered, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
             print(f"the run keeps seed {given.seed + best}, the best in validation")
@@ -72,8 +71,10 @@ def announce(task: Task) -> None:
     terms = [name for name in ("gravity", "friction") if getattr(task.needs, name)] or ["no potential, no friction"]
     print(f"{task.name}: {counts} samples")
     print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
-    if task.sets.train.estimated:
-        print(f"not in the data: {', '.join(task.sets.train.estimated)}; rates are finite differences")
+    if task.needs.joint_friction:
+        print(f"friction of joints: {', '.join(task.needs.joint_friction)}")
+    for line in task.said:
+        print(line)
     if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:
         print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.solver is not None:
@@ -93,29 +94,6 @@ def train(task: Task, solver: Solver, folder: Path, *, resume: bool) -> Training
             report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
             seconds=task.seconds,
         )
-
-
-def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
-    """One least-squares problem, after those by which validation chooses the degrees if it is to."""
-    began = time.perf_counter()
-    chosen = None
-    if grown:
-        chosen, trials = choose_degrees(task.needs, task.sets.train, task.sets.validation)
-        tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
-        print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
-        task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
-    model, dtype = build(task.description), data_type(task.precision)
-    fitted = chosen.outcome if chosen is not None else fit_linear(model, task.sets.train)
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), fitted.parameters)
-    size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
-    print(f"least squares: {size}")
-    errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)
-    at = Progress(1, fitted.torque_mse, float(np.mean(errors)), float("nan"), time.perf_counter() - began)
-    return task, Training(parameters, [at], Stop("finished", 1), 1, 0.0)
-
-
-def _degrees(degrees: tuple[int, ...]) -> str:
-    return "-".join(map(str, degrees))
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:

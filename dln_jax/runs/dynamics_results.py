@@ -20,6 +20,7 @@ from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_task import Task
+from dln_jax.runs.dynamics_uncertainty import uncertainty_metrics
 from dln_jax.runs.results import cost_metrics, print_numbers, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -45,6 +46,9 @@ MEANINGS = {
     "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
     "share_not_definite": "states where the mass matrix is not definite",
     "largest_condition_number": "largest condition number of the mass matrix",
+    "coverage_95_share": "torques within the 95 % band",
+    "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
+    "outside_share": "states outside the training data",
     "vpt_seconds": "valid prediction time, torque held",
     "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
     "rollout_seconds": "duration of a test motion",
@@ -75,6 +79,7 @@ def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, figure
         **errors(predicted, test),
         **spread,
         **definiteness_metrics(functions, task),
+        **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
         **rollouts(functions, task),
         **({"validation_error": float(np.min(training.validation))} if training.history else {}),
         **cost_metrics(
@@ -152,7 +157,7 @@ def draw(
     """Writes what there is to draw."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
-    if training.history and not CATALOGUE[task.kind].properties.linear:
+    if training.history and not CATALOGUE[task.kind].properties.direct:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
@@ -190,4 +195,10 @@ def number(metric: str, value: int | float) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     tiny = any(word in metric for word in ("_mse", "error", "eigenvalue", "condition"))
-    return f"{value:.2e}" if tiny else f"{value:,.2f}" if metric.startswith(("vpt", "share")) else f"{value:,.1f}"
+    return (
+        f"{value:.2e}"
+        if tiny
+        else f"{value:,.2f}"
+        if "share" in metric or metric.startswith("vpt")
+        else f"{value:,.1f}"
+    )

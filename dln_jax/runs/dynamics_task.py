@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
+from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.optimisers import name_of, optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
+from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
@@ -29,7 +31,7 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
 @dataclass(frozen=True)
-class Options(Limited, Resumable, Drawn, SingleCalls):
+class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     """What to train on, how, and where the results go."""
 
     model: str = "structured-delan"
@@ -45,7 +47,7 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     (default: what the scene or the file states, else revolute joints with gravity)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
-    gauss-newton while its equations are small. The trigonometric model is a linear problem and needs none."""
+    gauss-newton while its equations are small. The trigonometric model and the learned tree need none."""
     width: Unstated[int] = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
     depth: Unstated[int] = None
@@ -73,6 +75,8 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
     """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+    uncertainty: bool = True
+    """Store how uncertain the torque is at any state and whether a state is outside the data, and test both."""
 
 
 class Solver(NamedTuple):
@@ -97,11 +101,15 @@ class Task(NamedTuple):
     """Of the model, for `dln_jax.zoo.build`."""
     objective: Objective
     solver: Solver | None
-    """`None` for the trigonometric model, which is one least-squares problem."""
+    """`None` for models that have a fit of their own."""
     seeds: int | tuple[int, ...]
     """One, or several in one program."""
     seconds: float
     """Of training, after which to stop."""
+    said: tuple[str, ...] = ()
+    """Where rates come from, and what is wrong with the data."""
+    cutoff: float | None = None
+    """Hz, of the filter that was applied to q; `None` without."""
 
     @property
     def precision(self) -> str:
@@ -126,7 +134,14 @@ def prepare(given: Options) -> Task:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
         )
-    sets = split(data._replace(needs=needs), test=labels, seed=given.seed)
+    data = data._replace(needs=needs)
+    found = checked(data) if given.data is not None else []
+    filtered = smoothed(given, data)
+    said = [*preparation(data, filtered), *found]
+    if filtered is not None:
+        data = filtered.data
+        labels = None if labels is None else labels_of_parts(data, labels)
+    sets = split(data, test=labels, seed=given.seed)
     objective = objective_of(kind, sets.train)
     description, optimiser, reason = model_and_optimiser(given, kind, sets, needs, objective)
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
@@ -137,20 +152,23 @@ def prepare(given: Options) -> Task:
         problem = dynamics.problem(model, sets, objective, seeds=seeds)
         require_finite_start(problem, dynamics.samples(model, sets, objective))
         solver = Solver(optimiser, reason, problem)
-    return Task(name, kind, sets, scene, needs, origin, description, objective, solver, seeds, **limit)
+    cutoff = None if filtered is None else filtered.cutoff
+    return Task(
+        name, kind, sets, scene, needs, origin, description, objective, solver, seeds, **limit,
+        said=tuple(said), cutoff=cutoff,
+    )  # fmt: skip
 
 
 def check_options(given: Options, kind: str) -> None:
     """Refuses options that the model does not read."""
     require_positive(seeds=given.seeds)
     require_seed(given.seed, given.seeds)
-    if CATALOGUE[kind].properties.linear:
-        if given.seeds > 1:
-            raise InputError(f"--seeds is {given.seeds}, but one least-squares problem has no seeds; leave it out")
-        names = (*OF_NETWORKS, *OF_ADAM, "steps", "seconds", "target")
-        refuse_given(given, names, "for networks; the trigonometric model is one least-squares problem")
-        if given.optimizer != "auto":
-            raise InputError("the trigonometric model is one least-squares problem; leave --optimizer out")
+    properties = CATALOGUE[kind].properties
+    if properties.searched:
+        check_direct_options(given, ("degree",), "the learned tree", "has a search of its own")
+        return
+    if properties.linear:
+        check_direct_options(given, ("seconds",), "the trigonometric model", "is one least-squares problem")
         return
     refuse_given(given, ["degree"], "for the trigonometric model")
     if given.target is not None:
@@ -158,6 +176,15 @@ def check_options(given: Options, kind: str) -> None:
             raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
         refuse_given(given, ["width", "depth"], "what --target grows")
         require_positive(target=given.target)
+
+
+def check_direct_options(given: Options, others: tuple[str, ...], model: str, why: str) -> None:
+    """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
+    if given.seeds > 1:
+        raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
+    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
+    if given.optimizer != "auto":
+        raise InputError(f"{model} {why}; leave --optimizer out")
 
 
 def stated_needs(given: Options, scene: Scene | None, data: Trajectories) -> tuple[Needs, str]:
@@ -178,6 +205,8 @@ def model_and_optimiser(
     check_options(given, kind)
     properties, adam = CATALOGUE[kind].properties, given.optimizer == "adam"
     precision = given.precision or ("f32" if adam else "f64")
+    if properties.searched:
+        return describe_for(kind, sets.train, needs, precision=precision), None, ""
     if properties.linear:
         degree = 1 if given.degree is None else given.degree
         return describe_for(kind, sets.train, needs, precision=precision, degree=degree), None, ""

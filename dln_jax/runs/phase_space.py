@@ -9,7 +9,15 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given, resolved
+from dln_jax.command_line.arguments import (
+    Unstated,
+    choice,
+    positive_numbers,
+    refuse_given,
+    require_positive_if_given,
+    resolved,
+)
+from dln_jax.command_line.encoders import checked
 from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
 from dln_jax.command_line.progress import progress
@@ -23,14 +31,17 @@ from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.results import OF_LOSSES, losses, one_step_metrics, print_numbers, unit_of
 from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
-from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, TASKS, Problem, problem_of
+from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, TASKS, Problem, Stated, problem_of
 from dln_jax.studies.hamiltonian.training import (
+    LINEAR,
     MOTIONS,
     POLYNOMIAL,
     RATES,
     Trained,
     check,
     description_of,
+    gauge_of,
+    in_velocities,
     stages_of,
     train,
 )
@@ -61,8 +72,11 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
         "pairwise-hnn",
         "polynomial-hamiltonian",
         "phase-network",
+        "structured-delan",
+        "trigonometric",
+        "planar-chain",
     ] = "auto"
-    """What is learned; auto: what suits the task."""
+    """What is learned; auto: what suits the task. The last three are for measured."""
     data: Unstated[Path] = None
     """Trajectories in the npz schema, for measured and real-pendulum."""
     trajectories: Unstated[int] = None
@@ -70,6 +84,12 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     needs: Unstated[str] = None
     """measured: what the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
     (default: what the file states, else revolute joints with a potential and friction)."""
+    test: Unstated[str] = None
+    """measured: labels of test trajectories, or an npz file of them (default: every sixth, or the last fifth)."""
+    noise: Unstated[str] = None
+    """measured: standard deviation of q, rad or m, one number or one for each coordinate (default: estimated)."""
+    coordinates: Unstated[Literal["relative", "absolute"]] = None
+    """planar-chain: whether angles are those of joints, or from the vertical (default: relative)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """auto: gauss-newton."""
     width: Unstated[int] = None
@@ -79,7 +99,7 @@ class Options(Limited, Resumable, Drawn, SingleCalls):
     activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
     """Of the hidden layers (default: tanh)."""
     degree: Unstated[int] = None
-    """polynomial: degree (default: what validation asks for)."""
+    """polynomial: degree (default: what validation asks for); trigonometric: of the basis (default: 1)."""
     steps: Unstated[int] = None
     """Iterations of gauss-newton or steps of adam, of each stage."""
     learning_rate: Unstated[float] = None
@@ -94,11 +114,17 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     require_positive_if_given(given, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
     if given.optimizer != "adam":
         refuse_given(given, ["learning_rate"], "for adam, but a task is fitted by gauss-newton: add --optimizer adam")
-    if given.model != POLYNOMIAL:
-        refuse_given(given, ["degree"], "for polynomial-hamiltonian")
+    if given.model not in (POLYNOMIAL, "trigonometric"):
+        refuse_given(given, ["degree"], "for polynomial-hamiltonian and trigonometric")
+    if given.model != "planar-chain":
+        refuse_given(given, ["coordinates"], "for planar-chain")
     needs = None if given.needs is None else needs_from_option(given.needs)
-    problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, needs=needs)
-    size: dict[str, Any] = {name: getattr(given, name) for name in ("width", "depth", "activation", "degree")}
+    if given.task != MEASURED:
+        refuse_given(given, ["test", "noise"], "for measured")
+    stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
+    problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
+    names = ("width", "depth", "activation", "degree", "coordinates")
+    size: dict[str, Any] = {name: getattr(given, name) for name in names}
     description = description_of(problem, given.model, **size)
     check_suited(given, problem, description)
     name = "gauss-newton" if given.optimizer == "auto" else given.optimizer
@@ -115,6 +141,10 @@ def check_suited(given: Options, problem: Problem, description: dict[str, Any]) 
         refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")
     if problem.name not in PROTOCOLS:
         refuse_given(given, ["trajectories"], f"for generated data, but '{problem.name}' reads its --data")
+    if description["name"] in LINEAR:
+        refuse_given(
+            given, ["width", "depth", "activation"], f"for networks, which a {description['name']} model is not"
+        )
     if description["name"] == POLYNOMIAL:
         linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
         refuse_given(given, ["width", "depth", "activation"], linear)
@@ -142,6 +172,8 @@ def run(given: Options, command: str) -> None:
         metrics, seen = measured_once(problem, trained)
         states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
         metrics = {**metrics, **one_step_metrics(one_step(load(folder).flow.rates, states, calls=2000))}
+        if problem.noise is not None:
+            metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(problem.noise.q), start=1)}
         metrics["validation_error"] = float(trained.result.validation)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), print, function="rates")
@@ -184,8 +216,14 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
     print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
     missing = [key for key in data.estimated if key != "tau"]
     if missing:
-        print(f"not in the data: {', '.join(missing)}; finite differences start the fit to motions")
-    if problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
+        of = "finite differences" if problem.noise is None else "local polynomials, not finite differences,"
+        print(f"not in the data: {', '.join(missing)}; {of} start the fit to motions")
+    if problem.name in (REAL, MEASURED):
+        print("".join(f"{line}\n" for line in checked(data)), end="")
+    if in_velocities(problem, description):
+        q = ", ".join(f"{each:.3g}" for each in gauge_of(problem).q)
+        print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")
+    elif problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
         print("momenta p are taken as qd, per unit of inertia")
 
 
@@ -211,6 +249,10 @@ MEANINGS = {
     "train_loss": ("(qd, pd) at training states, mean square error", "units of qd² and pd²"),
     "test_loss": ("(qd, pd) at test states, mean square error", "units of qd² and pd²"),
     "clean_field_mse": ("(qd, pd) against the exact field, mean square error", "units of qd² and pd²"),
+    "vpt": ("time for which motions are predicted right", "s"),
+    "lyapunov_seconds": ("Lyapunov time of the model", "s"),
+    "predicted_seconds": ("duration of the predicted motions", "s"),
+    "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
     "validation_error": ("validation loss of the last stage", "see training.png"),
 }
 """What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from dln_jax.mechanics.trees import tree_from_json
 from dln_jax.models.baselines import make_feed_forward, make_phase_network
 from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import (
@@ -19,13 +20,19 @@ from dln_jax.models.hamiltonian import (
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
+from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
 from dln_jax.models.n_body import make_pairwise_hamiltonian
+from dln_jax.models.networks import Scale
+from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.models.residual import make_residual, make_with_residual
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Needs, require_network, require_positive
+from dln_jax.types import InputError, Needs, ResidualTerm, require_network, require_positive
 from dln_jax.zoo.differential_network import make_differential_network
 from dln_jax.zoo.pictures import make_picture_model
 
@@ -41,6 +48,13 @@ class Properties(NamedTuple):
     """It is a function of (q, p), which Hamilton's equations fit to data with momenta."""
     linear: bool = False
     """Its parameters enter linearly, so that one least-squares problem fits them."""
+    searched: bool = False
+    """A search of its own finds its parameters (`learning.kinematics`)."""
+
+    @property
+    def direct(self) -> bool:
+        """Whether it is fitted without an optimiser."""
+        return self.linear or self.searched
 
 
 class Entry(NamedTuple):
@@ -105,36 +119,102 @@ def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
     return factory
 
 
+def with_friction_laws(make: Callable[..., Model], *, linear: bool = False) -> Callable[..., Model]:
+    """The factory of a model with the friction laws that the needs name; `linear` as for `with_joint_friction`."""
+
+    @extending(make, "needs")
+    def factory(needs: Needs, **keywords: Any) -> Model:
+        model = make(needs._replace(joint_friction=()), **keywords)
+        dtype = keywords.get("dtype", inspect.signature(make).parameters["dtype"].default)
+        return with_joint_friction(model, needs, linear=linear, dtype=dtype)
+
+    return factory
+
+
 @extending(make_pairwise_hamiltonian, "bodies")
 def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model:
     """`make_pairwise_hamiltonian` of the bodies that the needs have coordinates for."""
     require_positive(dimension=dimension)
-    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or needs.friction:
+    has_friction = needs.friction or needs.joint_friction
+    if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
         raise InputError(
             f"the pairwise model takes positions of bodies, {dimension} for each, without friction; it got {needs}"
         )
     return make_pairwise_hamiltonian(needs.degrees_of_freedom // dimension, dimension, **keywords)
 
 
+@extending(make_rigid_tree, "friction")
+def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
+    """`make_rigid_tree` of a tree as `mechanics.trees.tree_to_json` gives it, with the friction that the needs name."""
+    frames = tree_from_json(tree)
+    if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
+        raise InputError(
+            f"the rigid tree has the joints {frames.joints}, and gravity if it is not zero; it got {needs}"
+        )
+    return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
+
+
+@extending(make_stored_tree)
+def make_stored_residual(
+    needs: Needs,
+    *,
+    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
+    width: int = 8,
+    depth: int = 1,
+    activation: Activation = tanh,
+    resolved_velocity: Scale = 0.05,
+    torque_scale: Scale = 1.0,
+    rate_scale: Scale = 1.0,
+    acceleration_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float64,
+    **keywords: Any,
+) -> Model:
+    """`make_stored_tree` with a `make_residual`, whose `velocity_scale` is `resolved_velocity` here."""
+    residual = make_residual(
+        needs,
+        terms=tuple(terms),
+        width=width,
+        depth=depth,
+        activation=activation,
+        velocity_scale=resolved_velocity,
+        torque_scale=torque_scale,
+        rate_scale=rate_scale,
+        acceleration_scale=acceleration_scale,
+        dtype=dtype,
+    )
+    return make_with_residual(make_stored_tree(needs, dtype=dtype, **keywords), residual)
+
+
 MOMENTUM = {"momentum_scale": ("p",)}
 CATALOGUE = {
-    "structured-delan": Entry(make_delan, Properties(definite=True)),
-    "black-box-delan": Entry(make_black_box_lagrangian, Properties(), {"rate_scale": ("qd",)}),
-    "trigonometric": Entry(make_trigonometric, Properties(linear=True)),
+    "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
+    "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
+    "trigonometric": Entry(with_friction_laws(make_trigonometric, linear=True), Properties(linear=True)),
+    "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
+    "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
+    "rigid-tree-residual": Entry(make_stored_residual, Properties()),
+    "learned-tree": Entry(make_serial_tree, Properties(searched=True)),
     "feed-forward": Entry(
-        make_feed_forward,
+        with_friction_laws(make_feed_forward),
         Properties(energy=False),
         {"rate_scale": ("qd",), "acceleration_scale": ("qdd",), "tau_scale": ("tau",)},
     ),
     "structured-hnn": Entry(
-        with_friction_network(make_structured_hamiltonian), Properties(definite=True, canonical=True)
+        with_friction_laws(with_friction_network(make_structured_hamiltonian)),
+        Properties(definite=True, canonical=True),
     ),
-    "black-box-hnn": Entry(with_friction_network(make_black_box_hamiltonian), Properties(canonical=True), MOMENTUM),
-    "separable-hnn": Entry(with_friction_network(make_separable_hamiltonian), Properties(canonical=True), MOMENTUM),
+    "black-box-hnn": Entry(
+        with_friction_laws(with_friction_network(make_black_box_hamiltonian)), Properties(canonical=True), MOMENTUM
+    ),
+    "separable-hnn": Entry(
+        with_friction_laws(with_friction_network(make_separable_hamiltonian)), Properties(canonical=True), MOMENTUM
+    ),
     "pairwise-hnn": Entry(make_pairwise, Properties(definite=True, canonical=True)),
     "polynomial-hamiltonian": Entry(make_polynomial_hamiltonian, Properties(canonical=True, linear=True)),
     "phase-network": Entry(
-        make_phase_network, Properties(energy=False, canonical=True), {**MOMENTUM, "rate_scale": ("qd", "pd")}
+        with_friction_laws(make_phase_network),
+        Properties(energy=False, canonical=True),
+        {**MOMENTUM, "rate_scale": ("qd", "pd")},
     ),
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
     "latent-phase": Entry(make_picture_model, Properties(energy=False)),

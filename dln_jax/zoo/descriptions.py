@@ -26,6 +26,8 @@ from dln_jax.zoo.parameter_files import REMEDY
 
 Description = dict[str, Any]
 """JSON values."""
+STATED = set(Needs._fields) - {"joint_friction", "joint_map", "velocity_scale"}
+"""What needs in a file state; older ones say nothing of the friction of joints, since there was none."""
 OWN = "own"
 """Name of a model whose factory the file does not tell."""
 
@@ -171,7 +173,7 @@ def require_complete(description: Description, factory: Callable[..., Any]) -> N
     if unknown := set(description) - expected:
         raise InputError(f"model description: unknown are {reprlib.repr(', '.join(sorted(unknown)))}; {REMEDY}")
     needs = description.get("needs")
-    if isinstance(needs, dict) and "needs" in expected and (missing := set(Needs._fields) - set(needs)):
+    if isinstance(needs, dict) and "needs" in expected and (missing := STATED - set(needs)):
         raise InputError(f"model description: needs lack {', '.join(sorted(missing))}; {REMEDY}")
 
 

@@ -17,6 +17,8 @@ import safetensors.numpy
 from dln_jax.files import is_file, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
+MODEL = "model"
+"""Name of the file pair in a run's folder that holds the trained model."""
 SCHEMA_VERSION = 2
 READ = (1, SCHEMA_VERSION)
 """Versions that this release reads."""

@@ -8,25 +8,25 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
 from dln_jax.models.model import Model, Parameters
+from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo import older
 from dln_jax.zoo.descriptions import Description, build
 from dln_jax.zoo.differential_network import Derivatives, FunctionModel
-from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
+from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, save_tree
 from dln_jax.zoo.pictures import PictureModel
+from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
 
 Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
 AnyModel = Model | FunctionModel | PictureModel
-
-MODEL = "model"
-"""Name of the file pair in a run's folder that holds the trained model."""
 
 
 # No NamedTuple: functions that are asked for twice have to be the same, or they would be compiled twice.
@@ -43,6 +43,8 @@ class Run:
     """Of the model."""
     description: Description
     """What builds the model."""
+    uncertainty: Uncertainty | None = None
+    """What the model does not know, where the run has it."""
 
     @functools.cached_property
     def energies(self) -> Any:
@@ -75,6 +77,30 @@ class Run:
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
 
+    @functools.cached_property
+    def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
+        """(q, qd, qdd) -> standard deviation [d] of a measured torque about the model's, N m or N.
+
+        InputError for a run that has none.
+        """
+        factor, noise, inflation, _ = self._known_uncertainty
+        return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
+
+    @functools.cached_property
+    def outside(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
+        """(q, qd, qdd) -> whether the state is outside the training data. InputError for a run that cannot tell."""
+        uncertainty = self._known_uncertainty
+        return _jitted(outside(self._of("outside", Model), self.parameters, uncertainty), self.dtype)
+
+    @property
+    def _known_uncertainty(self) -> Uncertainty:
+        if self.uncertainty is None:
+            raise InputError(
+                "the run does not say what its model does not know: train it anew by train_delan, or store an "
+                "estimate of learning.uncertainty by save_uncertainty"
+            )
+        return self.uncertainty
+
     @property
     def dtype(self) -> Any:
         """Of the training."""
@@ -102,13 +128,14 @@ class Run:
 
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """Writes `model.safetensors` and `model.json` into an existing folder.
+    """Writes `model.safetensors` and `model.json` into an existing folder; what other parameters did not know goes.
 
     Args:
         directory: of the run.
         description: as `describe` gives it.
         parameters: of the model that it describes.
     """
+    discard_uncertainty(Path(directory))
     save_tree(Path(directory), MODEL, parameters, {"model": description})
 
 
@@ -136,7 +163,8 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
         raise InputError(f"{directory / MODEL}.json: {error}") from None
     like = jax.eval_shape(model.init, jax.random.key(0))
     parameters = load_tree(directory, MODEL, older.stored_types(like) if old else like)
-    return Run(model, jax.tree.map(lambda leaf, as_built: leaf.astype(as_built.dtype), parameters, like), description)
+    parameters = jax.tree.map(lambda leaf, as_built: leaf.astype(as_built.dtype), parameters, like)
+    return Run(model, parameters, description, load_uncertainty(directory))
 
 
 def read_description(directory: Path) -> tuple[Description, bool]:

@@ -36,6 +36,7 @@ from dln_jax.commands import (
     train_hnn_pixels,
     train_hnn_task,
     train_locomotion,
+    uncertainty_report,
 )
 from dln_jax.data import archive, functions, meshes, schema
 from dln_jax.data.splits import split
@@ -610,6 +611,7 @@ SCRIPTS = {
     "simulate": (simulate,),
     "hnn_table": (hnn_table, "--tasks", "spring"),
     "delan_report": (delan_report, "--data", "data.npz", "--test", "4"),
+    "uncertainty_report": (uncertainty_report, "--splits", "1"),
 }
 
 

@@ -48,6 +48,16 @@ def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
+def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
+    options = ("--data", "swing.npz", "--model", "learned-tree", "--no-figures", "--no-low-latency")
+    command(train_delan, *options, "--out", "tree")
+    assert "descents" in capsys.readouterr().out
+    assert metrics_of(workplace / "tree")["torque_mse"] < 1e-12
+    assert load(workplace / "tree").description["name"] == "learned-tree"
+    assert "has a search of its own" in refused(capsys, train_delan, *options, "--width", "3")
+    assert "has no seeds" in refused(capsys, train_delan, *options, "--seeds", "2")
+
+
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
     asked = []
 

@@ -1,5 +1,6 @@
 """The schema, its refusals, splits by trajectory, and the generators' exactness."""
 
+import json
 import pickle
 
 import jax
@@ -60,6 +61,17 @@ REFUSED = [
     (changed(needs=np.array('{"joints": ["revolute", "revolute"], "wind": true}')), "expected JSON with the fields"),
     (changed(needs=np.array('{"joints": ["revolute", "revolute"], "gravity": 1}')), "gravity is 1"),
     (changed(needs=np.array('{"joints": ["revolute", "revolute"], "actuation": [[1]]}')), "actuation is"),
+    *(
+        (changed(needs=np.array(json.dumps({"joints": ["revolute"] * 2, key: value}))), message)
+        for key, value, message in (
+            ("joint_friction", ["viscous", "rust"], "joint_friction has 'rust'; expected some of viscous, coulomb"),
+            ("joint_friction", "viscous", "joint_friction is 'viscous'; expected a list of laws"),
+            ("joint_friction", ["asymmetric", "coulomb"], "which no data can tell apart"),
+            ("joint_map", [[1, 0]], "joint_map is"),
+            ("joint_map", [[1, 1], [1, 1]], "that can be inverted"),
+            ("velocity_scale", 0, "velocity_scale is 0; expected a positive number"),
+        )
+    ),
 ]
 
 
@@ -106,6 +118,16 @@ def test_saving_and_loading_is_the_identity(tmp_path):
         schema.save(tmp_path / "nowhere" / "data.npz", data)
     with pytest.raises(InputError, match=r"end in \.npz"):
         schema.save(tmp_path / "data.csv", data)
+
+
+def test_friction_of_joints_is_stated_in_a_file_and_older_needs_have_none(tmp_path):
+    laws, rows = ("viscous", "stribeck"), ((1.0, 0.0), (-1.0, 1.0))
+    needs = Needs(("revolute",) * 2, joint_friction=laws, joint_map=rows, velocity_scale=0.02)
+    data = schema.from_arrays(arrays())._replace(needs=needs)
+    schema.save(tmp_path / "data.npz", data)
+    assert schema.load(tmp_path / "data.npz").needs == needs
+    older = {"joints": ["revolute"], "gravity": True, "friction": False, "actuation": None}
+    assert schema.needs_from_json(older) == Needs(("revolute",))
 
 
 def test_absent_rates_are_estimated_to_second_order_and_never_across_trajectories():
@@ -165,7 +187,8 @@ def test_letters_are_consistent_trajectories(letters):
         # At rest at both ends but for the last fraction of a sample.
         assert np.abs(letters.qd[inside][0]).max() < 1e-12
         assert np.abs(letters.qd[inside][-1]).max() < 0.05
-    schema.from_arrays({key: value for key, value in letters._asdict().items() if key not in ("needs", "estimated")})
+    absent = ("needs", "estimated", "joint_names")
+    schema.from_arrays({key: value for key, value in letters._asdict().items() if key not in absent})
 
 
 def test_letters_have_exact_rates_and_momenta(letters):

@@ -8,7 +8,7 @@ import pytest
 
 from dln_jax.data.robots import read_robot
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.trees import tree_system, world_frames
+from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
 from dln_jax.types import InputError
 
 mujoco = pytest.importorskip("mujoco")
@@ -161,3 +161,64 @@ def test_what_is_no_tree_is_refused_in_one_line(case, tmp_path):
 def test_a_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="no file"):
         read_robot(tmp_path / "arm.urdf")
+
+
+def forces(robot):
+    state = np.random.default_rng(1).normal(size=(3, robot.tree.degrees_of_freedom))
+    return dynamics(tree_system(robot.tree)).inverse_dynamics(*state)
+
+
+def test_a_joint_that_is_held_is_fixed(tmp_path):
+    held = read_robot(written(tmp_path, "arm.urdf", ARM), hold=["elb*"])
+    fixed = ARM.replace('"elbow" type="continuous"', '"elbow" type="fixed"')
+    robot = read_robot(written(tmp_path, "fixed.urdf", fixed))
+    assert held.tree.names == robot.tree.names == ("shoulder", "slide")
+    np.testing.assert_array_equal(held.position_limits, robot.position_limits)
+    np.testing.assert_allclose(forces(held), forces(robot), rtol=1e-12, atol=1e-12)
+
+
+FREE = (
+    '<freejoint name="root"/><geom size="1"/><body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".3 0 0"/></body>'
+)
+
+
+def test_a_base_that_is_free_can_be_held(tmp_path):
+    path = written(tmp_path, "free.xml", f"<mujoco><worldbody><body>{FREE}</body></worldbody></mujoco>")
+    assert read_robot(path, hold=["root"]).tree.names == ("a",)
+
+
+HELD = {"turned": ("branched.xml", {"x": 0.7, "w": -0.4}), "moved": ("arm.urdf", {"slide": 0.2})}
+
+
+@pytest.mark.parametrize("name", HELD)
+def test_joints_are_held_where_it_is_asked_for(name, tmp_path):
+    file, hold = HELD[name]
+    path = written(tmp_path, file, FILES[file])
+    free, held = read_robot(path), read_robot(path, hold=hold)
+    place = np.array([free.tree.names.index(name) for name in held.tree.names])
+    q, qd, qdd = np.zeros((3, free.tree.degrees_of_freedom))
+    for joint, position in hold.items():
+        q[free.tree.names.index(joint)] = position
+    q[place], qd[place], qdd[place] = np.random.default_rng(0).normal(size=(3, len(place)))
+    every = dynamics(tree_system(free.tree)).inverse_dynamics(q, qd, qdd)
+    fewer = dynamics(tree_system(held.tree)).inverse_dynamics(q[place], qd[place], qdd[place])
+    np.testing.assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
+
+
+def test_a_gripper_whose_fingers_are_tied_can_be_held(tmp_path):
+    tied = ARM.replace('<parent link="two"/>', '<mimic joint="elbow"/><parent link="two"/>')
+    path = written(tmp_path, "arm.urdf", tied)
+    with pytest.raises(InputError, match="joint 'slide' follows another"):
+        read_robot(path)
+    assert read_robot(path, hold=["slide"]).tree.names == ("shoulder", "elbow")
+    with pytest.raises(InputError, match=r"there is no joint 'finger\*' to hold; it has shoulder, elbow, slide"):
+        read_robot(path, hold=["finger*"])
+
+
+def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
+    """As published files have them; MuJoCo alone would refuse."""
+    flat = ARM.replace('izz="0.02"', 'izz="-0.5"')
+    tree = read_robot(written(tmp_path, "flat.urdf", flat)).tree
+    true = read_robot(written(tmp_path, "arm.urdf", ARM)).tree
+    assert np.linalg.eigvalsh(pseudo_inertia(tree.inertias[0]))[0] < 0
+    np.testing.assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)

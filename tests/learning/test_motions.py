@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
+from dln_jax.data.stretches import stretches
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.motions import Weights, cut_windows, problem, stretches, take
+from dln_jax.learning.motions import Weights, cut_windows, problem, take
 from dln_jax.learning.rates import match_linear
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.models.model import Model

@@ -15,6 +15,7 @@ from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import Canonical, Energies, dynamics, flow
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -25,10 +26,20 @@ SWING = Needs(joints=("revolute",), friction=True)
 FREE = Needs(joints=("revolute",))
 BODIES = Needs(joints=("prismatic",) * 4)
 SMALL = {"width": 3, "depth": 1}
+PENDULUM = serial(
+    [np.eye(3)], [[0, 0, 0]], [inertial_parameters(1.0, [0.3, 0, 0], 0.1 * np.eye(3))], gravity=(0, -9.81, 0)
+)
 MODELS = {
     "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
     "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
+    "rigid-tree": {"needs": SWING, "tree": tree_to_json(PENDULUM), "velocity_scale": 0.1},
+    "rigid-tree-residual": {
+        **{"needs": SWING._replace(friction=False, joint_friction=("asymmetric",)), "tree": tree_to_json(PENDULUM)},
+        **{"terms": ["potential", "dissipation", "inertia"], **SMALL, "torque_scale": 0.5},
+    },
+    "planar-chain": {"needs": SWING, "symmetric": False, "velocity_scale": 0.1},
+    "learned-tree": {"needs": SWING, "velocity_scale": 0.1},
     "feed-forward": {"needs": FREE, **SMALL, "tau_scale": 3.0},
     "structured-hnn": {"needs": SWING, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": SWING, **SMALL, "momentum_scale": 0.5},

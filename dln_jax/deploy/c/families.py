@@ -9,6 +9,7 @@ In coordinates and velocities, x = (q, qd), of every system on which forces act:
 | `energy` | q, qd | energy |
 | `mass_matrix` | q, and qd where M depends on it | M |
 | `gravity`, `coriolis`, `friction` | q; q, qd; q, qd | g; c; tau_friction |
+| `torque_std`, `outside` | q, qd, qdd | tau_std; outside |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
 In a phase space, of rates and of Hamiltonians, without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p;
@@ -38,8 +39,11 @@ from dln_jax.mechanics.discrete import ITERATIONS, Actuation
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainFlow
 from dln_jax.mechanics.equations import Canonical, Driven, System, dynamics, flow
 from dln_jax.mechanics.jacobians import Natural
+from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.plain import PhaseRates
 from dln_jax.models.latent_phase import LatentPhase
+from dln_jax.models.model import Model
+from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
@@ -58,6 +62,8 @@ Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
 Named = dict[str, Function]
 DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
 """How names of functions end that are derivatives of others."""
+LARGEST_FACTOR = 250_000
+"""Numbers of a covariance's factor that go into C, where they take some 24 bytes each; a larger one stays in Python."""
 SCALARS = ("energy", "hamiltonian")
 """Functions with one number as their result, whose derivative is a gradient."""
 
@@ -105,14 +111,27 @@ def functions_of_system(
     """
     d = degrees_of_freedom
     # Networks take long to trace: each once, and not for every function that it occurs in.
-    system = system._replace(**{name: jax.jit(each) for name, each in system._asdict().items() if callable(each)})
+    traced = _traced_once(system)
     functions: Named = {}
     if not isinstance(system, PhaseRates):
-        functions |= _of_dynamics(system, d, actuation, iterations)
-    if isinstance(system, Canonical | PhaseRates):
-        functions |= _of_flow(flow(system, degrees_of_freedom=d), iterations)
+        functions |= _of_dynamics(traced, d, actuation, iterations)
+    if isinstance(_link(system), Canonical | PhaseRates):
+        functions |= _of_flow(flow(traced, degrees_of_freedom=d), iterations)
     controls = d if actuation is None else np.shape(actuation)[1]
     return _with_examples(functions, dtype, d, x=(2 * d,), u=(controls,))
+
+
+def _traced_once(system: Any) -> Any:
+    """Its functions jitted."""
+    fields = {name: jax.jit(each) for name, each in system._asdict().items() if callable(each)}
+    if isinstance(system, LoadedSystem):
+        fields["link"] = _traced_once(system.link)
+    return system._replace(**fields)
+
+
+def _link(system: System) -> Any:
+    """Of a system behind transmissions, that without them."""
+    return system.link if isinstance(system, LoadedSystem) else system
 
 
 def _of_run(run: Run, precision: str, iterations: int) -> Functions:
@@ -132,7 +151,11 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
         raise InputError("the model states no needs; export functions_of_system of its energies")
     needs = needs_from_json(description["needs"])
     energies, common = model.energies(parameters), {"actuation": needs.actuation, "iterations": iterations}
-    return functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    functions = functions_of_system(energies, needs.degrees_of_freedom, dtype=dtype, **common)
+    if run.uncertainty is not None and run.uncertainty.factor.size <= LARGEST_FACTOR:
+        known = _of_uncertainty(model, parameters, run.uncertainty)
+        functions |= _with_examples(known, dtype, needs.degrees_of_freedom)
+    return functions
 
 
 def _converted(dtype: Any, leaf: Array) -> Array:
@@ -159,7 +182,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     inverse_jacobians, coriolis_jacobians = (
         functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
     )
-    natural = isinstance(system, Natural)
+    link = _link(system)
+    natural = isinstance(link, Natural)
 
     def at_rest(q: Array) -> Array:
         return motion.decompose(q, jnp.zeros_like(q), jnp.zeros_like(q)).gravity
@@ -178,7 +202,7 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
         "coriolis": _named(coriolis, "c"),
         "coriolis_jacobian": _named(coriolis_jacobians, "c_q", "c_qd"),
     }
-    if not natural or system.potential is not None:
+    if not natural or link.potential is not None:
         functions |= _with_derivatives("gravity", _named(at_rest, "g"))
     if isinstance(motion, Dynamics):
         mass_matrix = (lambda q: motion.mass_matrix(q)) if natural else (lambda q, qd: motion.mass_matrix(q, qd))
@@ -190,6 +214,11 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     for name, step in {"rk4": discrete.rk4(forward, actuation=actuation), "implicit_midpoint": implicit}.items():
         functions |= _linearised(f"step_{name}", step, ("x_next",), ("A", "B"))
     return functions
+
+
+def _of_uncertainty(model: Model, parameters: Any, known: Uncertainty) -> Named:
+    std = predictive(model, parameters, known.factor, known.noise, known.inflation)
+    return {"torque_std": _named(std, "tau_std"), "outside": _named(outside(model, parameters, known), "outside")}
 
 
 def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:

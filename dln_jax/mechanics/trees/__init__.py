@@ -6,12 +6,20 @@
 from dln_jax.mechanics.trees.description import Tree, dh_frames, make_tree, serial, with_payload
 from dln_jax.mechanics.trees.energies import kinetic_energy, lagrangian, potential_energy, tree_energies, tree_system
 from dln_jax.mechanics.trees.frames import world_frames
-from dln_jax.mechanics.trees.inertia import PARAMETERS, inertial_parameters, moved, pseudo_inertia
+from dln_jax.mechanics.trees.inertia import (
+    PARAMETERS,
+    body_of_pseudo_inertia,
+    inertial_parameters,
+    moved,
+    pseudo_inertia,
+)
 from dln_jax.mechanics.trees.recursions import composite_bodies, newton_euler, regressor
+from dln_jax.mechanics.trees.stored import tree_from_json, tree_to_json
 
 __all__ = [
     "PARAMETERS",
     "Tree",
+    "body_of_pseudo_inertia",
     "composite_bodies",
     "dh_frames",
     "inertial_parameters",
@@ -25,7 +33,9 @@ __all__ = [
     "regressor",
     "serial",
     "tree_energies",
+    "tree_from_json",
     "tree_system",
+    "tree_to_json",
     "with_payload",
     "world_frames",
 ]

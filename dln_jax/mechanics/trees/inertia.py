@@ -56,6 +56,13 @@ def pseudo_inertia(theta: Inertia) -> Any:
     return numpy.block([[spread, h[:, None]], [h[None, :], m.reshape(1, 1)]])
 
 
+def body_of_pseudo_inertia(J: Any) -> Inertia:
+    """theta of the body whose `pseudo_inertia` is J [4, 4]."""
+    (own,) = _alike(J)
+    numpy = np if isinstance(own, np.ndarray) else jnp
+    return _joined(own[3, 3], own[:3, 3], numpy.trace(own[:3, :3]) * np.eye(3) - own[:3, :3])
+
+
 def _joined(m: Any, h: Any, moments: Any) -> Any:
     numpy = np if isinstance(moments, np.ndarray) else jnp
     return numpy.concatenate([m.reshape(1), h, moments[_ROWS, _COLUMNS]])

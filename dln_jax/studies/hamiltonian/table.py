@@ -12,11 +12,15 @@ from matplotlib.figure import Figure
 from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
+from dln_jax.learning.measured_motions import MeasuredWindows
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.measured_predictions import predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
+from dln_jax.models.model import Model, Parameters
 from dln_jax.studies.case import Case, Findings, by_case, rows_of
 from dln_jax.studies.hamiltonian import pixels
-from dln_jax.studies.hamiltonian.tasks import PIXELS, REAL, Problem, problem_of
-from dln_jax.studies.hamiltonian.training import RECIPES, Trained, description_of, models_of, train
+from dln_jax.studies.hamiltonian.tasks import MEASURED, PIXELS, REAL, WINDOW, Problem, problem_of
+from dln_jax.studies.hamiltonian.training import RECIPES, Trained, description_of, in_velocities, models_of, train
 from dln_jax.studies.published import HAMILTONIAN, published
 from dln_jax.studies.report import Row, markdown_table, unit_of
 from dln_jax.types import require_positive
@@ -47,6 +51,10 @@ TITLES = {
 }
 
 
+SUBSTEPS = 4
+"""Of RK4 between two samples of a measured motion."""
+
+
 class Seen(NamedTuple):
     """What a figure shows of a model."""
 
@@ -58,8 +66,12 @@ class Seen(NamedTuple):
 def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen]:
     """Errors and times of one run, and what it predicts."""
     model, parameters = build(trained.description), trained.result.parameters
-    predicted = [predict(model, parameters, true.q[:, 0], true.p[:, 0], true.t) for true in problem.truth]
+    predicted, rates = predicted_motions(problem, trained), partial(field_rates, model, parameters)
+    if in_velocities(problem, trained.description):
+        rates = partial(velocity_field, model, parameters)
     numbers = motion_errors(predicted, problem.truth, problem.energy, published_energy=problem.published_energy)
+    if problem.tests is not None:
+        numbers |= predicted_times(problem, trained)
     if problem.train is not None and problem.test is not None:
         fitted, tested = (field_errors(model, parameters, part) for part in (problem.train, problem.test))
         numbers["train_loss"], numbers["test_loss"] = fitted["loss"], tested["loss"]
@@ -67,7 +79,40 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
     for name in ("train_seconds", "compile_seconds"):
         numbers[name] = sum(getattr(fit, name) for fit in trained.fits.values())
     numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
-    return numbers, Seen(predicted[0], partial(field_rates, model, parameters))
+    return numbers, Seen(predicted[0], rates)
+
+
+def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
+    """The problem's motions from their first states, whose momenta are velocities where a model has its own."""
+    model, parameters = build(trained.description), trained.result.parameters
+    if not in_velocities(problem, trained.description):
+        return [predict(model, parameters, true.q[:, 0], true.p[:, 0], true.t) for true in problem.truth]
+    found = []
+    for true in problem.truth:
+        given = MeasuredWindows(true.t[None], true.q, true.p, np.zeros_like(true.q), np.ones(true.q.shape[:2]))
+        fitted = min(WINDOW[MEASURED], len(true.t) - 1)
+        moved = predict_measured(model, parameters, given, fitted=fitted, substeps=SUBSTEPS)
+        found.append(Motions(true.t, moved.q, moved.qd))
+    return found
+
+
+def predicted_times(problem: Problem, trained: Trained) -> dict[str, float]:
+    """For how long measured motions are predicted right, whose starts are fitted to one window."""
+    assert problem.tests is not None
+    model, fitted = build(trained.description), WINDOW[MEASURED]
+    known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(problem, trained.description)}
+    predicted = predict_measured(model, trained.result.parameters, problem.tests, **known)
+    variance = problem.fitted.q.var(axis=0)
+    return prediction_metrics(problem.tests, predicted, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
+
+
+def velocity_field(
+    model: Model, parameters: Parameters, q: np.ndarray, qd: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(qd, qdd) of states, without torques."""
+    accelerate = dynamics(model.energies(parameters)).forward_dynamics
+    qdd = jax.jit(jax.vmap(lambda q, qd: accelerate(q, qd, 0 * q)))(q, qd)
+    return np.asarray(qd), np.asarray(qdd)
 
 
 def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:

@@ -10,21 +10,24 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import PER_SAMPLE, hold_out
-from dln_jax.learning import motions, rates
+from dln_jax.learning import accelerations, measured_motions, motions, rates
 from dln_jax.learning.engine import problem as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Progress, Report, Training, silent
 from dln_jax.learning.growth import grow
+from dln_jax.learning.measured_motions import Gauge, cut_measured_windows
 from dln_jax.learning.motions import Weights, cut_windows
 from dln_jax.learning.rates import match_linear
-from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, WINDOW, Problem
+from dln_jax.studies.hamiltonian.recipes import RECIPES
+from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE, entry_of
 from dln_jax.zoo.descriptions import build, describe_for
@@ -34,6 +37,10 @@ MODELS = ("black-box-hnn", "phase-network")
 POLYNOMIAL = "polynomial-hamiltonian"
 """Of tasks with one coordinate and without friction, beside."""
 DEGREES = range(2, 7)
+LINEAR = {"trigonometric": ("degree",), "planar-chain": ("coordinates",)}
+"""Models of measured motions whose parameters enter linearly, and their keywords."""
+IN_VELOCITIES = ("structured-hnn", "structured-delan", *LINEAR)
+"""Models of measured motions that are fitted in coordinates and velocities, whose momenta are their own."""
 RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
 WINDOWS_OF_A_STEP = 64
@@ -42,47 +49,6 @@ VALIDATION_SHARE = 0.15
 """Of the trajectories for training."""
 
 
-class Recipe(NamedTuple):
-    """The networks of a task, and how long they train; chosen by trial on seed 0, and the same for all seeds."""
-
-    suits: str
-    """The model that suits the scene."""
-    width: int
-    """Hidden units per layer of that."""
-    depth: int
-    network: int
-    """Hidden units per layer of the models that know less: a Hamiltonian that is one network, and the baseline."""
-    network_depth: int
-    steps: int
-    """Iterations of Gauss-Newton on rates."""
-    samples: int
-    seconds: float
-    """At most, of both fits together, compilation included: the limit that `hnn_table` states, and nothing else has."""
-    trajectory_steps: int = 0
-    """Iterations of Gauss-Newton on trajectories, afterwards."""
-    window: int = 0
-    """Samples of a window."""
-    weights: Weights | None = None
-    """Of the trajectories; `None` for the deviations of the data."""
-    substeps: int = 4
-
-
-# The noise of spring and pendulum has sd 0.1; their rates have none, and are trusted to 0.01.
-_NOISY = Weights(state=0.1, rate=0.01)
-_SPRING = Recipe("separable-hnn", 8, 1, 16, 1, 40, 10_000, 60.0, 40, 30, _NOISY, 1)
-_PENDULUM = _SPRING._replace(trajectory_steps=50, window=15)
-RECIPES = {
-    "spring": _SPRING,
-    "pendulum": _PENDULUM,
-    "damped-spring": _SPRING,
-    "damped-pendulum": _PENDULUM,
-    "henon-heiles": Recipe("separable-hnn", 12, 2, 24, 2, 100, 4_000, 60.0),
-    "double-pendulum": Recipe("structured-hnn", 8, 2, 24, 2, 100, 4_000, 60.0),
-    "two-body": Recipe("pairwise-hnn", 8, 1, 24, 2, 60, 3_000, 25.0),
-    "three-body": Recipe("pairwise-hnn", 8, 1, 24, 2, 60, 4_000, 45.0),
-    REAL: Recipe("separable-hnn", 4, 1, 8, 1, 40, 10_000, 30.0, 40, WINDOW[REAL], Weights(state=0.03), 1),
-    MEASURED: Recipe("structured-hnn", 8, 1, 16, 1, 60, 10_000, 60.0, 60, WINDOW[MEASURED], None, 2),
-}
 ANCHOR = 30.0
 """How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
 to choose its own momentum."""
@@ -123,12 +89,15 @@ def models_of(task: str) -> tuple[str, ...]:
 def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
     """The description of a model for a task, "auto" for what suits the scene.
 
-    `keywords` (width, depth, activation, degree) replace the recipe's.
+    `keywords` (width, depth, activation, degree, coordinates) replace the recipe's.
     """
     recipe = RECIPES[problem.name]
     suits = model in ("auto", recipe.suits)
     name = recipe.suits if suits else model
-    if not entry_of(name).properties.canonical:
+    if problem.noise is not None and name in LINEAR:
+        own = {key: value for key, value in keywords.items() if value is not None and key in LINEAR[name]}
+        return describe_for(name, problem.fitted, problem.needs, precision=precision, **own)
+    if not (entry_of(name).properties.canonical or (problem.noise is not None and name in IN_VELOCITIES)):
         known = ", ".join(name for name, entry in CATALOGUE.items() if entry.properties.canonical)
         raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
     stated: dict[str, Any] = {"precision": precision, "pooled": True}
@@ -161,11 +130,26 @@ def stages_of(problem: Problem, description: dict[str, Any], steps: int | None =
     return {stage: steps or own for stage, own in most.items() if own}
 
 
+def in_velocities(problem: Problem, description: dict[str, Any]) -> bool:
+    """Whether a model is fitted in coordinates and velocities, rather than momenta."""
+    return problem.noise is not None and description["name"] in IN_VELOCITIES
+
+
+def gauge_of(problem: Problem) -> Gauge:
+    """Unit inertia where revolute joints are at zero, and prismatic ones at their mean."""
+    means = zip(problem.needs.joints, problem.fitted.q.mean(axis=0), strict=True)
+    return Gauge(tuple(0.0 if joint == "revolute" else float(mean) for joint, mean in means))
+
+
 def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
     """Raises `InputError` for all that `train` would refuse in the data."""
     recipe = RECIPES[problem.name]
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
-    fitted = rates.problem(build(description), *parts, seed=seed, most_samples=recipe.samples)
+    fitted = first_problem(problem, description, parts, seed)
+    if in_velocities(problem, description):
+        engine.require_finite_start(fitted, fitted.arrays)
+        second_problem(problem, description, parts, fitted.parameters, seed)
+        return
     engine.require_finite_start(fitted, rates.samples(problem.fitted))
     if recipe.trajectory_steps:
         windows, validation = (cut_windows(part, recipe.window) for part in parts)
@@ -206,22 +190,44 @@ def train(
     if description["name"] == POLYNOMIAL:
         first = match_linear(model, parts[0], validation=parts[1])[0]
     else:
-        task = rates.problem(model, *parts, seed=seed, most_samples=recipe.samples)
-        first = fitted(RATES, task, recipe.steps, "rates", seconds)
+        first = fitted(RATES, first_problem(problem, description, parts, seed), recipe.steps, "rates", seconds)
     fits = {RATES: first}
     left = seconds - (time.perf_counter() - began)
     if not recipe.trajectory_steps or first.stop.reason == "not finite":
         return _ended(description, fits, RATES, first)
     if first.stop.reason == "time" or left <= 0:
         return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
-    windows = [cut_windows(part, recipe.window) for part in parts]
-    weighted = {"weights": recipe.weights or deviations(parts[0]), "substeps": recipe.substeps, "seed": seed}
-    task = motions.problem(model, first.parameters, *windows, **weighted)
+    task = second_problem(problem, description, parts, first.parameters, seed)
     second = fitted(MOTIONS, task, recipe.trajectory_steps, "trajectories", left, must_start=False)
-    second = second._replace(parameters=second.parameters["model"])
+    if not in_velocities(problem, description):
+        second = second._replace(parameters=second.parameters["model"])
     if second.stop.step and np.isfinite(second.validation):
         fits[MOTIONS] = second
     return _ended(description, fits, MOTIONS, second)
+
+
+def first_problem(
+    problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories], seed: int
+) -> engine.Problem:
+    """The fit of rates: accelerations, or (qd, pd)."""
+    model, most = build(description), RECIPES[problem.name].samples
+    if in_velocities(problem, description):
+        initial = jax.jit(model.init)(jax.random.key(seed))
+        return accelerations.problem(model, initial, *parts, gauge=gauge_of(problem), most_samples=most, seed=seed)
+    return rates.problem(model, *parts, seed=seed, most_samples=most)
+
+
+def second_problem(
+    problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories], start: Any, seed: int
+) -> engine.Problem:
+    """The fit of motions, from parameters of the first fit."""
+    recipe, model = RECIPES[problem.name], build(description)
+    if problem.noise is not None and in_velocities(problem, description):
+        known = {"noise": problem.noise, "gauge": gauge_of(problem), "substeps": recipe.substeps, "seed": seed}
+        windows = [cut_measured_windows(part, recipe.window) for part in parts]
+        return measured_motions.problem(model, start, *windows, **known)
+    weighted = {"weights": recipe.weights or deviations(parts[0]), "substeps": recipe.substeps, "seed": seed}
+    return motions.problem(model, start, *(cut_windows(part, recipe.window) for part in parts), **weighted)
 
 
 def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training) -> Trained:

@@ -1,1 +1,42 @@
-"""What is measured of robots: identification, tracking, learned trees, real logs and speed."""
+"""What is measured of robots: identification, tracking, learned kinematics, real logs and speed."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+from dln_jax.precision import in_float64
+from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.robots import double_pendulum, known_kinematics, learned_kinematics, speed
+from dln_jax.studies.robots.recorded_arm import recorded_arm
+
+MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
+    "arm": {"clean": known_kinematics.clean, "noisy": known_kinematics.noisy},
+    "learned": {
+        "seven-joints": learned_kinematics.seven_joints,
+        "fewer-joints": learned_kinematics.fewer_joints,
+        "fewer-samples": learned_kinematics.fewer_samples,
+    },
+    "speed": {"seven-axis": speed.speed},
+}
+"""quick -> findings, by subject and by name; only `speed` depends on the machine."""
+
+
+def cases(
+    *, quick: bool = False, log: Path | None = None, robot: Path | None = None, pendulum: Path | None = None
+) -> list[Case]:
+    """All cases, named SUBJECT/NAME, in float64; quick ones have fewer seeds and motions.
+
+    Args:
+        quick: less of everything.
+        log, robot: of a recorded arm, and its URDF or MJCF file; without them there is no such case.
+        pendulum: recordings of a double pendulum; likewise.
+    """
+    measures = {f"{subject}/{name}": measure for subject, named in MEASURES.items() for name, measure in named.items()}
+    if log is not None and robot is not None:
+        measures["recordings/arm"] = functools.partial(recorded_arm, log, robot)
+    if pendulum is not None:
+        splits = double_pendulum.HELD_OUT
+        measures["recordings/double-pendulum"] = lambda quick: Findings(
+            double_pendulum.rows(pendulum, splits[:1] if quick else splits)
+        )
+    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]

@@ -13,6 +13,7 @@ from dln_jax.mechanics import integrators
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import Canonical, dynamics, flow
 from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
 from dln_jax.scenes import cart_pole, chain, double_pendulum, n_body
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -24,11 +25,19 @@ FREE = Needs(joints=("revolute", "revolute"), gravity=False)
 BODIES = Needs(joints=("prismatic",) * 4)
 SMALL = {"width": 4, "depth": 1}
 SWING = Needs(joints=("revolute",), friction=True)
+RODS = [inertial_parameters(1.0, [0.1, 0.2, 0.3], np.diag([0.2, 0.3, 0.4]))] * 2
+CART = serial([np.eye(3)] * 2, [[0, 0, 0], [0, 0.1, 0]], RODS, joints=MIXED.joints, axes=[[1, 0, 0], [0, 1, 0]])
 CONVEX = {**SMALL, "activation": "softplus", "iterations": 8}
 MODELS = {
     "structured-delan": {"needs": MIXED, **SMALL},
     "black-box-delan": {"needs": MIXED, **SMALL, "activation": "softplus"},
     "trigonometric": {"needs": FREE, "degree": 1},
+    "rigid-tree": {"needs": MIXED, "tree": tree_to_json(CART)},
+    "rigid-tree-residual": {
+        **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
+    },
+    "planar-chain": {"needs": FREE._replace(gravity=True, friction=True), "armature": True},
+    "learned-tree": {"needs": MIXED._replace(actuation=None)},
     "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
     "structured-hnn": {"needs": MIXED, **SMALL, "friction_width": 2},
     "black-box-hnn": {"needs": MIXED, **CONVEX},
@@ -52,7 +61,7 @@ def run_of(name, precision="f64"):
     """A model whose parameters no initialisation would give: biases are not zero."""
     description = describe(name, precision=precision, **MODELS[name])
     model, random = build(description), np.random.default_rng(3)
-    if name == "trigonometric":  # starts from M = 1, which small changes leave definite
+    if CATALOGUE[name].properties.linear and not CATALOGUE[name].properties.canonical:  # starts from a definite M
         started = model.init(jax.random.key(0))
         return Run(model, jax.tree.map(lambda leaf: leaf + 0.02 * random.normal(size=leaf.shape), started), description)
 

@@ -1,0 +1,87 @@
+"""Options of commands that read logs, and what is said of a log before it is learned from."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dln_jax.command_line.arguments import Unstated, refuse_given
+from dln_jax.data.checks import quick
+from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """How rates come about where a log has none that can be trusted."""
+
+    cutoff: Unstated[str] = None
+    """Low-pass q without delay at so many Hz, and derive the rates from it; auto: a cut-off chosen from the data
+    (default: the rates of the file, by finite differences where it has none)."""
+    decimate: Unstated[int] = None
+    """With --cutoff: keep every so manyth sample, of filtered torques too (default: 1, and torques as they are)."""
+
+
+def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
+    """What the options make of a log; `None` where they leave it as it is.
+
+    Raises:
+        InputError: what is no cut-off, a decimation without one, or what `data.encoders.smooth` refuses.
+    """
+    if given.cutoff is None:
+        refuse_given(given, ["decimate"], "for filtered data: add --cutoff auto")
+        return None
+    cutoff = None if given.cutoff == AUTO else _hertz(given.cutoff)
+    decimate = 1 if given.decimate is None else given.decimate
+    try:
+        return smooth(data, cutoff, decimate=decimate)
+    except InputError as error:
+        raise InputError(f"--cutoff {given.cutoff}: {error}") from None
+
+
+def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
+    """Lines on where rates and torques come from, and how noisy they are."""
+    if found is None:
+        estimated = [key for key in data.estimated if key != "tau"]
+        lines = [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
+        if estimated:
+            lines[0] += "; rates are raw finite differences, which amplify noise: --cutoff auto filters q first"
+        return lines
+    kept = f"{found.rate / found.decimate:.4g} Hz in {found.parts} parts"
+    how = "given" if found.choice is None else "chosen from the spectra of q"
+    lines = [
+        f"rates: q is not filtered, as its noise is too small; derivatives of splines, {kept}"
+        if np.isinf(found.cutoff)
+        else f"rates: q filtered without delay at {found.cutoff:.3g} Hz ({how}), {kept}"
+    ]
+    torque = "filtered alike" if found.filtered_torque else "not filtered"
+    sizes = [", ".join(f"{each:.2g}" for each in noise) for noise in (found.noise_q, found.noise_tau)]
+    lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
+    if found.left_out:
+        lines.append(f"{found.left_out} stretches are too short for the filter and left out")
+    return lines
+
+
+def checked(data: Trajectories, *, without: Collection[str] = ()) -> list[str]:
+    """What the quick part of `check_data` finds, a line each; none where nothing is found.
+
+    Args:
+        data: as they are in the file.
+        without: names of checks that say nothing to this command.
+    """
+    lines = [finding.line for finding in quick(data) if finding.check not in without]
+    return [*lines, "python -m scripts.check_data --data FILE says more"] if lines else []
+
+
+def _hertz(text: str) -> float:
+    try:
+        value: Any = float(text)
+    except ValueError:
+        value = -1.0
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto")
+    return value

@@ -1,0 +1,109 @@
+"""The doctor: all checks in turn, and what they saw beside their findings."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.data.checks.channels import check_channels
+from dln_jax.data.checks.derivatives import check_derivatives
+from dln_jax.data.checks.findings import Finding, told
+from dln_jax.data.checks.recording import Recording, as_recording
+from dln_jax.data.checks.surrogate import Surrogate, surrogate
+from dln_jax.data.checks.times import check_times
+from dln_jax.data.checks.torques import check_degrees, check_torques
+from dln_jax.data.checks.tree import OnTree, against_tree
+from dln_jax.data.encoders.noise import step_of
+from dln_jax.data.encoders.smoothing import Smoothed, smooth
+from dln_jax.data.robots import Robot
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError
+
+FARTHEST = 0.1
+"""s, of a delay between q and tau that is looked for; at most `MOST_SHIFTS` samples."""
+MOST_SHIFTS = 20
+ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
+
+
+class Examination(NamedTuple):
+    """What was found, and what it was found in."""
+
+    findings: list[Finding]
+    """Worst first."""
+    recording: Recording
+    smoothed: Smoothed | None
+    """The log with rates of filtered coordinates; `None` where no stretch is long enough for any."""
+    regression: Surrogate | None
+    """Of its torques; `None` without torques or with too few samples."""
+    on_tree: OnTree | None
+    """What the robot's description says of it; `None` without one."""
+    steps: np.ndarray
+    """Of each encoder, rad or m [d]; zero where there are none."""
+
+
+def quick(data: Trajectories) -> list[Finding]:
+    """Findings without a robot's description, in a second or less for some ten thousand samples."""
+    return examine(as_recording(data)).findings
+
+
+def examine(recording: Recording, robot: Robot | None = None) -> Examination:
+    """All checks.
+
+    Raises:
+        InputError: the robot has another number of joints than the data.
+    """
+    data = recording.data
+    d = data.degrees_of_freedom
+    joints = data.needs.joints if data.needs is not None else ("revolute",) * d
+    if robot is not None:
+        joints = robot.tree.joints
+        if len(joints) != d:
+            raise InputError(f"the robot has {len(joints)} joints, but the data have {d}; give those that it moves")
+    findings = [*recording.repaired, *check_times(data)]
+    even = _even(data)
+    findings += check_channels(data, None if even is None else even.data.qd)
+    regression = None
+    driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
+    if even is not None:
+        findings += _noise(data, even)
+        findings += check_derivatives(data, even)
+        farthest = _farthest(even)
+        regression = surrogate(even.data, joints, farthest=farthest) if driven else None
+        findings += check_degrees(even.data, joints, regression, farthest)
+        if regression is not None:
+            stated = data.needs is not None and data.needs.friction
+            findings += check_torques(even.data, regression, friction_stated=stated)
+    on_tree = None
+    if robot is not None:
+        samples = even.data if even is not None else data
+        farthest = 0 if even is None else _farthest(even)
+        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest)
+        # What the tree says of signs and delays is surer.
+        findings = [each for each in findings if each.check != "delay"]
+        if any(each.check == "tree-sign" for each in on_tree.findings):
+            findings = [each for each in findings if each.check != "torque-sign"]
+        findings += on_tree.findings
+    return Examination(told(findings), recording, even, regression, on_tree, step_of(data.q))
+
+
+def _farthest(even: Smoothed) -> int:
+    return int(np.clip(round(FARTHEST * even.rate), 2, MOST_SHIFTS))
+
+
+def _even(data: Trajectories) -> Smoothed | None:
+    try:
+        return smooth(data, trim=0.0)
+    except InputError:  # single states, or motions of a few samples: nothing to say of their rates
+        return None
+
+
+def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
+    """Raw differences of a noisy q."""
+    estimated = [key for key in ("qd", "qdd") if key in data.estimated]
+    if not estimated or np.isinf(even.cutoff) or even.choice is None:
+        return []
+    amplified = even.noise_q * (even.rate * np.sqrt(6) / 4)  # of central differences taken twice: sqrt(6) / (4 dt²)
+    share = amplified * even.rate / np.maximum(even.data.qdd.std(axis=0), np.finfo(float).tiny)
+    if share.max() < 0.05:
+        return []
+    said = f"accelerations by differences of this q are noise to {100 * share.max():.0f} % of their size"
+    return [Finding("warning", "raw-differences", said, ESTIMATED)]

@@ -1,0 +1,136 @@
+"""A cut-off from the data: the one at which accelerations are expected to be best.
+
+The spectrum of each coordinate is that of its motion, S(f), above a floor N of noise, which is white. A filter of gain
+H leaves of the motion's acceleration 1 - H missing, and lets H of the noise's through:
+
+    E(cutoff) = sum over joints of  integral (2 pi f)^4 [(1 - H)² S + H² N] df  /  integral (2 pi f)^4 S df
+
+The weight of frequencies falls out of the place of the minimum for a steep filter, which is where S = N whatever is
+differentiated: so one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967), so that
+the motion does not leak into the floor, and divided by the gain of the differences.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dln_jax.data.encoders.filters import ORDER, gain
+from dln_jax.types import InputError, require_positive
+
+SEGMENT = 8.0
+"""s, of a stretch whose spectrum is taken at a time."""
+SEEN = 1.5
+"""Times the floor, above which a smoothed spectrum is that of a motion."""
+CANDIDATES = 200
+"""Cut-offs that are tried."""
+TOP = 0.45
+"""Of the rate: where the best cut-off would be no lower, nothing is to be filtered."""
+MOVES = 2.0
+"""Standard deviations of noise, by more than which a joint has to move."""
+WORTH = 1e-4
+"""Relative error of unfiltered accelerations, below which nothing is to be filtered either."""
+
+
+class Choice(NamedTuple):
+    """The cut-off, and what it was chosen from, to be drawn."""
+
+    cutoff: float
+    """Hz; infinite where noise is too small to be worth a filter."""
+    tried: Float[np.ndarray, " C"]
+    """Hz."""
+    error: Float[np.ndarray, " C"]
+    """E of each: expected relative error of the accelerations, squared, mean over joints."""
+    f: Float[np.ndarray, " F"]
+    """Hz."""
+    spectrum: Float[np.ndarray, "F d"]
+    """Of q, (rad or m)² / Hz."""
+    floor: Float[np.ndarray, " d"]
+    """N, likewise."""
+
+
+def choose_cutoff(
+    q: Float[np.ndarray, "N d"],
+    trajectory: Int[np.ndarray, " N"],
+    *,
+    rate: float,
+    noise: Float[np.ndarray, " d"],
+    order: int = ORDER,
+) -> Choice:
+    """The cut-off of least expected error.
+
+    Args:
+        q: at equal steps.
+        trajectory: that each sample belongs to.
+        rate: Hz.
+        noise: standard deviation of each coordinate's.
+        order: of the filter.
+
+    Raises:
+        InputError: no stretch has sixteen samples, or nothing moves by more than its noise.
+    """
+    require_positive(rate=rate, order=order)
+    f, spectrum = spectra(q, trajectory, rate=rate)
+    floor = 2 * noise**2 / rate
+    signal = _motion(f, spectrum, floor)
+    tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
+    weight = (2 * np.pi * f) ** 4
+    sizes = weight @ signal
+    moves = (sizes > 0) & (q.std(axis=0) > MOVES * noise)
+    if not moves.any():
+        raise InputError("no joint moves by more than its noise; a cut-off takes motions: give one, or look at q")
+    error = np.empty(CANDIDATES)
+    for place, cutoff in enumerate(tried):
+        H = gain(f, float(cutoff), order)[:, None]
+        left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
+        error[place] = np.mean(left[moves] / sizes[moves])
+    best = int(np.argmin(error))
+    raw = np.mean((weight @ np.broadcast_to(floor, spectrum.shape))[moves] / sizes[moves])
+    cutoff = float(tried[best]) if best < CANDIDATES - 1 and raw > WORTH**2 else np.inf
+    return Choice(cutoff, tried, error, f, spectrum, floor)
+
+
+def spectra(
+    values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], *, rate: float
+) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F k"]]:
+    """Frequencies above zero, in Hz, and the power spectrum of each channel, in its unit² / Hz, mean over stretches.
+
+    Raises:
+        InputError: no trajectory has sixteen samples.
+    """
+    from scipy.signal import welch
+
+    parts = [part for part in np.split(values, np.flatnonzero(np.diff(trajectory)) + 1) if len(part) >= 16]
+    if not parts:
+        raise InputError("no stretch has 16 samples; a spectrum takes longer motions: record some, or give a cut-off")
+    length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
+    total, weight = 0.0, 0
+    f = np.zeros(0)
+    for part in parts:
+        changes = np.diff(part, n=2, axis=0)
+        if len(changes) < length:
+            changes = np.concatenate([changes, np.zeros((length - len(changes), changes.shape[1]))])
+        f, power = welch(changes, fs=rate, nperseg=length, axis=0)
+        total, weight = total + len(part) * power * (length / min(length, len(part) - 2)), weight + len(part)
+    power = np.asarray(total)[1:] / weight
+    return f[1:], power / (2 * np.sin(np.pi * f[1:, None] / rate)) ** 4
+
+
+def _motion(
+    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "F d"]:
+    """S of each joint: what stands out of the floor, up to where it first does not."""
+    smooth = _smoothed(spectrum)
+    hidden = np.cumsum(smooth < SEEN * floor, axis=0) > 0
+    return np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
+
+
+def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
+    """Geometric mean over a sixth of an octave to either side, so that single lines do not end a motion."""
+    logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
+    summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
+    place = np.arange(1, len(spectrum) + 1)
+    low = np.floor(place * 2 ** (-1 / 6)).astype(int) - 1
+    high = np.minimum(np.ceil(place * 2 ** (1 / 6)).astype(int), len(spectrum))
+    low = np.maximum(low, 0)
+    return np.exp((summed[high] - summed[low]) / (high - low)[:, None])

@@ -1,0 +1,189 @@
+"""From q, t and tau of a log to trajectories with rates.
+
+1. Gaps cut a trajectory, short ones are bridged; samples at unequal steps are interpolated to one rate.
+2. The noise of each channel is estimated, and from it and the spectra of q the cut-off, unless that is given.
+3. q is filtered without delay, and qd and qdd are derivatives of the result; tau is filtered too where samples are left
+   out, which it has to be, and where one asks for it.
+4. Ends are trimmed, where a filter knows one side only, and every k-th sample is kept.
+
+Torques are left as they are by default: least squares average their noise away, while filtered torques of a model with
+dry friction belong to no state, see `filters`: on a simulated seven-axis arm they cost a factor of 1.6
+(`studies.encoder_data`).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.encoders import sampling
+from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
+from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
+from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError, require_positive
+
+SHORTEST = 4.0
+"""Periods of the cut-off: shorter stretches are left out."""
+TRIMMED = 1.5
+"""Periods of the cut-off, from which on accelerations are as good as in the middle."""
+PART = "/"
+"""Between a trajectory's label and the number of its part."""
+
+
+class Smoothed(NamedTuple):
+    """Trajectories whose rates come from filtered coordinates, and how they came about."""
+
+    data: Trajectories
+    """q, qd, qdd and tau at equal steps; what else the log had is left out."""
+    cutoff: float
+    """Hz, of the filter; infinite where there was none."""
+    rate: float
+    """Hz, of the samples before decimation."""
+    noise_q: Float[np.ndarray, " d"]
+    """Standard deviation of each encoder's noise, rad or m."""
+    noise_tau: Float[np.ndarray, " d"]
+    """That of each torque of `data`, N m or N: its square root is the weight of an equation. Zero without torques."""
+    choice: Choice | None
+    """What the cut-off was chosen from; `None` where it was given."""
+    order: int
+    filtered_torque: bool
+    decimate: int
+    trim: float
+    """s, at both ends of each part."""
+    bridged: int
+    """Gaps that were interpolated."""
+    parts: int
+    """Trajectories, after cuts at longer gaps."""
+    left_out: int
+    """Stretches that were too short."""
+
+
+def smooth(
+    data: Trajectories,
+    cutoff: float | None = None,
+    *,
+    order: int = ORDER,
+    rate: float | None = None,
+    filter_torque: bool | None = None,
+    decimate: int = 1,
+    trim: float | None = None,
+    bridged: float = sampling.BRIDGED,
+) -> Smoothed:
+    """Trajectories of q, t and tau with rates that are fit to be learned from; rates that they had are not used.
+
+    Args:
+        data: a log.
+        cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
+        order: of the Butterworth filter, which acts twice.
+        rate: Hz, of equal steps (default: the median of the data's own).
+        filter_torque: whether tau goes through the same filter (default: only where samples are left out).
+        decimate: every so manyth sample is kept.
+        trim: s that are cut off at both ends of each part (default: 1.5 periods of the cut-off).
+        bridged: times the median step, up to which a gap is interpolated; longer ones cut a trajectory in parts that
+            are named LABEL/1, LABEL/2, ...
+
+    Raises:
+        InputError: settings out of range, a decimation that leaves less than twice the cut-off, or no stretch that is
+            long enough.
+    """
+    require_positive(order=order, decimate=decimate)
+    if trim is not None and not trim >= 0:
+        raise InputError(f"trim is {trim}; expected seconds >= 0")
+    if rate is None:
+        # Differences of times are rounded.
+        rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
+    require_positive(rate=rate)
+    pieces = sampling.stretches(data.t, data.trajectory, gap=bridged)
+    gaps = len(sampling.stretches(data.t, data.trajectory)) - len(pieces)
+    uniform = _Uniform.of(data, pieces, rate)
+    noise_q, noise_tau = (noise_of(values, uniform.part) for values in (uniform.q, uniform.tau))
+    choice = None
+    if cutoff is None:
+        choice = choose_cutoff(uniform.q, uniform.part, rate=rate, noise=noise_q, order=order)
+        cutoff = choice.cutoff
+    require_positive(cutoff=cutoff)
+    slowest = rate / decimate / 2
+    if decimate > 1 and not cutoff < slowest:
+        raise InputError(
+            f"decimate is {decimate}, which leaves {rate / decimate:g} Hz; expected more than twice the cut-off of "
+            f"{cutoff:g} Hz: keep more samples, or lower the cut-off"
+        )
+    filtered = decimate > 1 if filter_torque is None else filter_torque
+    trim = (0.0 if np.isinf(cutoff) else TRIMMED / cutoff) if trim is None else trim
+    shortest = max(6, round(SHORTEST * rate / cutoff) + 1, 2 * round(trim * rate) + 2 * decimate)
+    kept = [index for index in range(len(pieces)) if np.sum(uniform.part == index) >= shortest]
+    if not kept:
+        raise InputError(
+            f"no stretch without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
+            "longer motions, or give a higher cut-off"
+        )
+    smoothed = _filtered(data, pieces, uniform, kept, rate, cutoff, order, filtered, trim, decimate)
+    share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
+    return Smoothed(
+        smoothed, cutoff, rate, noise_q, noise_tau * share, choice, order, filtered, decimate, trim,
+        bridged=gaps, parts=len(kept), left_out=len(pieces) - len(kept),
+    )  # fmt: skip
+
+
+def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
+    """The labels that these have become where gaps have cut their trajectories; what is unknown stays as it is."""
+    found: list[str] = []
+    for label in labels:
+        parts = [each for each in data.label if each.rpartition(PART)[0] == label]
+        found.extend([label] if label in data.label or not parts else parts)
+    return found
+
+
+class _Uniform(NamedTuple):
+    """Stretches at equal steps, end to end."""
+
+    t: np.ndarray
+    q: np.ndarray
+    tau: np.ndarray
+    part: np.ndarray
+
+    @classmethod
+    def of(cls, data: Trajectories, pieces: list[np.ndarray], rate: float) -> "_Uniform":
+        values, d = np.hstack([data.q, data.tau]), data.degrees_of_freedom
+        resampled = [sampling.even(data.t[piece], values[piece], rate) for piece in pieces]
+        joined = np.concatenate([each for _, each in resampled])
+        part = np.repeat(np.arange(len(pieces)), [len(t) for t, _ in resampled])
+        return cls(np.concatenate([t for t, _ in resampled]), joined[:, :d], joined[:, d:], part)
+
+
+def _filtered(
+    data: Trajectories,
+    pieces: list[np.ndarray],
+    uniform: _Uniform,
+    kept: list[int],
+    rate: float,
+    cutoff: float,
+    order: int,
+    filtered: bool,
+    trim: float,
+    decimate: int,
+) -> Trajectories:
+    """The kept stretches with rates, trimmed and decimated, each a trajectory of its own."""
+    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
+    of = [int(data.trajectory[pieces[index][0]]) for index in kept]
+    for index in kept:
+        here = uniform.part == index
+        q = low_pass(uniform.q[here], rate=rate, cutoff=cutoff, order=order)
+        tau = low_pass(uniform.tau[here], rate=rate, cutoff=cutoff, order=order) if filtered else uniform.tau[here]
+        ends = round(trim * rate)
+        inside = slice(ends, len(q) - ends, decimate)
+        for key, array in zip(columns, (uniform.t[here], q, *derivatives(q, rate=rate), tau), strict=True):
+            columns[key].append(array[inside])
+    label = [
+        str(data.label[each]) + (f"{PART}{of[: place + 1].count(each)}" if of.count(each) > 1 else "")
+        for place, each in enumerate(of)
+    ]
+    joined = {key: np.concatenate(parts) for key, parts in columns.items()}
+    trajectory = np.repeat(np.arange(len(kept)), [len(part) for part in columns["t"]])
+    return data._replace(
+        **joined, trajectory=trajectory, label=np.array(label), p=None, pd=None,
+        tau_inertial=None, tau_coriolis=None, tau_gravity=None,
+        estimated=tuple(key for key in data.estimated if key == "tau"),
+    )  # fmt: skip

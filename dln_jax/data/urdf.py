@@ -1,0 +1,85 @@
+"""What a URDF file says of inertias, in the frames of its links, whether or not a body could have them."""
+
+import contextlib
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+
+import numpy as np
+
+from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
+from dln_jax.types import InputError
+
+MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+
+
+def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
+    """The ten inertial parameters of each link that states them, by name.
+
+    Raises:
+        InputError: one that is incomplete, no number, or has a mass below zero.
+    """
+    found = {}
+    for link in root.findall("link"):
+        inertial = link.find("inertial")
+        if inertial is not None:
+            name = link.get("name", "")
+            try:
+                found[name] = _parameters(inertial)
+            except (AttributeError, TypeError, ValueError):
+                raise InputError(
+                    f"link '{name}' has an <inertial> that is incomplete; expected a mass, not below zero, and six "
+                    "moments, all finite numbers"
+                ) from None
+    return found
+
+
+def velocity_limits(root: ET.Element, names: Sequence[str]) -> np.ndarray:
+    """What <limit velocity="..."> of each joint says, rad/s or m/s; infinite where it says nothing."""
+    stated = {}
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        velocity = "" if limit is None else limit.get("velocity", "")
+        with contextlib.suppress(ValueError):
+            stated[joint.get("name")] = float(velocity)
+    # Some files write 0 for what nobody knows.
+    return np.array([stated[name] if stated.get(name, 0.0) > 0 else np.inf for name in names])
+
+
+def without_inertias(root: ET.Element) -> ET.Element:
+    """The file as MuJoCo is to have it: no shapes, every link a body of its own, with an inertia that it takes."""
+    for link in root.iter("link"):
+        for part in [*link.findall("visual"), *link.findall("collision"), *link.findall("inertial")]:
+            link.remove(part)
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "mass", value="1")
+        ET.SubElement(inertial, "inertia", ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1")
+    for settings in root.findall("mujoco"):
+        root.remove(settings)
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="false")
+    return root
+
+
+def _parameters(inertial: ET.Element) -> np.ndarray:
+    origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
+    m = float(mass.get("value"))  # type: ignore[union-attr, arg-type]
+    moments = np.array([[float(inertia.get(key)) for key in row] for row in MOMENTS])  # type: ignore[union-attr, arg-type]
+    xyz, rpy = (_vector(origin, key) for key in ("xyz", "rpy"))
+    if not (m >= 0 and np.isfinite([m, *moments.ravel(), *xyz, *rpy]).all()):
+        raise ValueError
+    return np.asarray(moved(inertial_parameters(m, np.zeros(3), moments), _turned(rpy), xyz))
+
+
+def _vector(origin: ET.Element | None, key: str) -> np.ndarray:
+    found = np.array((origin.get(key, "0 0 0") if origin is not None else "0 0 0").split(), float)
+    if found.shape != (3,):
+        raise ValueError
+    return found
+
+
+def _turned(rpy: np.ndarray) -> np.ndarray:
+    """About the fixed axes x, y, z in turn."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x

@@ -1,0 +1,90 @@
+"""Motions as finite Fourier series of one period, from rest to rest.
+
+    q(t) = offset + sum over k = 1..H of s_k sin(k w t) + c_k cos(k w t),   w = 2 pi / period
+
+after Swevers, Ganseman, Tukel, De Schutter and Van Brussel (1997, IEEE T-RA 13, "Optimal robot excitation and
+identification"): rates are exact, the spectrum is known, and a motion may be repeated for ever. Velocity and
+acceleration vanish at both ends exactly if sum k s_k = 0 and sum k² c_k = 0, two equations for each joint that
+`rest_basis` solves once and for all.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.types import InputError, Scalar, Vector, require_positive
+
+MOST_HARMONICS = 50
+"""Of a motion that is designed: more are no smooth motion, and take hours."""
+
+
+class FourierMotion(NamedTuple):
+    """A periodic motion of d joints, of H harmonics."""
+
+    offset: Any
+    """[d], the mean posture, rad or m."""
+    coefficients: Any
+    """[d, 2 H]: s_1 .. s_H, c_1 .. c_H; rad or m."""
+    period: float
+    """s."""
+
+    @property
+    def harmonics(self) -> int:
+        """H."""
+        return np.shape(self.coefficients)[1] // 2
+
+
+def state(motion: FourierMotion, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
+    """q, qd and qdd [d] at one time, s."""
+    values = harmonic_functions(motion.harmonics, motion.period, t)
+    q, qd, qdd = (motion.coefficients @ each for each in values)
+    return motion.offset + q, qd, qdd
+
+
+def sampled(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
+    """q, qd and qdd at many times."""
+    return jax.vmap(lambda each: state(motion, each))(jnp.asarray(t))
+
+
+def harmonic_functions(harmonics: int, period: float, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
+    """sin(k w t) for k = 1..H, then cos(k w t), and their first and second derivatives; each [2 H]."""
+    rates = 2 * np.pi / period * np.arange(1, harmonics + 1)
+    sines, cosines = jnp.sin(rates * t), jnp.cos(rates * t)
+    values = jnp.concatenate([sines, cosines])
+    slopes = jnp.concatenate([rates * cosines, -rates * sines])
+    return values, slopes, -(jnp.concatenate([rates, rates]) ** 2) * values
+
+
+def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
+    """Orthonormal columns [2 H, 2 H - 2] that span all coefficients of a joint that rests at both ends.
+
+    Raises:
+        InputError: fewer than two harmonics, of which none moves from rest to rest, or more than `MOST_HARMONICS`.
+    """
+    if not 2 <= harmonics <= MOST_HARMONICS:
+        raise InputError(
+            f"harmonics is {harmonics}; expected 2, with which a motion can start and end at rest, to {MOST_HARMONICS}"
+        )
+    orders = np.arange(1.0, harmonics + 1)
+    basis = np.zeros((2 * harmonics, 2 * harmonics - 2))
+    for place, equation in enumerate((orders, orders**2)):
+        rows = slice(place * harmonics, (place + 1) * harmonics)
+        columns = slice(place * (harmonics - 1), (place + 1) * (harmonics - 1))
+        # All but the first right singular vector are orthogonal to the equation.
+        basis[rows, columns] = np.linalg.svd(equation[None, :])[2][1:].T
+    return basis
+
+
+def require_sampling(*, period: float, harmonics: int, rate: float) -> None:
+    """Raises `InputError` unless the highest harmonic is below half the sampling rate, in Hz."""
+    require_positive(seconds=period, harmonics=harmonics, rate=rate)
+    highest = harmonics / period
+    if highest >= rate / 2:
+        raise InputError(
+            f"{harmonics} harmonics of {period:g} s reach {highest:g} Hz, beyond half the sampling rate of {rate:g} "
+            "Hz; take fewer harmonics, more seconds or a higher rate"
+        )

@@ -1,0 +1,166 @@
+"""What a motion must keep to, and by how much it keeps to it.
+
+Every limit is a number that is at most zero where it is kept, relative to the size of the limit:
+
+    |x - middle| / half - 1   for positions, velocities, accelerations and forces,   -clearance / 1 m
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.robots import Robot
+from dln_jax.mechanics.trees import Tree, world_frames
+from dln_jax.types import InputError, Vector
+
+SECONDS_TO_SPEED = 0.2
+"""s in which a joint is assumed to reach full velocity, where no acceleration is stated."""
+Clearance = Callable[[Array], Array]
+"""q -> [K], m, each to stay positive: such as heights of the links above a table."""
+
+
+class MotionLimits(NamedTuple):
+    """Of d joints."""
+
+    position: Float[np.ndarray, "d 2"]
+    """Lower and upper, rad or m; finite."""
+    velocity: Float[np.ndarray, " d"]
+    """1/s or m/s; finite."""
+    acceleration: Float[np.ndarray, " d"]
+    """1/s² or m/s²; finite."""
+    force: Float[np.ndarray, "d 2"]
+    """Lower and upper, N m or N; infinite, both, where a joint has none."""
+
+
+class Excess(NamedTuple):
+    """By how much one state is beyond each limit, relative to it; negative inside, `None` where there is no limit."""
+
+    position: Any
+    """[d]."""
+    velocity: Any
+    """[d]."""
+    acceleration: Any
+    """[d]."""
+    force: Any
+    """[joints with limits]."""
+    clearance: Any
+    """[K], m."""
+
+
+def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[str, ...] = ()) -> None:
+    """Raises `InputError` that names the first joint whose limits are absent, empty or not numbers."""
+    d = degrees_of_freedom
+    for kind, shape in (("position", (d, 2)), ("velocity", (d,)), ("acceleration", (d,)), ("force", (d, 2))):
+        array = np.asarray(getattr(limits, kind))
+        if array.shape != shape:
+            raise InputError(f"limits of {kind} have shape {array.shape}; expected {shape}")
+        for joint, given in enumerate(array):
+            name = names[joint] if names else str(joint)
+            if np.isnan(given).any() or (kind != "force" and np.isinf(given).any()):
+                raise InputError(f"joint '{name}' has no limit of {kind}; state one")
+            if np.isinf(given).any() and not (given[0] == -np.inf and given[1] == np.inf):
+                raise InputError(f"joint '{name}' has a limit of {kind} on one side, {given}; expected both or none")
+            if not (given[0] < given[1] if len(shape) == 2 else given > 0):
+                raise InputError(f"joint '{name}' has limits of {kind} {given}; expected lower < upper, and rates > 0")
+
+
+def limits_of_robot(
+    robot: Robot, *, position: Any = None, velocity: Any = None, acceleration: Any = None, force: Any = None
+) -> tuple[MotionLimits, list[str]]:
+    """The limits that a robot's file states, those given in their place, and in words what is assumed of others.
+
+    A joint without limits of position may turn by pi to either side; it may take `SECONDS_TO_SPEED` to its full
+    velocity; its force is free. Velocities are not assumed.
+
+    Args:
+        robot: as read.
+        position: half the range, about zero, rad or m; like all others one for all joints, or [d].
+        velocity: 1/s or m/s.
+        acceleration: 1/s² or m/s².
+        force: N m or N, in either direction.
+
+    Raises:
+        InputError: no limit of velocity, a prismatic joint without one of position, or another number of them.
+    """
+    tree, said = robot.tree, []
+    d, names = tree.degrees_of_freedom, tree.names or tuple(map(str, range(tree.degrees_of_freedom)))
+    given = {"position": position, "velocity": velocity, "acceleration": acceleration, "force": force}
+    for kind, each in given.items():
+        if each is not None and np.size(each) not in (1, d):
+            raise InputError(f"{kind} has {np.size(each)} numbers; expected one, or one for each of the {d} joints")
+    sizes = {kind: None if each is None else np.broadcast_to(np.ravel(each), d) for kind, each in given.items()}
+
+    def about_zero(half: Any) -> np.ndarray:
+        return np.stack([-np.asarray(half), np.asarray(half)], axis=1)
+
+    positions = robot.position_limits if sizes["position"] is None else about_zero(sizes["position"])
+    free = np.logical_not(np.isfinite(positions).all(axis=1)) & (np.array(tree.joints) == "revolute")
+    if free.any():
+        said.append(f"no limits of position for {_listed(names, free)}: pi to either side is assumed")
+        positions = np.where(free[:, None], about_zero(np.full(d, np.pi)), positions)
+    velocities = np.broadcast_to(robot.velocity_limits, d) if sizes["velocity"] is None else sizes["velocity"]
+    accelerations = sizes["acceleration"]
+    if accelerations is None:
+        said.append(f"no limits of acceleration: full velocity in {SECONDS_TO_SPEED} s is assumed")
+        accelerations = velocities / SECONDS_TO_SPEED
+    forces = robot.force_limits if sizes["force"] is None else about_zero(sizes["force"])
+    unbounded = np.logical_not(np.isfinite(forces).all(axis=1))
+    if unbounded.any():
+        said.append(f"no limits of force for {_listed(names, unbounded)}: any is allowed")
+    limits = MotionLimits(positions, velocities, accelerations, forces)
+    require_limits(limits, d, names)
+    return limits, said
+
+
+def _listed(names: tuple[str, ...], which: np.ndarray) -> str:
+    return "any joint" if which.all() else ", ".join(name for name, there in zip(names, which, strict=True) if there)
+
+
+def heights_above(tree: Tree, height: float) -> Clearance | None:
+    """How far the origins of links are above a plane z = height, m, of those that can rise and sink; `None` without."""
+    drawn = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
+    rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in drawn], axis=0) > 1e-9
+    return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
+
+
+def used(limits: MotionLimits, share: float) -> MotionLimits:
+    """The limits of which a motion uses a share, in (0, 1]; ranges shrink towards their middles.
+
+    Raises:
+        InputError: another share.
+    """
+    if not 0 < share <= 1:
+        raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")
+    middle = limits.position.mean(axis=1, keepdims=True)
+    position = middle + share * (limits.position - middle)
+    return MotionLimits(position, share * limits.velocity, share * limits.acceleration, share * limits.force)
+
+
+def excess(
+    limits: MotionLimits, clearance: Clearance | None, q: Vector, qd: Vector, qdd: Vector, tau: Vector
+) -> Excess:
+    """Of one state and its force."""
+    bounded = np.isfinite(limits.force).all(axis=1)
+    return Excess(
+        position=_beyond(limits.position, q),
+        velocity=jnp.abs(qd) / limits.velocity - 1,
+        acceleration=jnp.abs(qdd) / limits.acceleration - 1,
+        force=_beyond(limits.force[bounded], tau[bounded]) if bounded.any() else None,
+        clearance=None if clearance is None else -clearance(q),
+    )
+
+
+def _beyond(bounds: np.ndarray, x: Array) -> Array:
+    middle, half = bounds.mean(axis=1), np.diff(bounds, axis=1)[:, 0] / 2
+    return jnp.abs(x - middle) / half - 1
+
+
+def worst(found: Excess) -> tuple[float, str]:
+    """The largest excess of all samples, and of which limit; the last axis of each is that of `excess`."""
+    largest = {kind: float(np.max(each)) for kind, each in found._asdict().items() if each is not None}
+    kind = max(largest, key=lambda each: largest[each])
+    return largest[kind], kind

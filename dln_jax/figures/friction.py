@@ -1,0 +1,88 @@
+"""Friction of joints against their rates: curves of fits, with measured points behind, and the laws side by side."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.figures import style
+from dln_jax.mechanics.friction import FrictionShape, unit_force
+from dln_jax.mechanics.loaded import Load, carrying
+
+MOST_POINTS = 4000
+"""Of a joint that are drawn."""
+MOST_COLUMNS = 4
+
+
+def friction_curves(
+    curves: Mapping[str, tuple[Any, Any]],
+    *,
+    names: Sequence[str] = (),
+    measured: tuple[Any, Any] | None = None,
+    rate_unit: str = "rad/s",
+    force_unit: str = "N m",
+) -> Figure:
+    """A panel for each joint.
+
+    Args:
+        curves: by name, rates [N, d] of joints, in any order, and forces [N, d].
+        names: of the joints; by default their numbers.
+        measured: rates and forces [N, d], such as torque less that of the links, drawn as points.
+        rate_unit: of all.
+        force_unit: of all.
+    """
+    arrays = {name: tuple(np.atleast_2d(np.asarray(each, float)) for each in pair) for name, pair in curves.items()}
+    d = next(iter(arrays.values()))[0].shape[1]
+    columns = min(d, MOST_COLUMNS)
+    rows = -(-d // columns)
+    figure, axes = style.figure(rows, columns, height=0.6 + 2.4 * rows)
+    for joint, axis in enumerate(axes.flat):
+        if joint >= d:
+            axis.set_visible(False)
+            continue
+        if measured is not None:
+            rates, forces = (np.asarray(each)[:, joint] for each in measured)
+            every = slice(None, None, -(-len(rates) // MOST_POINTS))
+            axis.plot(rates[every], forces[every], ".", color=style.REFERENCE, markersize=1.5, rasterized=True)
+        for place, (name, (rates, forces)) in enumerate(arrays.items()):
+            order = np.argsort(rates[:, joint])
+            colour = style.CYCLE[place % len(style.CYCLE)]
+            axis.plot(rates[order, joint], forces[order, joint], color=colour, linewidth=1.3, label=name)
+        axis.axhline(0, color="black", linewidth=0.5)
+        axis.locator_params(axis="x", nbins=5)
+        if d > 1:
+            style.title(axis, names[joint] if names else f"joint {joint + 1}")
+        if joint >= d - columns:
+            axis.set_xlabel(f"rate, {rate_unit}")
+        if joint % columns == 0:
+            axis.set_ylabel(f"friction, {force_unit}")
+    style.legend(figure, *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(arrays), 4))
+    return figure
+
+
+def friction_laws() -> Figure:
+    """Each law with typical numbers, over the rate of one joint: `docs/friction.png`."""
+    shape = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.15, sigmoid_slope=12.0, sigmoid_shift=0.05)
+    rates = jnp.linspace(-0.6, 0.6, 1201)
+    sums: dict[str, dict[str, float]] = {
+        "viscous": {"viscous": 1.0},
+        "coulomb": {"coulomb": 0.5},
+        "coulomb + stribeck": {"coulomb": 0.5, "stribeck": 0.4},
+        "asymmetric": {
+            "viscous_forward": 0.2,
+            "viscous_backward": 0.9,
+            "coulomb_forward": 0.35,
+            "coulomb_backward": 0.15,
+        },
+        "sigmoid": {"sigmoid": 1.0},
+        "offset": {"offset": 0.05},
+    }
+    forces = {
+        name: jnp.sum(jnp.stack([size * unit_force(law, rates, shape) for law, size in each.items()]), axis=0)
+        for name, each in sums.items()
+    }
+    link = jnp.ones_like(rates)
+    forces["load, 1 N m carried"] = carrying(Load(0.25, shape.velocity_scale), rates, link) - link
+    return friction_curves({name: (rates[:, None], force[:, None]) for name, force in forces.items()})

@@ -1,0 +1,120 @@
+"""Pictures of a log: its spectra with the cut-off, the delay of its torques, and torque against velocity."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dln_jax.data.checks import Examination
+from dln_jax.data.encoders import Smoothed
+from dln_jax.figures import style
+
+MOST_JOINTS = 9
+"""Whose friction is shown."""
+COLUMNS = 3
+MOST_POINTS = 3000
+"""Of a joint."""
+
+
+def cutoff_figure(smoothed: Smoothed) -> Figure:
+    """Spectra of q above their floors of noise, and below them the error that each cut-off is expected to leave.
+
+    `smoothed` is what `data.encoders.smooth` gave without a cut-off of one's own.
+    """
+    figure, axes = style.figure(2, 1, height=4.6, sharex=True, height_ratios=[1.4, 1.0])
+    _spectra(axes[0, 0], smoothed)
+    _expected(axes[1, 0], smoothed)
+    axes[0, 0].set_xlabel("")
+    return figure
+
+
+def log_figure(examined: Examination) -> Figure:
+    """One page: spectra and cut-off, time steps or delay, and the torque that friction has part in, joint by joint."""
+    regression, smoothed = examined.regression, examined.smoothed
+    on_tree = examined.on_tree
+    seen = on_tree.friction if on_tree is not None and on_tree.friction is not None else regression
+    joints = 0 if seen is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)
+    rows = 1 + -(-joints // COLUMNS)
+    figure, axes = style.figure(rows, COLUMNS, height=2.3 * rows + 0.3)
+    if smoothed is not None and smoothed.choice is not None:
+        _spectra(axes[0, 0], smoothed)
+        _expected(axes[0, 1], smoothed)
+    else:
+        axes[0, 0].set_axis_off()
+        axes[0, 1].set_axis_off()
+    if regression is not None and smoothed is not None:
+        _delays(axes[0, 2], examined)
+    else:
+        _steps(axes[0, 2], examined)
+    for place, axis in enumerate(axes[1:].flat):
+        if seen is None or smoothed is None or place >= joints:
+            axis.set_axis_off()
+            continue
+        qd = smoothed.data.qd[seen.rows, place]
+        shown = slice(None, None, -(-len(qd) // MOST_POINTS))
+        axis.plot(qd[shown], seen.rest[shown, place], ".", color="0.6", markersize=1.5)
+        speeds = np.linspace(qd.min(), qd.max(), 200)
+        dry = seen.coulomb[place] * np.tanh(speeds / seen.velocity_scale[place])
+        offset = float(np.mean(seen.rest[:, place]))
+        axis.plot(speeds, seen.viscous[place] * speeds + dry + offset, color=style.VERMILLION, linewidth=1.3)
+        style.title(axis, f"joint {place + 1}: {seen.explained[place]:.0%} explained")
+        axis.set_xlabel("velocity, 1/s")
+        if place % COLUMNS == 0:
+            axis.set_ylabel("friction and error, N m")
+    return figure
+
+
+def _spectra(axis: Axes, smoothed: Smoothed) -> None:
+    choice = smoothed.choice
+    if choice is None:
+        raise ValueError("the cut-off was given, not chosen")
+    for joint, shade in zip(range(choice.spectrum.shape[1]), [*style.CYCLE, *style.CYCLE], strict=False):
+        axis.loglog(choice.f, choice.spectrum[:, joint], color=shade, linewidth=0.8, label=f"{joint + 1}")
+        if choice.floor[joint] > 0:
+            axis.axhline(choice.floor[joint], color=shade, linewidth=0.6, linestyle=":")
+    if np.isfinite(smoothed.cutoff):
+        axis.axvline(smoothed.cutoff, color=style.VERMILLION, linewidth=1.0)
+    axis.set_xlabel("frequency, Hz")
+    axis.set_ylabel("spectrum of q, rad²/Hz")
+    style.legend(axis, ncols=2, handlelength=0.8, columnspacing=0.8, loc="lower left", fontsize=6.5)
+
+
+def _expected(axis: Axes, smoothed: Smoothed) -> None:
+    choice = smoothed.choice
+    if choice is None:
+        raise ValueError("the cut-off was given, not chosen")
+    axis.loglog(choice.tried, np.sqrt(np.maximum(choice.error, 1e-16)), color="black", linewidth=1.2)
+    _mark(axis, smoothed.cutoff)
+    axis.set_xlabel("cut-off, Hz")
+    axis.set_ylabel("expected error of qdd")
+
+
+def _mark(axis: Axes, cutoff: float) -> None:
+    if np.isfinite(cutoff):
+        axis.axvline(cutoff, color=style.VERMILLION, linewidth=1.0)
+        axis.annotate(
+            f" {cutoff:.3g} Hz", (cutoff, 0.95), xycoords=("data", "axes fraction"),
+            color=style.VERMILLION, fontsize=style.SMALL, va="top",
+        )  # fmt: skip
+
+
+def _delays(axis: Axes, examined: Examination) -> None:
+    regression, smoothed = examined.regression, examined.smoothed
+    assert regression is not None and smoothed is not None
+    step = 1e3 / smoothed.rate
+    axis.plot(step * regression.delays, regression.delay_error, color=style.BLUE, linewidth=1.2, label="regression")
+    on_tree = examined.on_tree
+    if on_tree is not None and on_tree.delays is not None and len(on_tree.delays.tried) > 1:
+        axis.plot(step * on_tree.delays.tried, on_tree.delays.error, color=style.GREEN, linewidth=1.2, label="robot")
+    axis.set_yscale("log")
+    axis.axvline(0.0, color="0.7", linewidth=0.8)
+    axis.set_xlabel("torques are late by, ms")
+    axis.set_ylabel("unexplained share")
+    style.legend(axis)
+
+
+def _steps(axis: Axes, examined: Examination) -> None:
+    data = examined.recording.data
+    steps = np.diff(data.t)[np.diff(data.trajectory) == 0]
+    axis.plot(1e3 * steps, ".", color=style.BLUE, markersize=1.5)
+    axis.set_xlabel("sample")
+    axis.set_ylabel("time step, ms")

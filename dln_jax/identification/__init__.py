@@ -1,0 +1,38 @@
+"""Identification: what data of a robot determine of its parameters, and what these are.
+
+`identify(model, known, data)` does all of it for a model that is linear in its parameters, as `models.make_rigid_tree`.
+"""
+
+from dln_jax.identification.base import BaseParameters, base_parameters, determinacy, null_directions
+from dln_jax.identification.columns import Columns, columns_of, flat
+from dln_jax.identification.consistent import ConsistentFit, fit_consistent, is_consistent, nearest_body
+from dln_jax.identification.equations import Equations, compressed, regressor_of
+from dln_jax.identification.identify import Identification, identify, parameters_of, random_states
+from dln_jax.identification.robust import ResidualStatistics, fit_robust, residual_statistics
+from dln_jax.identification.weighted import WeightedFit, fit_weighted
+
+__all__ = [
+    "BaseParameters",
+    "Columns",
+    "ConsistentFit",
+    "Equations",
+    "Identification",
+    "ResidualStatistics",
+    "WeightedFit",
+    "base_parameters",
+    "columns_of",
+    "compressed",
+    "determinacy",
+    "fit_consistent",
+    "fit_robust",
+    "fit_weighted",
+    "flat",
+    "identify",
+    "is_consistent",
+    "nearest_body",
+    "null_directions",
+    "parameters_of",
+    "random_states",
+    "regressor_of",
+    "residual_statistics",
+]

@@ -1,0 +1,120 @@
+"""What was identified, in words and rows: base parameters, each parameter, and what is to be said of the data."""
+
+from typing import Any
+
+import numpy as np
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.identification.base import Determinacy
+from dln_jax.identification.identify import Identification
+from dln_jax.solvers.levenberg_marquardt import Status
+
+STILL = 0.01
+"""rad or m: a joint that moves by less does not move."""
+LARGE_CONDITION = 300.0
+"""Above it, errors grow much more along some combinations than along others."""
+LONG_CORRELATION = 10.0
+"""Samples for which residuals follow each other, above which they are rather model error than noise."""
+
+
+def base_rows(found: Identification) -> list[dict[str, Any]]:
+    """Each base parameter: in words, its value by these data, the standard error, and the value before."""
+    values, errors = found.base.combinations @ found.fit.theta, found.fit.standard_errors(found.base.combinations)
+    known = found.base.combinations @ found.known
+    rows = zip(found.base.words, values.tolist(), errors.tolist(), known.tolist(), strict=True)
+    return [
+        {"combination": words, "value": value, "standard_error": error, "known": before}
+        for words, value, error, before in rows
+    ]
+
+
+def parameter_rows(found: Identification) -> list[dict[str, Any]]:
+    """Each parameter: what could be known of it and what these data show, values, and its error where it has one."""
+    names, errors = found.columns.names, found.fit.standard_errors(np.eye(len(found.columns.names)))
+    return [
+        {
+            "name": name,
+            "structure": found.structure[k],
+            "data": found.seen[k],
+            "known": float(found.known[k]),
+            "least_squares": float(found.fit.theta[k]),
+            "standard_error": float(errors[k]) if found.seen[k] == "alone" else None,
+            "identified": float(found.theta[k]),
+        }
+        for k, name in enumerate(names)
+    ]
+
+
+def lost(found: Identification) -> tuple[str, ...]:
+    """Names of parameters that some motion would show, and these data do not."""
+    return tuple(
+        name
+        for name, possible, seen in zip(found.columns.names, found.structure, found.seen, strict=True)
+        if seen == "not at all" != possible
+    )
+
+
+def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) -> list[str]:
+    """What a user should know of the data, a line each with its remedy."""
+    lines = []
+    still = np.flatnonzero(np.ptp(data.q, axis=0) < STILL)
+    if len(still):
+        which = ", ".join(names[k] for k in still)
+        lines.append(f"{which}: does not move; what only its motion shows stays as it was; add motions of it")
+    if missing := lost(found):
+        shown = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
+        lines.append(f"not shown by these data, though other motions would: {shown}; vary speeds and postures more")
+    if found.fit.condition > LARGE_CONDITION:
+        lines.append(f"condition {found.fit.condition:.0f}: motions are much alike; excite the joints more variously")
+    times = found.statistics.correlation
+    slow = np.flatnonzero(times > LONG_CORRELATION)
+    if len(slow):
+        which = ", ".join(f"{names[k]} {times[k]:.0f}" for k in slow)
+        lines.append(
+            f"residuals follow each other, for samples: {which}; rather model error (friction, elasticity) or a filter "
+            "than noise; standard errors count such samples once"
+        )
+    friction = [
+        name
+        for name, kind, value in zip(found.columns.names, found.columns.kinds, found.fit.theta, strict=True)
+        if kind == "positive" and value < 0 and name not in missing
+    ]
+    if friction and found.consistent is None:
+        lines.append(f"negative, which no joint is: {', '.join(friction)}; ask for consistent parameters")
+    if found.consistent is not None and found.consistent.status == Status.RUNNING:
+        lines.append(
+            f"bodies that exist still came closer to the data after {found.consistent.iterations} iterations; "
+            "the table shows how close they are"
+        )
+    return lines
+
+
+def summary(found: Identification) -> list[str]:
+    """How much is known, in a few lines."""
+    names, structure = found.columns.names, found.structure
+
+    def those(which: Determinacy) -> list[str]:
+        return [name for name, each in zip(names, structure, strict=True) if each == which]
+
+    counts = ", ".join(f"{len(those(which))} {which}" for which in ("alone", "in combination", "not at all"))
+    return [
+        f"{len(names)} parameters, of which motions show {counts}: {len(found.base.words)} base parameters",
+        f"these data determine {found.fit.rank} combinations, condition {found.fit.condition:.3g}",
+    ]
+
+
+def text(found: Identification) -> str:
+    """All of it, as a page of plain text."""
+    lines = [*summary(found), "", "base parameters: value ± standard error (before)"]
+    for row in base_rows(found):
+        lines.append(
+            f"  {row['value']:12.5g} ± {row['standard_error']:<9.2g} ({row['known']:.5g})   {row['combination']}"
+        )
+    lines += ["", "parameter      motions could show  these data show   before       least squares          identified"]
+    for row in parameter_rows(found):
+        error = "" if row["standard_error"] is None else f"± {row['standard_error']:.2g}"
+        lines.append(
+            f"{row['name']:<14} {row['structure']:<19} {row['data']:<15} {row['known']:11.5g}  "
+            f"{row['least_squares']:11.5g} {error:<10} {row['identified']:11.5g}"
+        )
+    return "\n".join(lines) + "\n"

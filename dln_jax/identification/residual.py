@@ -1,0 +1,136 @@
+"""A small network on top of an identified tree: as large as held-out motions ask for, and none where they do not.
+
+The tree keeps its parameters. Candidates grow from no network at all; one is better than another only where its error
+on validation motions is lower by more than the standard error of the difference, over stretches of time that are taken
+to be independent, which neighbouring samples are not.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from dln_jax.data.magnitudes import spread
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split
+from dln_jax.learning import dynamics
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.growth import Trial, grow
+from dln_jax.learning.objectives import TORQUE, arrays, residuals
+from dln_jax.models.model import Model, Parameters
+from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
+from dln_jax.types import InputError, Needs, ResidualTerm
+
+SCALED = TORQUE._replace(selects_by="scaled")
+"""Every joint counts alike, however small its torques are."""
+STRETCH = 0.5
+"""s of validation motion whose mean error counts as one measurement."""
+
+
+class Candidate(NamedTuple):
+    """A size of network; without terms it is none."""
+
+    terms: tuple[ResidualTerm, ...] = ()
+    width: int = 0
+
+
+CANDIDATES = (
+    Candidate(),
+    Candidate(("dissipation",), 4),
+    Candidate(("potential", "dissipation"), 4),
+    Candidate(("potential", "dissipation"), 8),
+    Candidate(("potential", "dissipation", "inertia"), 8),
+    Candidate(("potential", "dissipation"), 16),
+)
+
+
+class ResidualFit(NamedTuple):
+    """A tree with what was added, if anything was."""
+
+    model: Model
+    """The tree's own, or the sum."""
+    parameters: Parameters
+    """Of the tree, or `ResidualParameters`."""
+    chosen: Candidate
+    settings: dict[str, Any]
+    """Keywords of `make_residual`; empty where nothing was added."""
+    trials: list[Trial]
+    """All that were tried; the errors are those of stretches of validation motion, in units of the torque's own."""
+
+
+def fit_residual(
+    rigid: Model,
+    parameters: Parameters,
+    needs: Needs,
+    train: Trajectories,
+    validation: Trajectories,
+    *,
+    candidates: tuple[Candidate, ...] = CANDIDATES,
+    iterations: int = 40,
+    seed: int = 0,
+) -> ResidualFit:
+    """Fits networks to what an identified tree leaves, and keeps the smallest that held-out motions call enough.
+
+    Args:
+        rigid: such as `models.make_rigid_tree`.
+        parameters: identified, which stay.
+        needs: kinds of the joints.
+        train: what the tree was identified from.
+        validation: other motions; what is chosen is to be judged by others again.
+        candidates: in order of size, the first without terms.
+        iterations: of Gauss-Newton, at most; kept are the parameters with the lowest validation error.
+        seed: of the networks.
+
+    Raises:
+        InputError: candidates that do not start with none, or data without varying torques.
+    """
+    if not candidates or candidates[0].terms:
+        raise InputError("candidates start with a network; expected none at all first, which others have to better")
+    with jax.enable_x64(True):
+        scale = SCALED.scale(train)
+        stretch = stretches(validation)
+        of_train, of_validation = (arrays(SCALED, data, jnp.float64) for data in (train, validation))
+        judge = jax.jit(lambda system_of, batch: residuals(SCALED, system_of(), batch) / scale, static_argnums=0)
+        left = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
+        sizes = _sizes(train, left)
+        sets = Split(train, validation, validation)
+
+        def errors(system_of: Any) -> Float[np.ndarray, " stretches"]:
+            squares = np.sum(np.asarray(judge(system_of, of_validation)) ** 2, axis=1)
+            return np.bincount(stretch, squares) / np.bincount(stretch)
+
+        def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " stretches"]]:
+            if not candidate.terms:
+                return None, errors(lambda: rigid.energies(parameters))
+            settings = {"terms": candidate.terms, "width": candidate.width, **sizes}
+            both = make_with_residual(rigid, make_residual(needs, **settings))
+            part = frozen(both, parameters)
+            training = fit(dynamics.problem(part, sets, SCALED, seeds=seed), GaussNewton(steps=iterations))
+            found = ResidualParameters(parameters, training.parameters)
+            return (both, found, settings), errors(lambda: both.energies(found))
+
+        chosen, trials = grow(candidates, attempt)
+    if chosen.outcome is None:
+        return ResidualFit(rigid, parameters, chosen.candidate, {}, trials)
+    model, found, settings = chosen.outcome
+    return ResidualFit(model, found, chosen.candidate, settings, trials)
+
+
+def stretches(data: Trajectories, seconds: float = STRETCH) -> Int[np.ndarray, " N"]:
+    """The number of the stretch of time that each sample is in; stretches do not reach across trajectories."""
+    within = np.floor(data.t / seconds).astype(int)
+    within -= within.min()
+    _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
+    return numbers
+
+
+def _sizes(train: Trajectories, left: Float[np.ndarray, "N d"]) -> dict[str, tuple[float, ...]]:
+    """Typical sizes, to three digits: of what the tree leaves, and of rates and accelerations."""
+    named = {"torque_scale": left, "rate_scale": train.qd, "acceleration_scale": train.qdd}
+    return {
+        name: tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, numbers))
+        for name, numbers in named.items()
+    }

@@ -1,0 +1,11 @@
+"""Trees of unknown kinematics: joint frames by Gauss-Newton from random starts, all else by elimination.
+
+fit = fit_tree(needs, train, validation)
+make_serial_tree(needs).energies(fit.parameters)
+"""
+
+from dln_jax.learning.kinematics.fit import TreeFit, fit_tree
+from dln_jax.learning.kinematics.frames import Frames, mirrored, random_frames, rough_frames, turned_round
+from dln_jax.learning.kinematics.search import Search
+
+__all__ = ["Frames", "Search", "TreeFit", "fit_tree", "mirrored", "random_frames", "rough_frames", "turned_round"]

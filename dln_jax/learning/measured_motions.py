@@ -1,0 +1,223 @@
+"""Motions of which coordinates were measured, matched in coordinates and velocities, with or without torques.
+
+The state is (q, qd), so that momenta p = dL/dqd are the model's own, and coupled joints are no harder than one: any
+energies of `mechanics.equations.dynamics` will do. A window of T samples is matched by
+
+    r_w(theta, z) = [(q(t; z, theta) - q_measured) / noise_q,  (qd(t; z, theta) - qd_measured) / noise_qd]
+
+where qd has been measured too, and minimise over theta and all starts z_w: sum over windows of |r_w|². Starts are
+eliminated window by window: z_w(theta) is found by Gauss-Newton, and the derivative of what is left of r_w is that of
+Kaufman (`learning.starts`). The problem's parameters are those of the model alone, however many windows there are.
+
+Torques that are off push motions off course. With `Noise.tau` each window has a torque e_w more, constant and unknown,
+and a residual e_w / noise_tau: between matching motions under exact torques, and matching torques of exact motions.
+
+Motion without torques fits any multiple of an energy: a `Gauge` says which one is meant.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.data.magnitudes import on_device
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import GAP, window_indices
+from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.learning.starts import nearest, without_start
+from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import InputError, Scalar, require_positive
+
+GAUGE_TOLERANCE = 0.01
+"""Relative distance from a gauge that counts as one standard deviation; it can be met exactly, and is."""
+
+
+class MeasuredWindows(NamedTuple):
+    """W equally long windows; the shorter ones repeat their last sample, with weight zero."""
+
+    t: np.ndarray
+    """Time since the window's first sample [W, T], in s."""
+    q: np.ndarray
+    """[W, T, d]."""
+    qd: np.ndarray
+    """[W, T, d], measured, or an estimate that only the first start is taken from."""
+    tau: np.ndarray
+    """[W, T, d]."""
+    weight: np.ndarray
+    """1 for a sample, 0 for a repeated one [W, T]."""
+
+
+class Noise(NamedTuple):
+    """Standard deviations of what was measured, one for each coordinate or one for all."""
+
+    q: tuple[float, ...] | float
+    qd: tuple[float, ...] | float | None = None
+    """`None` where velocities were not measured."""
+    tau: tuple[float, ...] | float | None = None
+    """Of the mean torque over a window; `None` where torques are exact. What pushes a motion off course is then an
+    unknown of each window, as its start is."""
+
+
+class Gauge(NamedTuple):
+    """Which of the multiples of an energy is meant, that are all the same to motions without torques."""
+
+    q: tuple[float, ...]
+    """Where the mass matrix is looked at."""
+    mass: float = 1.0
+    """The mean of its diagonal there, kg m² or kg."""
+
+
+def cut_measured_windows(data: Trajectories, length: int, *, gap: float = GAP) -> MeasuredWindows:
+    """Consecutive windows of `length` samples within stretches without a gap.
+
+    Raises:
+        InputError: a length below 2, or no two samples without a gap between them.
+    """
+    indices, weight = window_indices(data, length, gap=gap)
+    t = data.t[indices]
+    return MeasuredWindows(t - t[:, :1], data.q[indices], data.qd[indices], data.tau[indices], weight)
+
+
+def motion(
+    system: Dynamics | PlainDynamics,
+    start: Float[Array, " two_d"],
+    t: Float[Array, " T"],
+    tau: Float[Array, "T d"] | None = None,
+    *,
+    torque: Torque = "interpolated",
+    substeps: int = 1,
+) -> Float[Array, "T two_d"]:
+    """States (q, qd) at the times t from `start`, by RK4, under torques or none."""
+    d = start.shape[0] // 2
+    driving = jnp.zeros((t.shape[0], d), start.dtype) if tau is None else tau
+
+    def rate(state: tuple[Array, Array], tau: Array) -> tuple[Array, Array]:
+        q, qd = state
+        return qd, system.forward_dynamics(q, qd, tau)
+
+    slopes = torque_slopes(driving, t, torque)
+    state, drive = (start[:d], start[d:]), (driving[:-1], slopes, jnp.diff(t))
+    q, qd = driven(rate, state, *drive, substeps=substeps, method=looped_rk4)
+    return jnp.concatenate([q, qd], axis=1)
+
+
+def problem(
+    model: Model,
+    parameters: Parameters,
+    windows: MeasuredWindows,
+    validation: MeasuredWindows,
+    *,
+    noise: Noise,
+    gauge: Gauge | None = None,
+    torque: Torque = "interpolated",
+    substeps: int = 1,
+    seed: int = 0,
+) -> Problem:
+    """The fit of a model's parameters to windows, in float64; starts are eliminated.
+
+    Selected are the parameters whose motions come closest to the validation windows, whose starts are fitted too.
+
+    Args:
+        model: of any energies, or of accelerations, with float64 parameters.
+        parameters: to start from, such as those of `learning.accelerations`.
+        windows: to fit.
+        validation: to select by.
+        noise: of the measurements; a loss of d (or 2 d where velocities were measured) is then noise alone, less what
+            the starts take up.
+        gauge: what motions without torques need, and others do not.
+        torque: between samples.
+        substeps: of RK4 between two samples.
+        seed: of the order of the windows.
+
+    Raises:
+        InputError: no windows, noise that is not positive, no gauge where there are no torques, or one of another size.
+    """
+    require_positive(substeps=substeps)
+    d = windows.q.shape[2]
+    fitted, held_out = _arrays(windows, validation, noise)
+    if gauge is None and not np.any(windows.tau):
+        raise InputError("motions without torques fit any multiple of an energy; give a gauge")
+    check_gauge(gauge, d)
+
+    def first(window: tuple[Array, ...]) -> Array:
+        _, q, qd, *_ = window
+        return jnp.concatenate([q[0], qd[0], *([] if noise.tau is None else [jnp.zeros(d)])])
+
+    def error(system: Dynamics | PlainDynamics, start: Array, window: tuple[Array, ...]) -> Array:
+        return _residual(system, start, window, noise=noise, torque=torque, substeps=substeps)
+
+    def residual(parameters: Parameters, *window: Array) -> Array:
+        frozen = dynamics(model.energies(jax.lax.stop_gradient(parameters)))
+        system = dynamics(model.energies(parameters))
+        left = without_start(
+            lambda start: error(frozen, start, window), lambda start: error(system, start, window), first(window)
+        )
+        return jnp.append(left, gauge_error(system, gauge))
+
+    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+        system = dynamics(model.energies(parameters))
+
+        def closest(*window: Array) -> Array:
+            return error(system, nearest(lambda start: error(system, start, window), first(window)), window)
+
+        return unmonitored(mean_square(closest, held_out))
+
+    return Problem(residual, parameters, fitted, score, seed)
+
+
+def check_gauge(gauge: Gauge | None, d: int) -> None:
+    """Raises `InputError` for a gauge of another number of coordinates, or a mass that is not positive."""
+    if gauge is None:
+        return
+    require_positive(gauge_mass=gauge.mass)
+    if len(gauge.q) != d:
+        raise InputError(f"the gauge has {len(gauge.q)} coordinates, the data {d}; make them agree")
+
+
+def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
+    """How far the mass matrix is from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without one or energies."""
+    if gauge is None or not isinstance(system, Dynamics):
+        return jnp.zeros(0)
+    M = system.mass_matrix(jnp.asarray(gauge.q))
+    return jnp.reshape(jnp.mean(jnp.diagonal(M)) / gauge.mass - 1, 1) / GAUGE_TOLERANCE
+
+
+def _residual(
+    system: Dynamics | PlainDynamics,
+    start: Array,
+    window: tuple[Array, ...],
+    *,
+    noise: Noise,
+    torque: Torque,
+    substeps: int,
+) -> Array:
+    t, q, qd, tau, weight = window
+    d = q.shape[1]
+    start, push = start[: 2 * d], start[2 * d :]
+    pushed = tau if noise.tau is None else tau + push
+    states = motion(system, start, t, pushed, torque=torque, substeps=substeps)
+    size = jnp.sqrt(weight / jnp.sum(weight))[:, None]
+    errors = [size * (states[:, :d] - q) / jnp.asarray(noise.q)]
+    if noise.qd is not None:
+        errors.append(size * (states[:, d:] - qd) / jnp.asarray(noise.qd))
+    if noise.tau is not None:
+        errors.append(push / jnp.asarray(noise.tau))
+    return jnp.concatenate([jnp.ravel(each) for each in errors])
+
+
+def _arrays(windows: MeasuredWindows, validation: MeasuredWindows, noise: Noise) -> list[tuple[Array, ...]]:
+    for key, deviations in noise._asdict().items():
+        for deviation in np.ravel(deviations) if deviations is not None else ():
+            require_positive(**{f"noise_{key}": float(deviation)})
+    if not len(windows.t) or not len(validation.t):
+        raise InputError(f"{len(windows.t)} windows to fit, {len(validation.t)} to validate; expected some of each")
+    return [
+        tuple(on_device(key, array, jnp.float64) for key, array in each._asdict().items())
+        for each in (windows, validation)
+    ]

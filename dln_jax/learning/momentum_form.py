@@ -1,0 +1,163 @@
+"""Models linear in their parameters from q, qd and tau alone: the equations of motion in weak form, without qdd.
+
+With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd has gravity, friction and what
+is left of the Coriolis forces. Multiplied by a window w(t) that is zero at both its ends, and integrated by parts:
+
+    - integral w' p dt + integral w s dt = integral w tau dt
+
+(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987 and of Gautier and Khalil
+1988.) Both sides are linear in the parameters, one equation for each joint and window. No acceleration appears, whose
+noise grows with the square of the frequency, and both sides go through the same low-pass, so that dry friction is not
+distorted: the result hardly depends on the cut-off of q.
+
+The windows are sin⁴ (pi t / W), with weights that make plain sums over samples exact to the smoothness of the motion.
+"""
+
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.encoders.sampling import EVEN, stretches
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.objectives import torque_scale
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers import least_squares
+from dln_jax.types import InputError, Vector, require_positive
+
+WINDOW = 0.16
+"""s: some two periods of what a low-pass at 12 Hz lets through."""
+FEWEST = 8
+"""Steps of a window."""
+OVERLAP = 5
+"""Windows that begin within the length of one: more are all but copies."""
+CHUNK = 4096
+"""Samples whose columns are in memory at a time."""
+
+
+class MomentumFit(NamedTuple):
+    """Identified parameters, and how well the data determine them; otherwise as `learning.linear.LinearFit`."""
+
+    parameters: Any
+    """Of the model, in its dtype."""
+    parameter_count: int
+    rank: int
+    condition: float
+    equations: int
+    """Windows times joints."""
+    torque_mse: float
+    """Mean over windows of the sum over joints of the squared error of the windows' mean torque; (N m)² or N²."""
+
+
+def fit_momentum(
+    model: Model,
+    data: Trajectories,
+    *,
+    window: float = WINDOW,
+    noise: Float[np.ndarray, " d"] | None = None,
+    ridge: float = 0.0,
+    rank_tolerance: float | None = None,
+    negligible: float = 0.0,
+) -> MomentumFit:
+    """The parameters of least squared error of the windows' equations, in float64; qdd is not read.
+
+    Args:
+        model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
+        data: at equal steps, with velocities that are fit to be used and torques as they were measured, such as
+            `data.encoders.smooth` gives.
+        window: s, at least `FEWEST` steps.
+        noise: standard deviation of each torque's noise, by which its equations are divided (default: that of each
+            torque's variation).
+        ridge: as in `solvers.least_squares.solve`, as are `rank_tolerance` and `negligible`.
+
+    Raises:
+        InputError: steps that are not equal, no stretch as long as a window, torques that do not vary, or settings
+            out of range.
+    """
+    require_positive(window=window)
+    with jax.enable_x64(True):
+        zero, unravel = ravel_pytree(model.init(jax.random.key(0)))
+        zero = jnp.zeros(zero.shape, jnp.float64)
+        scale = np.asarray(torque_scale(data)) if noise is None else np.asarray(noise, float)
+        if scale.shape != (data.degrees_of_freedom,) or not (scale > 0).all():
+            raise InputError(
+                f"noise is {scale}; expected a positive number for each of {data.degrees_of_freedom} joints"
+            )
+        equations = list(_equations(model, unravel, zero, data, window))
+    if not equations:
+        raise InputError(f"no stretch of the data is as long as a window of {window:g} s; give a shorter one")
+    weighted = (
+        (A.reshape(-1, zero.size), b.ravel()) for A, b in ((A / scale[:, None], b / scale) for A, b in equations)
+    )
+    solution = least_squares.solve_chunks(weighted, ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible)
+    squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b in equations)
+    windows = sum(len(b) for _, b in equations)
+    return MomentumFit(
+        parameters=unravel(jnp.asarray(solution.x, zero.dtype)),
+        parameter_count=zero.size,
+        rank=solution.rank,
+        condition=solution.condition,
+        equations=windows * data.degrees_of_freedom,
+        torque_mse=squares / windows,
+    )
+
+
+def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
+    """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
+    p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
+    return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
+
+
+def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """w dt and w' dt [steps + 1] of a window of so many steps, whose integral of w is 1."""
+    phase = np.pi * np.arange(steps + 1) / steps
+    w, slope = np.sin(phase) ** 4, 4 * np.pi / (steps * dt) * np.sin(phase) ** 3 * np.cos(phase)
+    return w / w.sum(), slope / w.sum()
+
+
+def _equations(
+    model: Model, unravel: Any, zero: Array, data: Trajectories, window: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Columns [W, d, P] and right-hand sides [W, d] of the windows of one chunk after the other."""
+
+    def both(theta: Parameters, q: Vector, qd: Vector) -> Array:
+        return jnp.concatenate(momentum_and_rest(dynamics(model.energies(unravel(theta))), q, qd))
+
+    def columns(q: Vector, qd: Vector) -> Array:
+        values, pull_back = jax.vjp(functools.partial(both, q=q, qd=qd), zero)
+        return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
+
+    program = jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
+    pieces = stretches(data.t, data.trajectory)
+    length = min(CHUNK, max(len(piece) for piece in pieces))
+    for piece in pieces:
+        if len(piece) <= FEWEST:
+            continue
+        steps_taken = np.diff(data.t[piece])
+        dt = float(np.median(steps_taken))
+        if np.abs(np.cumsum(steps_taken - dt)).max() > 10 * EVEN * dt * len(piece):
+            raise InputError("steps in time are not equal, as windows take them; resample with data.encoders.smooth")
+        steps = max(FEWEST, round(window / dt))
+        w, slope = window_weights(steps, dt)
+        starts = np.arange(0, len(piece) - steps, max(1, steps // OVERLAP))
+        for begin in range(0, len(piece) - steps, max(1, length - steps)):
+            mine = starts[(starts >= begin) & (starts < begin + max(1, length - steps))]
+            rows = piece[np.minimum(np.arange(begin, begin + max(length, steps + 1)), len(piece) - 1)]
+            found = np.asarray(program(data.q[rows], data.qd[rows]))
+            d = data.degrees_of_freedom
+            A, b = [], []
+            for start in mine:
+                part = slice(start - begin, start - begin + steps + 1)
+                A.append(np.tensordot(w, found[part, d:], 1) - np.tensordot(slope, found[part, :d], 1))
+                b.append(w @ data.tau[rows[part]])
+            if A:
+                yield np.stack(A), np.stack(b)

@@ -1,0 +1,172 @@
+"""What training data determine of a model's parameters: the covariance of a least-squares fit, and its noise.
+
+The fit minimises sum over samples and joints of ((tau_hat_i - tau_i) / unit_i)² + ridge |D (theta - theta_0)|², to
+first order about the parameters found, with D the norms of the columns of the Jacobian J of the scaled residuals. With
+J D⁻¹ = U S Vᵀ, noise of variance noise_i² in each torque, and a prior of variance Sigma / ridge,
+
+    Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
+
+For ridge = 0 that is the covariance of weighted least squares on the directions that are determined, whatever the
+weights; where all joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. Degrees of
+freedom of joint i are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.solvers.least_squares import triangular_factor
+
+Rows = Iterator[tuple[np.ndarray, np.ndarray]]
+"""Phi [n, d, P] and tau_hat - tau [n, d] of some samples at a time."""
+ALONE = 1e-6
+"""Share of the information on a direction that is elsewhere, below which some samples alone determine it."""
+
+
+class Spectrum(NamedTuple):
+    """The singular value decomposition of J D⁻¹, and what each joint has in it."""
+
+    scale: Float[np.ndarray, " P"]
+    """D."""
+    sizes: Float[np.ndarray, " P"]
+    """S, zero where a direction is undetermined."""
+    directions: Float[np.ndarray, "P P"]
+    """V, in columns."""
+    triangles: list[np.ndarray]
+    """Of each joint J_i D⁻¹ V up to a rotation of its rows, [.., P]."""
+    squares: Float[np.ndarray, " d"]
+    """Of each joint the sum of squared residuals, (N m)² or N²."""
+    unit: Float[np.ndarray, " d"]
+    """Of the residuals that were fitted, N m or N."""
+    samples: int
+
+
+class Posterior(NamedTuple):
+    """Covariance of the parameters, noise, and how many parameters the data determine."""
+
+    along: Float[np.ndarray, "K r"]
+    """Factor of the covariance of D theta along the directions of the spectrum."""
+    noise: Float[np.ndarray, " d"]
+    """Standard deviation, N m or N."""
+    degrees_of_freedom: Float[np.ndarray, " d"]
+
+
+def spectrum(
+    rows: Rows, unit: Float[np.ndarray, " d"], *, rank_tolerance: float | None = None, negligible: float = 0.0
+) -> Spectrum:
+    """Of all rows; takes some N d P² operations, and d P² numbers.
+
+    Args:
+        rows: of the training data.
+        unit: by which the fit divided the residuals of each joint.
+        rank_tolerance: as for `solvers.least_squares.solve`.
+        negligible: as there.
+    """
+    triangles, samples = _triangles(rows, len(unit))
+    squares = np.array([np.sum(each[:, -1] ** 2) for each in triangles])
+    weighted = [each[:, :-1] / size for each, size in zip(triangles, unit, strict=True)]
+    P = weighted[0].shape[1]
+    norms = np.sqrt(sum(np.sum(each**2, axis=0) for each in weighted))
+    seen = norms > negligible * norms.max(initial=0.0)
+    scale = np.where(seen, norms, 1.0)
+    scaled = [np.where(seen, each, 0.0) / scale for each in weighted]
+    _, found, right = np.linalg.svd(np.linalg.qr(np.concatenate(scaled), mode="r"), full_matrices=True)
+    sizes = np.concatenate([found, np.zeros(P - len(found))])
+    tolerance = np.finfo(np.float64).eps * max(samples * len(unit), P) if rank_tolerance is None else rank_tolerance
+    sizes = np.where(sizes > tolerance * sizes.max(initial=0.0), sizes, 0.0)
+    return Spectrum(scale, sizes, right.T, [each @ right.T for each in scaled], squares, unit, samples)
+
+
+def left_out(
+    spectrum: Spectrum,
+    noise: Float[np.ndarray, " d"],
+    columns: Float[np.ndarray, "n d P"],
+    residual: Float[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    """Residuals that some training samples would have if they had not been fitted, and their variance by parameters.
+
+    With U their rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r: exact for least squares without a
+    ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
+
+    Args:
+        spectrum: of all training data.
+        noise: as `posterior` finds it.
+        columns: Phi D⁻¹ V of the samples.
+        residual: tau_hat - tau of them.
+    """
+    counts, unit = spectrum.sizes > 0, spectrum.unit
+    along = columns[:, :, counts] / spectrum.sizes[counts]
+    relative = (noise / unit) ** 2
+    U = along / unit[:, None]
+    values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - np.einsum("nip,niq->pq", U, U, optimize=True))
+    # What these samples alone determine is fitted exactly: its residual is zero, and says nothing.
+    inverse = (vectors * np.divide(1, values, out=np.zeros_like(values), where=values > ALONE)) @ vectors.T
+    inner = -np.einsum("nip,i,niq->pq", U, relative, U, optimize=True)
+    for size, triangle in zip(relative, spectrum.triangles, strict=True):
+        share = triangle[:, counts] / spectrum.sizes[counts]
+        inner += size * (share.T @ share)
+    weighted = residual / unit
+    predicted = U @ (inverse @ np.einsum("nip,ni->p", U, weighted))
+    variance = np.einsum("nip,pq,niq->ni", along, inverse @ inner @ inverse, along, optimize=True)
+    return (weighted + predicted) * unit, np.maximum(variance, 0.0)
+
+
+def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
+    """The triangular factor of each joint's [Phi_i r_i], and the number of samples."""
+    folded: list[np.ndarray | None] = [None] * d
+    samples = 0
+    for columns, residual in rows:
+        samples += len(residual)
+        for joint in range(d):
+            A, b = columns[:, joint], residual[:, joint]
+            if (above := folded[joint]) is not None:
+                A, b = np.concatenate([above[:, :-1], A]), np.concatenate([above[:, -1], b])
+            folded[joint] = triangular_factor(A, b)
+    return [each for each in folded if each is not None], samples
+
+
+def leading_directions(
+    rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int, *, passes: int = 3, seed: int = 0
+) -> Float[np.ndarray, "P K"]:
+    """Combinations of parameters, those that the training data determine best, for models too large for all of them.
+
+    Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is what a
+    model has whose parameters move in that subspace alone (Izmailov et al. 2020, "Subspace inference").
+
+    Args:
+        rows: gives the training data anew at each call.
+        unit: by which the fit divided the residuals of each joint.
+        count: K.
+        passes: over the data, the first of which finds D.
+        seed: of the start.
+    """
+    squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
+    scale = np.sqrt(np.where(squares > 0, squares, 1.0))
+    basis = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(scale), count)))[0]
+    for _ in range(passes - 1):
+        products = np.zeros_like(basis)
+        for columns, _residual in rows():
+            scaled = (columns / unit[:, None] / scale).reshape(-1, len(scale))
+            products += scaled.T @ (scaled @ basis)
+        basis = np.linalg.qr(products)[0]
+    return basis / scale[:, None]
+
+
+def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
+    """The covariance for a ridge; with 0, directions that are undetermined have none."""
+    counts = (spectrum.sizes > 0) | (ridge > 0)
+    damped = np.sqrt(spectrum.sizes[counts] ** 2 + ridge)
+    shares = [each[:, counts] / damped for each in spectrum.triangles]
+    dof = np.array([np.sum(each**2) for each in shares])
+    noise = np.sqrt(spectrum.squares / np.maximum(spectrum.samples - dof, 1.0))
+    relative = (noise / spectrum.unit) ** 2
+    inner = np.diag(relative.mean() * ridge / damped**2)
+    for size, share in zip(relative, shares, strict=True):
+        inner += size * (share.T @ share)
+    along = np.zeros((len(counts), int(counts.sum())))
+    # Scaled by the largest: where a fit is exact, all are rounding's squares.
+    largest = max(float(relative.max(initial=0.0)), np.finfo(np.float64).tiny)
+    along[counts] = np.sqrt(largest) * np.linalg.cholesky(inner / largest) / damped[:, None]
+    return Posterior(along, noise, dof)

@@ -1,0 +1,245 @@
+"""What a fitted model does not know, found from its training data and calibrated on validation trajectories.
+
+    found = estimate(model, parameters, train, validation, ridge=0.0)
+    torque_std = predictive(model, parameters, found.uncertainty.factor, found.uncertainty.noise)
+
+The covariance of the parameters is that of the least-squares fit (`learning.posterior`). For models that are linear in
+them, as `fit_linear` fits them, `ridge=0.0` is exact; a network trained on torques is linearised about its parameters
+(Laplace's approximation) with the ridge of `RIDGES` under which the validation torques are most likely. Of networks
+with more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain, the rest taken as known.
+
+What is left over is not white noise but also what the model cannot express, and errors of neighbouring samples are
+alike. Motions that were not fitted therefore scale both parts of the variance of each joint,
+
+    a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood,
+
+and keeps the simplest that no other betters by more than half the logarithm of the effective samples for each further
+factor (Schwarz 1978): a few seconds that agree with the training leave it as it is. These motions are the validation's,
+and for least squares also the training's, each as if it had been left out (`posterior.left_out`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import select
+from dln_jax.learning.linear import linearised_chunks
+from dln_jax.learning.objectives import torque_scale
+from dln_jax.learning.posterior import Posterior, Rows, Spectrum, leading_directions, left_out, posterior, spectrum
+from dln_jax.models.model import Model, Parameters
+from dln_jax.models.uncertainty import Domain, Uncertainty
+from dln_jax.solvers.normal_equations import count
+from dln_jax.types import InputError, require_positive
+
+RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
+"""That are tried for networks."""
+RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
+"""b / a that are tried."""
+MOST_PARAMETERS, DIRECTIONS = 1_500, 400
+FOLDS = 10
+"""Groups of training trajectories that are left out in turn."""
+MOST_SAMPLES = 2_000
+"""Of the validation, spread evenly."""
+STILL = 1e-3
+"""rad, m, 1/s or 1/s²: how far a coordinate may move that rests in all data."""
+
+
+class Estimate(NamedTuple):
+    """What is stored, and how it came about."""
+
+    uncertainty: Uncertainty
+    ridge: float
+    degrees_of_freedom: Float[np.ndarray, " d"]
+    """Parameters that the data of each joint determine."""
+    training_noise: Float[np.ndarray, " d"]
+    """Standard deviation of the training residuals, N m or N, before calibration."""
+
+
+def estimate(
+    model: Model,
+    parameters: Parameters,
+    train: Trajectories,
+    validation: Trajectories,
+    *,
+    ridge: float | None = None,
+    unit: Float[np.ndarray, " d"] | None = None,
+    rank_tolerance: float | None = None,
+    negligible: float = 0.0,
+    quantile: float = 0.999,
+    margin: float = 1.25,
+) -> Estimate:
+    """The uncertainty of a model of torques, in float64 whatever the model's dtype.
+
+    Args:
+        model: whose parameters were fitted to torques.
+        parameters: as they were found.
+        train: what they were fitted to.
+        validation: other trajectories, by which nothing but choices was made.
+        ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
+        unit: by which the fit divided the residuals of each joint, N m or N; by default `torque_scale`.
+        rank_tolerance: as for `solvers.least_squares.solve`.
+        negligible: as there, and as it was given to `fit_linear`.
+        quantile: of the data, that the thresholds of `outside` are taken from.
+        margin: by which the thresholds are larger: held-out motions of the same kind go a little further.
+
+    Raises:
+        InputError: a setting out of range, parameters that are not finite, or torques that do not vary.
+    """
+    require_positive(margin=margin)
+    if not 0 < quantile <= 1:
+        raise InputError(f"quantile is {quantile}; expected a number above 0, and at most 1")
+    if ridge is not None and not 0 <= ridge < np.inf:
+        raise InputError(f"ridge is {ridge}; expected a number >= 0, or None to choose it by validation")
+    with jax.enable_x64(True):
+        unit = np.asarray(torque_scale(train) if unit is None else unit, np.float64)
+        parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters)):
+            raise InputError("the parameters are not finite; train again")
+        held_out = thinned(validation, MOST_SAMPLES)
+        if ridge == 0 or count(parameters) <= MOST_PARAMETERS:
+            basis = None
+        else:
+            basis = leading_directions(lambda: _rows(model, parameters, thinned(train, MOST_SAMPLES)), unit, DIRECTIONS)
+        found = spectrum(
+            _rows(model, parameters, train, basis), unit, rank_tolerance=rank_tolerance, negligible=negligible
+        )
+        fitted = _along(found, _rows(model, parameters, thinned(train, MOST_SAMPLES), basis))[0]
+        judged, residual = _along(found, _rows(model, parameters, held_out, basis))
+        folds = [] if ridge != 0 else _left_out(model, parameters, train, found)
+    tried = [
+        _calibrated(posterior(found, each), each, judged, residual, held_out.trajectory, folds)
+        for each in (RIDGES if ridge is None else (ridge,))
+    ]
+    chosen = min(tried, key=lambda each: each.unlikeliness)
+    along = chosen.posterior.along
+    limits = np.concatenate([np.linalg.norm(part @ along, axis=2) for part in (fitted, judged)])
+    factor, scale = (found.directions @ along) / found.scale[:, None], found.scale
+    undetermined = found.directions[:, found.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
+    if basis is not None:
+        factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
+    centre, reach = _reach(train, validation, quantile)
+    domain = Domain(
+        limit=margin * np.maximum(np.quantile(limits, quantile, axis=0), np.finfo(np.float64).tiny),
+        scale=scale,
+        undetermined=undetermined,
+        centre=centre,
+        reach=np.maximum(margin * reach, STILL),
+    )
+    uncertainty = Uncertainty(factor, chosen.noise, chosen.inflation, domain)
+    return Estimate(uncertainty, chosen.ridge, chosen.posterior.degrees_of_freedom, chosen.posterior.noise)
+
+
+def calibration(
+    residual: Float[np.ndarray, " N"], noise: float, variance: Float[np.ndarray, " N"], samples: float
+) -> tuple[float, float, float]:
+    """(a, b) of a noise² + b variance that residuals of one joint call for, and their mean negative log-likelihood.
+
+    Args:
+        residual: of the validation, N m or N.
+        noise: standard deviation, of the training.
+        variance: by the parameters.
+        samples: how many of the residuals are independent.
+    """
+    ratios = np.asarray(RATIOS)[:, None]
+    relative = np.maximum(noise**2 + ratios * variance, np.finfo(np.float64).tiny)
+    factors = np.maximum(np.mean(residual**2 / relative, axis=1), np.finfo(np.float64).tiny)
+    both = 0.5 + 0.5 * (np.log(factors) + np.mean(np.log(relative), axis=1))
+    one = int(np.argmin(abs(ratios - 1)))
+    best = int(np.argmin(both))
+    unscaled = 0.5 * float(np.mean(residual**2 / relative[one] + np.log(relative[one])))
+    further = 0.5 * np.log(max(samples, 2.0)) / max(samples, 1.0)
+    candidates = [
+        (unscaled, unscaled, 1.0, 1.0),
+        (both[one] + further, both[one], factors[one], factors[one]),
+        (both[best] + 2 * further, both[best], factors[best], factors[best] * RATIOS[best]),
+    ]
+    _, unlikeliness, a, b = min(candidates)
+    return float(a), float(b), float(unlikeliness)
+
+
+def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
+    """How many independent samples say as much of the variance: N / (1 + 2 sum of squared autocorrelations).
+
+    The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
+    """
+    order = np.argsort(trajectory, kind="stable")
+    parts = np.split(residual[order], np.flatnonzero(np.diff(trajectory[order])) + 1)
+    whole = sum(float(part @ part) for part in parts)
+    total = 1.0
+    for lag in range(1, max(map(len, parts))):
+        correlation = sum(float(part[lag:] @ part[:-lag]) for part in parts if len(part) > lag) / max(whole, 1e-300)
+        if not correlation >= 0.05:
+            break
+        total += 2 * correlation**2
+    return len(residual) / total
+
+
+def thinned(data: Trajectories, most: int) -> Trajectories:
+    """At most so many samples, spread evenly."""
+    rows = np.unique(np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int))
+    keys = ("t", "q", "qd", "qdd", "tau", "trajectory")
+    return data._replace(**{key: getattr(data, key)[rows] for key in keys})
+
+
+class _Calibrated(NamedTuple):
+    posterior: Posterior
+    ridge: float
+    noise: np.ndarray
+    inflation: np.ndarray
+    unlikeliness: float
+
+
+def _calibrated(
+    found: Posterior,
+    ridge: float,
+    rows: np.ndarray,
+    residual: np.ndarray,
+    trajectory: np.ndarray,
+    folds: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> _Calibrated:
+    variances = np.sum((rows @ found.along) ** 2, axis=2)
+    parts = [(residual, variances, trajectory), *folds]
+    residual, variances, trajectory = (np.concatenate(each) for each in zip(*parts, strict=True))
+    joints = [
+        calibration(r, float(noise), variance, effective_samples(r / np.sqrt(noise**2 + variance), trajectory))
+        for r, noise, variance in zip(residual.T, found.noise, variances.T, strict=True)
+    ]
+    a, b, unlikeliness = (np.array(each) for each in zip(*joints, strict=True))
+    return _Calibrated(found, ridge, np.sqrt(a) * found.noise, b, float(unlikeliness.mean()))
+
+
+def _left_out(
+    model: Model, parameters: Parameters, train: Trajectories, found: Spectrum
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Residuals, variances and trajectories of training data as if held out, a fold of trajectories at a time."""
+    noise, present = posterior(found, 0.0).noise, np.unique(train.trajectory)
+    if len(present) < 2:
+        return []
+    folds = []
+    for indices in np.array_split(present, min(FOLDS, len(present))):
+        data = select(train, indices)
+        columns, residual = _along(found, _rows(model, parameters, data))
+        folds.append((*left_out(found, noise, columns, residual), data.trajectory))
+    return folds
+
+
+def _rows(model: Model, parameters: Parameters, data: Trajectories, basis: np.ndarray | None = None) -> Rows:
+    for columns, tau, measured in linearised_chunks(model, parameters, data):
+        yield columns if basis is None else columns @ basis, tau - measured
+
+
+def _along(found: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Phi D⁻¹ V [N, d, P] and the residuals [N, d] of some data."""
+    parts = [(columns / found.scale @ found.directions, residual) for columns, residual in rows]
+    columns, residuals = zip(*parts, strict=True)
+    return np.concatenate(columns), np.concatenate(residuals)
+
+
+def _reach(train: Trajectories, validation: Trajectories, quantile: float) -> tuple[np.ndarray, np.ndarray]:
+    """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, each [3 d]."""
+    states, others = (np.concatenate([each.q, each.qd, each.qdd], axis=1) for each in (train, validation))
+    centre = (states.max(axis=0) + states.min(axis=0)) / 2
+    return centre, np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)

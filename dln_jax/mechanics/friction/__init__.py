@@ -1,0 +1,25 @@
+"""Friction of joints: laws, their Rayleigh functions, load in transmissions, and how they join a system's energies."""
+
+from dln_jax.mechanics.friction.curves import unit_force
+from dln_jax.mechanics.friction.dissipation import joint_dissipation, joint_rates, require_shape
+from dln_jax.mechanics.friction.laws import (
+    LAWS,
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    require_laws,
+    shape_of,
+)
+
+__all__ = [
+    "LAWS",
+    "FrictionCoefficients",
+    "FrictionShape",
+    "coefficients_of",
+    "joint_dissipation",
+    "joint_rates",
+    "require_laws",
+    "require_shape",
+    "shape_of",
+    "unit_force",
+]

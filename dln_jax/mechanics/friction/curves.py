@@ -1,0 +1,119 @@
+"""Rayleigh functions of unit coefficients, elementwise in the rate u of a joint, with their forces as exact slopes.
+
+Each is the integral of its force from rest. Derivatives are written out, and not those of the integral, whose terms
+cancel; further ones are exact derivatives of the force.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.custom_derivatives import SymbolicZero
+
+from dln_jax.mechanics.friction.laws import FrictionShape
+from dln_jax.types import Vector
+
+NODES, WEIGHTS = (0.5 * (each + shift) for each, shift in zip(np.polynomial.legendre.leggauss(40), (1, 0), strict=True))
+"""Of Gauss and Legendre's rule on [0, 1]; exact to rounding for what is integrated here."""
+
+
+def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callable[..., Array]:
+    """The function value(x, *rest), elementwise in x, whose derivative by x is `slope(x, *rest)`."""
+    function = jax.custom_jvp(value)
+
+    def rule(primals, tangents):
+        x, *rest = primals
+        change, *others = tangents
+        result = function(*primals)
+        total = jnp.zeros_like(result) if isinstance(change, SymbolicZero) else slope(*primals) * change
+        for place, other in enumerate(others):
+            if not isinstance(other, SymbolicZero):
+                # Of what follows x by differentiating the integral.
+                moved = lambda r, place=place: value(x, *rest[:place], r, *rest[place + 1 :])  # noqa: E731
+                total = total + jax.jvp(moved, (rest[place],), (other,))[1]
+        return result, total
+
+    function.defjvp(rule, symbolic_zeros=True)
+    return function
+
+
+def _log_cosh(x: Vector) -> Vector:
+    """Without cosh, which overflows."""
+    return jnp.logaddexp(x, -x) - jnp.log(jnp.asarray(2.0, x.dtype))
+
+
+def _towards(side: int) -> Callable[[Vector], Vector]:
+    """(1 ± tanh x)/2, 1 on one side of rest and 0 on the other."""
+    return lambda x: 0.5 * (1 + side * jnp.tanh(x))
+
+
+def _dry(side: int) -> Callable[[Vector], Vector]:
+    return integral(
+        lambda x: 0.5 * (_log_cosh(x) + side * (x - jnp.tanh(x))), lambda x: jnp.tanh(x) * _towards(side)(x)
+    )
+
+
+def _one_sided(side: int) -> Callable[[Vector], Vector]:
+    def value(x: Vector) -> Vector:
+        return 0.25 * (x**2 + side * (x * jnp.sqrt(1 + x**2) - jnp.arcsinh(x)))
+
+    return integral(value, lambda x: 0.5 * x * (1 + side * x / jnp.sqrt(1 + x**2)))
+
+
+def _stribeck_value(x: Vector, ratio: Vector) -> Vector:
+    """√π/2 erf|x| less the integral of exp(-s²) (1 - tanh(s / ratio)), which lives near rest."""
+    size = jnp.abs(x)
+    reach = jnp.minimum(size, jnp.minimum(20 * ratio, 7.0))[..., None]
+    s = reach * jnp.asarray(NODES, x.dtype)
+    missing = 2 * jnp.exp(-(s**2)) * jax.nn.sigmoid(-2 * s / ratio[..., None])
+    return 0.5 * math.sqrt(math.pi) * jax.scipy.special.erf(size) - jnp.sum(
+        reach * jnp.asarray(WEIGHTS, x.dtype) * missing, axis=-1
+    )
+
+
+def _sigmoid_value(x: Vector, shift: Vector) -> Vector:
+    return jax.nn.softplus(x + shift) - jax.nn.softplus(shift) - x * jax.nn.sigmoid(shift)
+
+
+log_cosh = integral(_log_cosh, jnp.tanh)
+dry_forward, dry_backward = _dry(1), _dry(-1)
+viscous_forward, viscous_backward = _one_sided(1), _one_sided(-1)
+stribeck = integral(_stribeck_value, lambda x, ratio: jnp.exp(-(x**2)) * jnp.tanh(x / ratio))
+sigmoid = integral(_sigmoid_value, lambda x, shift: jax.nn.sigmoid(x + shift) - jax.nn.sigmoid(shift))
+
+
+def _stribeck(u: Vector, shape: FrictionShape) -> Vector:
+    w = shape.stribeck_velocity
+    return w * stribeck(u / w, jnp.broadcast_to(jnp.asarray(shape.velocity_scale / w, u.dtype), u.shape))
+
+
+def _sigmoid(u: Vector, shape: FrictionShape) -> Vector:
+    a = shape.sigmoid_slope
+    return sigmoid(a * u, jnp.broadcast_to(jnp.asarray(a * shape.sigmoid_shift, u.dtype), u.shape)) / a
+
+
+def _scaled(function: Callable[[Vector], Vector], power: int) -> Callable[[Vector, FrictionShape], Vector]:
+    """vⁿ f(u / v)."""
+    return lambda u, shape: shape.velocity_scale**power * function(u / shape.velocity_scale)
+
+
+POTENTIALS: Mapping[str, Callable[[Vector, FrictionShape], Vector]] = {
+    "viscous": lambda u, shape: 0.5 * u**2,
+    "coulomb": _scaled(log_cosh, 1),
+    "offset": lambda u, shape: u,
+    "stribeck": _stribeck,
+    "viscous_forward": _scaled(viscous_forward, 2),
+    "viscous_backward": _scaled(viscous_backward, 2),
+    "coulomb_forward": _scaled(dry_forward, 1),
+    "coulomb_backward": _scaled(dry_backward, 1),
+    "sigmoid": _sigmoid,
+}
+"""By the name of a coefficient, the Rayleigh function of one unit of it, [d], for each joint; W."""
+
+
+def unit_force(coefficient: str, u: Vector, shape: FrictionShape) -> Vector:
+    """The force [d] of one unit of a coefficient at rates u [d]."""
+    return jax.jvp(lambda rate: POTENTIALS[coefficient](rate, shape), (u,), (jnp.ones_like(u),))[1]

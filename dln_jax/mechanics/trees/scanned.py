@@ -1,0 +1,142 @@
+"""Forces of a tree whose frames are learned, by one scan over its links: quick to compile, and to differentiate.
+
+`recursions` writes every link out, so that zeros of known frames cost nothing. Here no frame is known. A scan carries,
+in each link's frame, the motions of the link for a unit rate of every joint (the columns of its Jacobian), its own
+motion, and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008); each link has
+its forces by itself then. Joints are about z, for one state.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
+
+from dln_jax.mechanics.trees.inertia import parts
+from dln_jax.types import JointKind, Vector
+
+
+def scanned_regressor(
+    parents: Sequence[int],
+    joints: Sequence[JointKind],
+    gravity: Any,
+    rotations: Any,
+    positions: Any,
+    q: Vector,
+    qd: Vector,
+    qdd: Vector,
+) -> Float[Array, "d d 10"]:
+    """d tau / d theta: force of each joint for the unit of each link's inertial parameters, without armature.
+
+    Args:
+        parents: as of a `Tree`.
+        joints: kinds.
+        gravity: [3], m/s².
+        rotations: [d, 3, 3], of the links at q = 0 in the frames that they hang on.
+        positions: [d, 3], likewise, m.
+        q: with `qd` and `qdd` the state.
+    """
+
+    def of_link(angular: Array, linear: Array) -> Array:
+        w, dw, a = _motion(angular, linear)
+        turning = _hat(w)
+        force = jnp.concatenate([a[:, None], _hat(dw) + turning @ turning], axis=1)
+        moment = jnp.concatenate([-_hat(a), _moments(dw) + turning @ _moments(w)], axis=1)
+        by_force, by_moment = linear[:, :-2].T @ force, angular[:, :-2].T @ moment
+        return jnp.pad(by_force, ((0, 0), (0, 6))) + jnp.pad(by_moment, ((0, 0), (1, 0)))
+
+    found = jax.vmap(of_link)(*_spatial(parents, joints, gravity, rotations, positions, q, qd, qdd))
+    return jnp.swapaxes(found, 0, 1)
+
+
+def scanned_forces(
+    parents: Sequence[int],
+    joints: Sequence[JointKind],
+    gravity: Any,
+    rotations: Any,
+    positions: Any,
+    inertias: Any,
+    q: Vector,
+    qd: Vector,
+    qdd: Vector,
+) -> Vector:
+    """tau [d] of links with inertial parameters `inertias`, as `newton_euler`, without armature; arguments as above."""
+
+    def of_link(angular: Array, linear: Array, theta: Array) -> Array:
+        w, dw, a = _motion(angular, linear)
+        m, h, moments = parts(theta)
+        force = m * a + jnp.cross(dw, h) + jnp.cross(w, jnp.cross(w, h))
+        moment = jnp.cross(h, a) + moments @ dw + jnp.cross(w, moments @ w)
+        return linear[:, :-2].T @ force + angular[:, :-2].T @ moment
+
+    spatial = _spatial(parents, joints, gravity, rotations, positions, q, qd, qdd)
+    return jnp.sum(jax.vmap(of_link)(*spatial, inertias), axis=0)
+
+
+def _spatial(
+    parents: Sequence[int],
+    joints: Sequence[JointKind],
+    gravity: Any,
+    rotations: Any,
+    positions: Any,
+    q: Vector,
+    qd: Vector,
+    qdd: Vector,
+) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
+    """Angular and linear parts in each link's frame: d columns of its Jacobian, its velocity, its acceleration."""
+    d = len(parents)
+    turns = np.array([kind == "revolute" for kind in joints], float)
+    c, s = jnp.where(turns > 0, jnp.cos(q), 1.0), jnp.where(turns > 0, jnp.sin(q), 0.0)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    about_z = jnp.stack([jnp.stack(row, -1) for row in ([c, -s, zero], [s, c, zero], [zero, zero, one])], -2)
+    into = jnp.swapaxes(rotations @ about_z, -1, -2)
+    places = positions + rotations[:, :, 2] * ((1 - turns) * q)[:, None]
+    ground = jnp.zeros((2, 3, d + 2), q.dtype).at[1, :, -1].set(-jnp.asarray(gravity, q.dtype))
+    serial = tuple(parents) == tuple(range(-1, d - 1))
+
+    def link(carried: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
+        index, parent, into, place, turns, rate, change = given
+        angular, linear = carried if serial else carried[parent]
+        linear = into @ (linear - _hat(place) @ angular)
+        angular = into @ angular
+        own = (jnp.arange(d + 1) == index) + 0.0 * rate
+        own = own.at[d].set(rate)
+        angular = angular.at[2, : d + 1].add(turns * own)
+        linear = linear.at[2, : d + 1].add((1 - turns) * own)
+        # S qdd + v x S qd
+        w, v = angular[:, d], linear[:, d]
+        across = jnp.stack([w[1] * rate, -w[0] * rate, change])
+        angular = angular.at[:, d + 1].add(turns * across)
+        linear = linear.at[:, d + 1].add((1 - turns) * across)
+        linear = linear.at[:2, d + 1].add(turns * rate * jnp.stack([v[1], -v[0]]))
+        found = jnp.stack([angular, linear])
+        return (found if serial else carried.at[index].set(found)), found
+
+    # Links of a tree look up their parent; the ground is the last, which -1 names.
+    start = ground if serial else jnp.concatenate([jnp.zeros((d, *ground.shape), q.dtype), ground[None]])
+    links = (jnp.arange(d), jnp.asarray(parents), into, places, jnp.asarray(turns, q.dtype), qd, qdd)
+    _, found = lax.scan(link, start, links)
+    return found[:, 0], found[:, 1]
+
+
+def _motion(angular: Array, linear: Array) -> tuple[Array, Array, Array]:
+    """Angular velocity, its rate, and the acceleration of the link's origin."""
+    w = angular[:, -2]
+    return w, angular[:, -1], linear[:, -1] + jnp.cross(w, linear[:, -2])
+
+
+def _hat(v: Array) -> Array:
+    x, y, z = v
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+
+
+def _moments(w: Array) -> Array:
+    """[3, 6] with I w = _moments(w) (I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)."""
+    x, y, z = w
+    zero = jnp.zeros_like(x)
+    rows = [[x, y, z, zero, zero, zero], [zero, x, zero, y, z, zero], [zero, zero, x, zero, y, z]]
+    return jnp.stack([jnp.stack(row) for row in rows])

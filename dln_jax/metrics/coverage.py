@@ -1,0 +1,50 @@
+"""Whether predicted standard deviations are right: how often errors stay within the bands that they promise.
+
+The band of level p about a prediction has half the width z_p sd, with z_p the quantile of a standard normal variable
+between whose negative and itself there is the probability p: 1.96 sd for 95 %.
+"""
+
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.types import InputError
+
+LEVELS = tuple(np.round([*np.arange(0.05, 0.95, 0.05), 0.95, 0.975, 0.99], 3).tolist())
+"""Of a curve."""
+LEVEL = 0.95
+"""Of one number."""
+
+
+class Coverage(NamedTuple):
+    """Share of samples within the bands of each level and joint."""
+
+    levels: Float[np.ndarray, " n"]
+    shares: Float[np.ndarray, "n d"]
+
+
+def half_width(level: float) -> float:
+    """z_p, in standard deviations; `InputError` for a level outside (0, 1)."""
+    if not 0 < level < 1:
+        raise InputError(f"the level of a band is {level}; expected a number between 0 and 1")
+    return NormalDist().inv_cdf(0.5 + level / 2)
+
+
+def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Coverage:
+    """Shares of errors within z_p standard deviations.
+
+    Args:
+        error: predicted less measured, [N, d].
+        std: predicted standard deviations, [N, d].
+        levels: p.
+
+    Raises:
+        InputError: a level outside (0, 1), or shapes that differ.
+    """
+    error, std = np.asarray(error, np.float64), np.asarray(std, np.float64)
+    if error.shape != std.shape or error.ndim != 2 or not len(error):
+        raise InputError(f"error is {error.shape} and std {std.shape}; expected the same [N, d] with N >= 1")
+    shares = [np.mean(np.abs(error) <= half_width(level) * std, axis=0) for level in levels]
+    return Coverage(np.asarray(levels), np.asarray(shares))

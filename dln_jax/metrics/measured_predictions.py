@@ -1,0 +1,183 @@
+"""How long a model stays right on motions whose coordinates were measured: starts are fitted to their first samples.
+
+    VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold, counted from the end of the fitted samples
+    lambda = ln |dx(T) / dx(0)| / T, the growth of the smallest changes of a start along the predicted motion
+    drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| over the largest kinetic energy
+
+Whatever perturbs a start by e has grown to e exp(lambda t). 1 / lambda, the Lyapunov time, is what predictions of
+chaotic motions are measured in: accuracy adds its logarithm only.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning import motions, starts
+from dln_jax.learning.measured_motions import MeasuredWindows, motion
+from dln_jax.learning.starts import nearest
+from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.plain import InverseForward
+from dln_jax.metrics.rollouts import valid_prediction_time
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import InputError
+
+START_STEPS = 2 * starts.STEPS
+"""Steps of Gauss-Newton to the start of a prediction."""
+
+
+class Predictions(NamedTuple):
+    """Of W stretches of T samples each."""
+
+    q: Float[np.ndarray, "W T d"]
+    qd: Float[np.ndarray, "W T d"]
+    growth: Float[np.ndarray, " W"]
+    """lambda, 1/s."""
+    drift: Float[np.ndarray, " W"]
+    """Relative to the largest kinetic energy; NaN for a model without energies."""
+
+
+def cut_stretches(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
+    """Stretches of so many samples to predict, which begin at every so manyth sample of each trajectory.
+
+    Raises:
+        InputError: no trajectory is that long.
+    """
+    found = []
+    for index in np.unique(data.trajectory):
+        own = np.flatnonzero(data.trajectory == index)
+        found += [own[first : first + samples] for first in range(0, len(own) - samples + 1, every)]
+    if not found:
+        raise InputError(f"no trajectory has {samples} samples to predict; record longer motions, or predict fewer")
+    rows = np.stack(found)
+    t = data.t[rows]
+    return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
+
+
+def predict_measured(
+    model: Model,
+    parameters: Parameters,
+    stretches: MeasuredWindows,
+    *,
+    fitted: int,
+    torque: Torque = "interpolated",
+    substeps: int = 1,
+    momenta: bool = False,
+) -> Predictions:
+    """Motions of a model whose starts come closest to the first `fitted` samples of q, at least 2.
+
+    Args:
+        model: of any energies, or of accelerations.
+        parameters: its parameters.
+        stretches: to predict.
+        fitted: samples that a start is fitted to.
+        torque: between samples.
+        substeps: of RK4 between two samples.
+        momenta: the model is a flow of (q, p), without torques, whose p is about qd; the answer's qd is its p then.
+
+    Raises:
+        InputError: `fitted` is out of range.
+    """
+    if not 2 <= fitted < stretches.t.shape[1]:
+        raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {stretches.t.shape[1]}")
+    spread = stretches.q.reshape(-1, stretches.q.shape[2]).std(axis=0)
+    scale = tuple(np.where(spread > 0, spread, 1.0).tolist())
+    arrays = (jnp.asarray(each) for each in stretches[:4])
+    known = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
+    found = _predict(model, parameters, *arrays, **known)
+    return Predictions(*(np.asarray(each) for each in found))
+
+
+def valid_times(
+    stretches: MeasuredWindows,
+    predicted: Predictions,
+    *,
+    fitted: int,
+    variance: Float[np.ndarray, " d"],
+    threshold: float = 1e-2,
+) -> Float[np.ndarray, " W"]:
+    """Valid prediction time of each stretch in s, from the last of the fitted samples on."""
+    later = slice(fitted - 1, None)
+    return np.array(
+        [
+            valid_prediction_time(q[later], q_hat[later], t[later], variance, threshold=threshold)
+            for q, q_hat, t in zip(stretches.q, predicted.q, stretches.t, strict=True)
+        ]
+    )
+
+
+# Compiled once for each model and shape, whatever the parameters.
+@functools.partial(jax.jit, static_argnames=("model", "scale", "fitted", "torque", "substeps", "momenta"))
+def _predict(model: Model, parameters, t, q, qd, tau, *, scale, fitted: int, torque: Torque, substeps: int, momenta):
+    energies = model.energies(parameters)
+    d = q.shape[2]
+
+    def moved(start, t, tau):
+        if momenta:
+            return motions.motion(flow(energies), start, t, substeps=substeps)
+        return motion(dynamics(energies), start, t, tau, torque=torque, substeps=substeps)
+
+    def drift(states, t, tau):
+        if momenta or isinstance(energies, InverseForward):
+            return jnp.asarray(jnp.nan)
+        return _drift(dynamics(energies), states, t, tau, torque, substeps)
+
+    def one(t, q, qd, tau):
+        first = slice(None, fitted)
+
+        def error(start):
+            return jnp.ravel((moved(start, t[first], tau[first])[:, :d] - q[first]) / jnp.asarray(scale))
+
+        start = nearest(error, jnp.concatenate([q[0], qd[0]]), steps=START_STEPS)
+        states, moves = jax.jvp(lambda start: moved(start, t, tau), (start,), (jnp.ones(2 * d),))
+        growth = jnp.log(jnp.linalg.norm(moves[-1]) / jnp.linalg.norm(moves[0])) / (t[-1] - t[0])
+        return states[:, :d], states[:, d:], growth, drift(states, t, tau)
+
+    return jax.vmap(one)(t, q, qd, tau)
+
+
+def _drift(system: Dynamics, states, t, tau, torque: Torque, substeps: int):
+    """Of the energy, against the work along the predicted motion."""
+    d = states.shape[1] // 2
+
+    def rate(state, tau):
+        q, qd, _ = state
+        return qd, system.forward_dynamics(q, qd, tau), qd @ (tau - system.friction(q, qd))
+
+    start = (states[0, :d], states[0, d:], jnp.zeros(()))
+    slopes = torque_slopes(tau, t, torque)
+    *_, work = driven(rate, start, tau[:-1], slopes, jnp.diff(t), substeps=substeps, method=looped_rk4)
+    energy = jax.vmap(system.energy)(states[:, :d], states[:, d:])
+    kinetic = jax.vmap(lambda q, qd: 0.5 * qd @ system.mass_matrix(q, qd) @ qd)(states[:, :d], states[:, d:])
+    return jnp.max(jnp.abs(energy - energy[0] - work)) / jnp.max(kinetic)
+
+
+def prediction_metrics(
+    stretches: MeasuredWindows,
+    predicted: Predictions,
+    *,
+    fitted: int,
+    variance: Float[np.ndarray, " d"],
+    threshold: float = 1e-2,
+) -> dict[str, float]:
+    """Means over the stretches, and the median of the valid prediction times, beside what bounds them.
+
+    `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, where
+    motions part) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
+    """
+    times = valid_times(stretches, predicted, fitted=fitted, variance=variance, threshold=threshold)
+    growth = float(np.mean(predicted.growth))
+    chaotic = {"vpt_lyapunov": float(np.mean(times)) * growth, "lyapunov_seconds": 1 / growth} if growth > 0 else {}
+    return {
+        "vpt_seconds": float(np.mean(times)),
+        "vpt_median_seconds": float(np.median(times)),
+        "predicted_seconds": float(np.mean(stretches.t[:, -1] - stretches.t[:, fitted - 1])),
+        **chaotic,
+        "energy_drift": float(np.mean(predicted.drift)),
+    }

@@ -1,0 +1,121 @@
+"""Any model of the zoo with friction in its joints, of the laws that the needs name.
+
+How its numbers are parametrised is decided here, for every model. Where all is trained by descent, from parameters x,
+
+    coefficients = softplus(x) > 0, offsets = x, sigmoid's shift = x, share of load = 1 / (1 + exp(-x)) in (0, 1)
+    Stribeck's velocity and the sigmoid's slope = default exp(x) > 0, and the velocity scale is held,
+
+since what an integrator can step over is for the user to say. Where the model is linear in its parameters, coefficients
+are parameters themselves, so that one least-squares problem finds them; then nothing keeps them from being negative
+(which says that the data do not show the law), shapes are held at their defaults (`learning.friction` finds them), and
+load, which multiplies what the energies give, is refused.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics.friction import (
+    FrictionCoefficients,
+    FrictionShape,
+    coefficients_of,
+    joint_dissipation,
+    require_laws,
+    require_shape,
+    shape_of,
+)
+from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.loaded import Load
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import InputError, Needs
+
+START = -3.0
+"""Of x where the coefficient is positive: softplus gives 0.05 N m or N m s, as for viscous friction of networks."""
+HELD = "velocity_scale"
+
+
+class FrictionParameters(NamedTuple):
+    """Of the joints; the linear ones apart from the others, and by names, of those that the laws take."""
+
+    coefficients: dict[str, Any]
+    """[d] each, as `FrictionCoefficients`, before the parametrisation above."""
+    shape: dict[str, Any]
+    """[d] each, of `FrictionShape` and "load"; empty where the model is linear."""
+
+
+def with_joint_friction(
+    model: Model,
+    needs: Needs,
+    *,
+    linear: bool = False,
+    shape: FrictionShape | None = None,
+    dtype: DTypeLike = jnp.float32,
+) -> Model:
+    """The model with friction in its joints; its parameters are {"model": its own, "friction": `FrictionParameters`}.
+
+    Args:
+        model: of coordinates, of a phase space, or without an energy; made for needs without joint friction.
+        needs: whose `joint_friction` names the laws; `joint_map` leads from coordinates to joints, and
+            `velocity_scale` is that of dry friction. Without laws the model is returned as it is.
+        linear: the model's parameters enter linearly, and shall go on to.
+        shape: where learned shapes start, and what the others are; the velocity scale is that of the needs by default.
+        dtype: of the parameters of friction.
+
+    Raises:
+        InputError: an unknown law, two that are the same friction, load in a linear model, or a shape that is not
+            positive.
+    """
+    laws = needs.joint_friction
+    require_laws(laws, "joint_friction")
+    if not laws:
+        return model
+    if linear and "load" in laws:
+        raise InputError(
+            "friction by load multiplies what the energies give, so that the model is not linear in its parameters; "
+            "leave load out, or train a network"
+        )
+    start = FrictionShape(velocity_scale=needs.velocity_scale) if shape is None else shape
+    require_shape(start)
+    d = needs.degrees_of_freedom
+    learned = () if linear else tuple(name for name in shape_of(laws) if name != HELD)
+
+    def init(key: Array) -> Parameters:
+        friction = FrictionParameters(
+            {name: jnp.full(d, 0.0 if linear or name == "offset" else START, dtype) for name in coefficients_of(laws)},
+            {name: jnp.full(d, _shape_start(name, start), dtype) for name in learned}
+            | ({"load": jnp.full(d, START, dtype)} if "load" in laws else {}),
+        )
+        return {"model": model.init(key), "friction": friction}
+
+    def energies(parameters: Parameters) -> Any:
+        friction = parameters["friction"]
+        coefficients, found = friction_of(friction, start, linear=linear)
+        dissipation = joint_dissipation(**coefficients._asdict(), **found._asdict(), joint_map=needs.joint_map)
+        load = None
+        if "load" in friction.shape:
+            load = Load(jax.nn.sigmoid(friction.shape["load"]), found.velocity_scale, needs.joint_map)
+        return with_friction(model.energies(parameters["model"]), dissipation, load)
+
+    return Model(init, energies)
+
+
+def friction_of(
+    parameters: FrictionParameters, start: FrictionShape, *, linear: bool = False
+) -> tuple[FrictionCoefficients, FrictionShape]:
+    """The coefficients and shapes that parameters stand for; arguments as of `with_joint_friction`."""
+    coefficients = {
+        name: x if linear or name == "offset" else jax.nn.softplus(x) for name, x in parameters.coefficients.items()
+    }
+    shape = {
+        name: x if name == "sigmoid_shift" else jnp.asarray(getattr(start, name), x.dtype) * jnp.exp(x)
+        for name, x in parameters.shape.items()
+        if name != "load"
+    }
+    return FrictionCoefficients(**coefficients), start._replace(**shape)
+
+
+def _shape_start(name: str, start: FrictionShape) -> Any:
+    return start.sigmoid_shift if name == "sigmoid_shift" else 0.0

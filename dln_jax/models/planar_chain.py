@@ -1,0 +1,140 @@
+"""Links that turn in one plane, one behind the other, whose lengths, masses and inertias are unknown.
+
+With absolute angles phi, each link's own, measured from where it hangs,
+
+    T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i w_i²
+    V = -sum_i (g_i cos phi_i + h_i sin phi_i)
+    D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
+
+A is symmetric and B skew. B and h are zero where each centre of mass is on the line to the next joint and the zero of
+the angles is right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
+(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum is
+the acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.models.model import Model
+from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_positive
+
+
+class PlanarChainParameters(NamedTuple):
+    """Of d links; `None` for what is left out."""
+
+    moments: Any
+    """A: its lower triangle, row by row [d (d + 1) / 2], kg m²."""
+    skew: Any
+    """B: below its diagonal, row by row [d (d - 1) / 2], kg m²."""
+    armature: Any
+    """a_2, .., a_d [d - 1], kg m²."""
+    weight: Any
+    """g [d], N m."""
+    sideways: Any
+    """h [d], N m."""
+    viscous: Any
+    """b [d], N m s."""
+    coulomb: Any
+    """c [d], N m."""
+
+
+def make_planar_chain(
+    needs: Needs,
+    *,
+    coordinates: str = "relative",
+    symmetric: bool = True,
+    armature: bool = False,
+    velocity_scale: float = 0.05,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
+    """The (init, energies) pair of a planar chain; `init` starts without chance: M_ii = 1, and nothing else.
+
+    Args:
+        needs: revolute joints only; with friction each joint has viscous and dry friction.
+        coordinates: q_i is the angle of link i to the one before ("relative") or to the vertical ("absolute").
+        symmetric: leave out B and h.
+        armature: of the motors, or gears, of joints 2, .., d.
+        velocity_scale: of dry friction, rad/s, as for `mechanics.friction.joint_dissipation`; it is not fitted.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: a prismatic joint, other coordinates, or a scale that is not positive.
+    """
+    require_positive(velocity_scale=velocity_scale)
+    d = needs.degrees_of_freedom
+    if set(needs.joints) != {"revolute"}:
+        raise InputError(f"the planar chain has revolute joints only, the needs {needs.joints}; take another model")
+    if coordinates not in ("relative", "absolute"):
+        raise InputError(f"coordinates are {coordinates!r}; expected 'relative' or 'absolute'")
+    # phi = absolute q, and rates of the joints w = relative qd.
+    absolute: Any = np.tril(np.ones((d, d))) if coordinates == "relative" else np.eye(d)
+    relative: Any = np.linalg.inv(np.tril(np.ones((d, d)))) @ absolute
+    triangle, below = np.tril_indices(d), np.tril_indices(d, -1)
+
+    def init(key: Array) -> PlanarChainParameters:
+        def zeros(count: int, wanted: bool) -> Array | None:
+            return jnp.zeros(count, dtype) if wanted else None
+
+        return PlanarChainParameters(
+            moments=jnp.asarray((triangle[0] == triangle[1]).astype(float), dtype),
+            skew=zeros(len(below[0]), not symmetric),
+            armature=zeros(d - 1, armature),
+            weight=zeros(d, needs.gravity),
+            sideways=zeros(d, needs.gravity and not symmetric),
+            viscous=zeros(d, needs.friction),
+            coulomb=zeros(d, needs.friction),
+        )
+
+    def energies(parameters: PlanarChainParameters) -> ClosedForm:
+        moments, skew, motors, weight, sideways, viscous, coulomb = parameters
+        like = jnp.zeros((d, d), moments.dtype)
+        A = like.at[triangle].set(moments)
+        A = A + A.T - jnp.diag(jnp.diagonal(A))
+        B = None if skew is None else like.at[below].set(skew) - like.at[below].set(skew).T
+        fixed = (
+            0.0 if motors is None else relative.T @ jnp.diag(jnp.append(jnp.zeros(1, motors.dtype), motors)) @ relative
+        )
+
+        def mass_matrix(q: Vector) -> Matrix:
+            between = _between(absolute @ q)
+            own = A * jnp.cos(between) + (0.0 if B is None else B * jnp.sin(between))
+            return absolute.T @ own @ absolute + fixed
+
+        def coriolis(q: Vector, qd: Vector) -> Vector:
+            between = _between(absolute @ q)
+            slopes = A * jnp.sin(between) - (0.0 if B is None else B * jnp.cos(between))
+            return absolute.T @ (slopes @ (absolute @ qd) ** 2)
+
+        def potential(q: Vector) -> Scalar:
+            phi = absolute @ q
+            height = weight @ jnp.cos(phi)
+            return -height if sideways is None else -height - sideways @ jnp.sin(phi)
+
+        friction = None if viscous is None else joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale)
+
+        def dissipation(q: Vector, qd: Vector) -> Scalar:
+            assert friction is not None
+            return friction(q, relative @ qd)
+
+        return ClosedForm(
+            mass_matrix=mass_matrix,
+            coriolis=coriolis,
+            potential=None if weight is None else potential,
+            gravity=None if weight is None else jax.grad(potential),
+            dissipation=None if friction is None else dissipation,
+            friction=None if friction is None else jax.grad(dissipation, argnums=1),
+        )
+
+    return Model(init, energies)
+
+
+def _between(phi: Vector) -> Matrix:
+    """phi_i - phi_j."""
+    return phi[:, None] - phi[None, :]

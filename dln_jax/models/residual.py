@@ -1,0 +1,112 @@
+"""A rigid tree and a small network for what it leaves unexplained.
+
+    V = Σ_j s_j v_j(q),   D = Σ_j s_j r_j d_j(q, qd),   L = diag(√(s / a)) (lower triangle)(q)
+
+with v, d, L outputs of networks, s_j, r_j, a_j typical sizes of the unexplained torque, of rates and of accelerations.
+The networks start small, so that training starts at the tree.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_args
+
+import haiku as hk
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics.residual import Residual, with_residual
+from dln_jax.models.model import Model, Parameters, model_of
+from dln_jax.models.networks import Scale, joint_features, per_coordinate
+from dln_jax.nn.activations import Activation, tanh
+from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector, require_network
+
+TERMS: tuple[ResidualTerm, ...] = get_args(ResidualTerm)
+START = 0.1
+"""Of the last layer's weights, in units of what is usual."""
+
+
+class ResidualParameters(NamedTuple):
+    """Of a rigid tree, and of what is added."""
+
+    rigid: Any
+    residual: Parameters
+
+
+def make_with_residual(rigid: Model, residual: Model) -> Model:
+    """The sum of a `make_rigid_tree` and a `make_residual`."""
+
+    def init(key: Array) -> ResidualParameters:
+        return ResidualParameters(rigid.init(key), residual.init(key))
+
+    def energies(parameters: ResidualParameters) -> Any:
+        return with_residual(rigid.energies(parameters.rigid), residual.energies(parameters.residual))
+
+    return Model(init, energies)
+
+
+def make_residual(
+    needs: Needs,
+    *,
+    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
+    width: int = 8,
+    depth: int = 1,
+    activation: Activation = tanh,
+    velocity_scale: Scale = 0.05,
+    torque_scale: Scale = 1.0,
+    rate_scale: Scale = 1.0,
+    acceleration_scale: Scale = 1.0,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
+    """The networks alone; `energies` gives a `Residual`.
+
+    Args:
+        terms: those there are, of potential, dissipation and inertia.
+        velocity_scale: 1/s or m/s, to which networks of the dissipation resolve rates near rest.
+        torque_scale, rate_scale, acceleration_scale: s, r and a above, in their units.
+        needs, width, depth, activation, dtype: as for all, in `models.model`.
+
+    Raises:
+        InputError: no term, an unknown one, or a size that is not positive.
+    """
+    require_network(width=width, depth=depth)
+    if not terms or set(terms) - set(TERMS) or len(set(terms)) < len(terms):
+        raise InputError(f"terms are {list(terms)}; expected some of {', '.join(TERMS)}, each once")
+    d = needs.degrees_of_freedom
+    given = {"torque_scale": torque_scale, "rate_scale": rate_scale, "acceleration_scale": acceleration_scale}
+    s, r, a = (np.array(per_coordinate(needs, name, scale)) for name, scale in given.items())
+    slow = np.array(per_coordinate(needs, "velocity_scale", velocity_scale))
+
+    def network(name: str, outputs: int, inputs: Array) -> Array:
+        small = hk.initializers.VarianceScaling(START**2)
+        hidden = hk.nets.MLP([width] * depth, activation=activation.value, name=name, activate_final=True)
+        return hk.Linear(outputs, w_init=small, name=f"{name}_output")(hidden(inputs))
+
+    def potential(q: Vector) -> Scalar:
+        return jnp.sum(jnp.asarray(s, q.dtype) * network("potential", d, joint_features(needs, q)))
+
+    def dissipation(q: Vector, qd: Vector) -> Scalar:
+        rates = [qd / jnp.asarray(r, qd.dtype), jnp.tanh(qd / jnp.asarray(slow, qd.dtype))]
+        outputs = network("dissipation", d, jnp.concatenate([joint_features(needs, q), *rates]))
+        return jnp.sum(jnp.asarray(s * r, qd.dtype) * outputs)
+
+    def cholesky(q: Vector) -> Matrix:
+        entries = network("inertia", d * (d + 1) // 2, joint_features(needs, q))
+        rows = jnp.zeros((d, d), q.dtype).at[np.tril_indices(d)].set(entries)
+        return jnp.asarray(np.sqrt(s / a), q.dtype)[:, None] * rows
+
+    every: dict[str, tuple[str, Callable[..., Any]]] = {
+        "potential": ("potential", potential),
+        "dissipation": ("dissipation", dissipation),
+        "inertia": ("cholesky", cholesky),
+    }
+    return model_of(Residual, lambda: dict(every[term] for term in terms), d, dtype)
+
+
+def frozen(model: Model, rigid: Any) -> Model:
+    """A `make_with_residual` whose rigid part stays: its parameters are those of the residual alone."""
+    rigid = jax.tree.map(jnp.asarray, rigid)
+    return Model(
+        lambda key: model.init(key).residual, lambda parameters: model.energies(ResidualParameters(rigid, parameters))
+    )

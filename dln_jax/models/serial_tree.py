@@ -1,0 +1,140 @@
+"""An arm whose kinematics is not known: joint frames, inertias, armature and friction are the parameters.
+
+Links hang on each other in a stated order, by default one after the other. Torques do not show all of the six numbers
+of each frame. Without effect on them ("gauges") are
+
+- turning a link's frame about its joint's axis, and sliding it along, with the link's inertia and the next frames taken
+  along: an axis in space is four numbers, the direction of a prismatic joint two;
+- where the base stands and how it is turned about the vertical: of the first axis only its angle with gravity counts;
+- the mirror image of the whole arm, axes as pseudo-vectors: torques cannot tell left hands from right hands.
+
+`learning.kinematics.fit_tree` finds the parameters.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float
+
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.recursive import RecursiveSystem
+from dln_jax.mechanics.trees.description import Tree
+from dln_jax.mechanics.trees.energies import tree_system
+from dln_jax.models.model import Model
+from dln_jax.types import InputError, Needs, require_positive
+
+
+class SerialTreeParameters(NamedTuple):
+    """Of an arm of d joints; friction is `None` where there is none."""
+
+    turns: Any
+    """[d, 3], rotation vectors of the links' frames at q = 0 in those that they hang on, rad."""
+    positions: Any
+    """[d, 3], m."""
+    inertias: Any
+    """[d, 10], as `mechanics.trees.PARAMETERS`; combinations of them that forces show, no bodies that need exist."""
+    armature: Any
+    """[d], kg m² or kg."""
+    viscous: Any
+    """[d], N m s or N s/m."""
+    coulomb: Any
+    """[d], N m or N."""
+    offset: Any
+    """[d], N m or N."""
+
+
+def make_serial_tree(
+    needs: Needs,
+    *,
+    parents: Sequence[int] | None = None,
+    acceleration: float = 9.81,
+    velocity_scale: float = 0.01,
+    dtype: DTypeLike = jnp.float64,
+) -> Model:
+    """A tree of the joints that are needed, in frames that are to be found.
+
+    Args:
+        needs: kinds of joints, gravity and friction (viscous, dry and an offset of each joint).
+        parents: link that each hangs on, -1 for the ground; by default the one before.
+        acceleration: of gravity, m/s².
+        velocity_scale: of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
+        dtype: of the parameters.
+
+    Raises:
+        InputError: parents that are not links before, an acceleration or scale that is not positive, or actuation by
+            fewer motors than joints.
+    """
+    require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
+    if needs.actuation is not None:
+        raise InputError("a learned tree has a motor at each joint; leave actuation out of the needs")
+    d = needs.degrees_of_freedom
+    order = tuple(range(-1, d - 1)) if parents is None else tuple(parents)
+    if len(order) != d or any(not -1 <= parent < link for link, parent in enumerate(order)):
+        raise InputError(f"parents are {order}; expected for each of {d} links one before it, or -1 for the ground")
+    gravity = np.array([0.0, 0.0, -acceleration if needs.gravity else 0.0])
+
+    def init(key: Array) -> SerialTreeParameters:
+        turns, positions = jax.random.normal(key, (2, d, 3), dtype)
+        body = jnp.asarray([1.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02], dtype)
+        none = jnp.zeros(d, dtype) if needs.friction else None
+        inertias, armature = jnp.tile(body, (d, 1)), jnp.full(d, 0.01, dtype)
+        return SerialTreeParameters(turns, 0.15 * positions, inertias, armature, none, none, none)
+
+    def energies(parameters: SerialTreeParameters) -> RecursiveSystem:
+        dissipation = None
+        if needs.friction:
+            coefficients = parameters.viscous, parameters.coulomb, parameters.offset
+            dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
+        return tree_system(tree_of(parameters), dissipation)
+
+    def tree_of(parameters: SerialTreeParameters) -> Tree:
+        return Tree(
+            parents=order,
+            joints=needs.joints,
+            rotations=jax.vmap(rotation)(parameters.turns),
+            positions=parameters.positions,
+            axes=np.tile([0.0, 0.0, 1.0], (d, 1)),
+            inertias=parameters.inertias,
+            armature=parameters.armature,
+            gravity=gravity,
+        )
+
+    return Model(init, energies)
+
+
+def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """exp of a rotation vector, by Rodrigues' formula, smooth at zero."""
+    x, y, z = turn
+    zero = jnp.zeros_like(x)
+    hat = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    square = turn @ turn
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    first = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    second = jnp.where(small, 0.5 - square / 24, (1 - jnp.cos(angle)) / angle**2)
+    return jnp.eye(3, dtype=turn.dtype) + first * hat + second * hat @ hat
+
+
+def rotation_vector(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """The shortest turn whose `rotation` a matrix is, by its quaternion, which is accurate at half turns too."""
+    trace = np.trace(matrix)
+    places = np.array([trace, *np.diag(matrix)])
+    largest = int(np.argmax(places))
+    skew = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    if largest == 0:
+        w, xyz = 1 + trace, skew
+    else:
+        i = largest - 1
+        w = skew[i]
+        xyz = matrix[i] + matrix[:, i]
+        xyz[i] = 1 - trace + 2 * matrix[i, i]
+    length = np.linalg.norm(xyz)
+    if length == 0:
+        return np.zeros(3)
+    sign = 1.0 if w >= 0 else -1.0
+    return sign * xyz * (2 * np.arctan2(length, abs(w)) / length)

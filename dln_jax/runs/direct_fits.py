@@ -1,0 +1,69 @@
+"""Models with a fit of their own, without an optimiser: one linear problem, or a search for joint frames."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.learning import dynamics
+from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.kinematics import Search, fit_tree
+from dln_jax.learning.linear import choose_degrees, fit_linear
+from dln_jax.models.model import Parameters
+from dln_jax.precision import data_type
+from dln_jax.runs.dynamics_task import Options, Task
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+
+
+def fit_directly(task: Task, given: Options) -> tuple[Task, Training]:
+    """The fit of the task's model, and the task with whatever of the model it has chosen."""
+    if CATALOGUE[task.kind].properties.searched:
+        return fit_learned_tree(task, given)
+    return fit_trigonometric(task, grown=given.degree is None)
+
+
+def fit_learned_tree(task: Task, given: Options) -> tuple[Task, Training]:
+    """Joint frames by Gauss-Newton from random starts, all else by elimination."""
+    fit = fit_tree(
+        task.needs,
+        task.sets.train,
+        task.sets.validation,
+        parents=task.description["parents"],
+        acceleration=task.description["acceleration"],
+        velocity_scale=task.description["velocity_scale"],
+        settings=Search(seed=given.seed, seconds=task.seconds),
+        report=print,
+    )
+    size = f"{fit.parameter_count} parameters, of the linear ones rank {fit.rank}, condition {fit.condition:.3g}"
+    print(f"learned tree: {size}")
+    return task, _training(task, fit.parameters, fit.torque_mse, fit.seconds)
+
+
+def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
+    """One least-squares problem, after those by which validation chooses the degrees if it is to."""
+    began = time.perf_counter()
+    chosen = None
+    if grown:
+        chosen, trials = choose_degrees(task.needs, task.sets.train, task.sets.validation)
+        tried = ", ".join(f"{_degrees(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+        print(f"validation error by degrees of the joints: {tried}; chosen {_degrees(chosen.candidate)}")
+        task = task._replace(description={**task.description, "degree": list(chosen.candidate)})
+    fitted = chosen.outcome if chosen is not None else fit_linear(build(task.description), task.sets.train)
+    size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
+    print(f"least squares: {size}")
+    return task, _training(task, fitted.parameters, fitted.torque_mse, time.perf_counter() - began)
+
+
+def _training(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:
+    """A fit as if it were a training of one step."""
+    model, dtype = build(task.description), data_type(task.precision)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)
+    at = Progress(1, loss, float(np.mean(errors)), float("nan"), seconds)
+    return Training(parameters, [at], Stop("finished", 1), 1, 0.0)
+
+
+def _degrees(degrees: tuple[int, ...]) -> str:
+    return "-".join(map(str, degrees))

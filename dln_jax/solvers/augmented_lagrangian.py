@@ -1,0 +1,101 @@
+"""Smooth minimisation under many inequalities, by an augmented Lagrangian, in float64.
+
+    minimise f(x) subject to g(x) <= 0
+
+With multipliers mu >= 0 and a penalty rho, each round minimises
+
+    f(x) + sum over i of (max(0, mu_i + rho g_i(x))² - mu_i²) / (2 rho)
+
+without constraints, then takes mu <- max(0, mu + rho g) (Powell, Hestenes, Rockafellar; Nocedal and Wright 2006,
+"Numerical Optimization", section 17.4). The penalty grows where a round has not divided the violation by four. Inside
+a round it is L-BFGS (SciPy). What is returned may break a constraint by about `tolerance`: it is for the caller to
+check, who knows what a constraint is.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.precision import require_double_precision
+from dln_jax.types import InputError, require_positive
+
+Constrained = Callable[..., tuple[Array, Array]]
+"""(x [n], *arguments) -> f, scalar, and g [K]."""
+
+
+class Minimum(NamedTuple):
+    """Where a minimisation ended."""
+
+    x: np.ndarray
+    """[n]."""
+    value: float
+    """f."""
+    violation: float
+    """Largest g, 0 if none is positive."""
+    rounds: int
+    """Done."""
+
+
+def make_minimiser(
+    function: Constrained,
+    *,
+    rounds: int = 8,
+    iterations: int = 60,
+    penalty: float = 10.0,
+    growth: float = 5.0,
+    tolerance: float = 1e-3,
+) -> Callable[..., Minimum]:
+    """(x0, *arguments) -> `Minimum`, compiled once for all starts and arguments of the same shapes.
+
+    Args:
+        function: f and g.
+        rounds: at most; it ends earlier where x neither breaks a constraint by more than `tolerance`, nor has f fallen
+            by more than 1e-3 of its size.
+        iterations: of L-BFGS in a round, at most.
+        penalty: rho of the first round; f and g are best of order one.
+        growth: of rho.
+        tolerance: of g.
+
+    Raises:
+        InputError: a setting that is not positive, and from the result a start at which f is not finite.
+    """
+    require_positive(rounds=rounds, iterations=iterations, penalty=penalty, growth=growth, tolerance=tolerance)
+    require_double_precision("an augmented Lagrangian")
+
+    def augmented(x: Array, multipliers: Array, rho: Array, *arguments: Any) -> tuple[Array, tuple[Array, Array]]:
+        value, constraints = function(x, *arguments)
+        active = jnp.maximum(0.0, multipliers + rho * constraints)
+        return value + jnp.sum(active**2 - multipliers**2) / (2 * rho), (value, constraints)
+
+    evaluate = jax.jit(jax.value_and_grad(augmented, has_aux=True), compiler_options=quick_compilation())
+
+    def minimise(x0: Any, *arguments: Any) -> Minimum:
+        from scipy.optimize import minimize
+
+        x, rho, last, before = np.asarray(x0, np.float64), penalty, np.inf, np.inf
+        multipliers = np.zeros(jax.eval_shape(function, x, *arguments)[1].shape)
+        done, value, violation = 0, np.inf, np.inf
+        for done in range(1, rounds + 1):
+
+            def objective(at: np.ndarray, mu: np.ndarray = multipliers, rho: float = rho) -> tuple[float, np.ndarray]:
+                (total, _), slope = evaluate(at, mu, rho, *arguments)
+                return float(total), np.asarray(slope)
+
+            if done == 1 and not np.isfinite(objective(x)[0]):
+                raise InputError("the function to minimise is not finite at the start; choose another")
+            x = minimize(objective, x, jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}).x
+            value, constraints = (np.asarray(each) for each in evaluate(x, multipliers, rho, *arguments)[0][1])
+            violation = float(np.max(constraints, initial=0.0))
+            if violation <= tolerance and abs(before - value) <= 1e-3 * max(1.0, abs(float(value))):
+                break
+            multipliers = np.maximum(0.0, multipliers + rho * constraints)
+            rho = rho * growth if violation > max(tolerance, last / 4) else rho
+            last, before = violation, float(value)
+        return Minimum(x, float(value), violation, done)
+
+    return minimise

@@ -1,0 +1,45 @@
+"""Arms whose kinematics is not known, on the LIP protocol, as cases of the report."""
+
+from dln_jax.studies.case import Findings
+from dln_jax.studies.robots.lip import rows
+
+SEEDS = range(10)
+"""Of the starts."""
+SAMPLES = {500: 10, 150: 33, 50: 100}
+"""Of the training motion, and of how many samples each is one."""
+SMALLER = ("panda-3", "panda-4", "panda-5", "panda-6", "skew-arm", "sliding-arm")
+
+
+def seven_joints(quick: bool) -> Findings:
+    """The Panda from 500 samples, over seeds of the starts, with friction and without."""
+    if quick:
+        return Findings(rows("panda-3", friction=False, seeds=(0,), tests=(101, 102)))
+    return Findings([row for friction in (False, True) for row in rows("panda-7", friction=friction, seeds=SEEDS)])
+
+
+def fewer_joints(quick: bool) -> Findings:
+    """Three to six joints, and two arms that are not all perpendicular, one of them with a prismatic joint."""
+    if quick:
+        return Findings(rows("sliding-arm", friction=False, seeds=(0,), tests=(101, 102)))
+    return Findings(
+        [
+            row
+            for name in SMALLER
+            for friction in (False, True)
+            for row in rows(name, friction=friction, seeds=SEEDS[:3])
+        ]
+    )
+
+
+def fewer_samples(quick: bool) -> Findings:
+    """The Panda from 150 and from 50 samples."""
+    if quick:
+        return Findings(rows("panda-3", friction=False, every=SAMPLES[150], seeds=(0,), tests=(101, 102)))
+    return Findings(
+        [
+            row
+            for samples in (150, 50)
+            for friction in (False, True)
+            for row in rows("panda-7", friction=friction, every=SAMPLES[samples], seeds=SEEDS[:3])
+        ]
+    )

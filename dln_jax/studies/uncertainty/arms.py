@@ -1,0 +1,129 @@
+"""Arms of known frames, and noisy motions of them: torques of rigid bodies, friction, and what no model of ours has."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.types import Vector
+
+RIGHT = np.pi / 2
+PANDA = (
+    *((0, 0, 0.333, 0), (-RIGHT, 0, 0, 0), (RIGHT, 0, 0.316, 0), (RIGHT, 0.0825, 0, 0)),
+    *((-RIGHT, -0.0825, 0.384, 0), (RIGHT, 0, 0, 0), (RIGHT, 0.088, 0, 0)),
+)
+"""Modified Denavit-Hartenberg rows: alpha, a, d, theta; rad and m."""
+UR10 = (
+    *((0, 0, 0.1273, 0), (RIGHT, 0, 0, 0), (0, -0.612, 0, 0)),
+    *((0, -0.5723, 0.163941, 0), (RIGHT, 0, 0.1157, 0), (-RIGHT, 0, 0.0922, 0)),
+)
+"""Of the manufacturer, likewise."""
+VELOCITY_SCALE = 0.05
+"""1/s, of dry friction."""
+SECONDS, STEP = 6.0, 0.04
+"""Of a motion, and between its samples."""
+
+Plant = Callable[..., Any]
+
+
+def arm(d: int) -> Tree:
+    """The first d joints of a Panda, with links that get lighter, and motors."""
+    random = np.random.default_rng(0)
+    links = [
+        inertial_parameters(5.0 / (1 + i / 2), 0.1 * random.normal(size=3), 0.03 * np.diag(random.uniform(0.5, 1.5, 3)))
+        for i in range(d)
+    ]
+    return serial(*dh_frames(PANDA[:d]), links, armature=np.full(d, 0.05))
+
+
+def plant(tree: Tree, *, unmodelled: bool) -> Plant:
+    """(q, qd, qdd) [N, d] each -> torques [N, d] of the arm with viscous and dry friction.
+
+    With `unmodelled`, also friction that grows with the weight on a joint and as it slows down (Stribeck).
+    """
+    d = tree.degrees_of_freedom
+    friction = joint_dissipation(
+        np.full(d, 0.2), np.full(d, 0.5), np.linspace(-0.1, 0.1, d), velocity_scale=VELOCITY_SCALE
+    )
+    motion = dynamics(tree_system(tree, friction))
+
+    def torque(q: Vector, qd: Vector, qdd: Vector) -> Vector:
+        tau = motion.inverse_dynamics(q, qd, qdd)
+        if not unmodelled:
+            return tau
+        weight = motion.decompose(q, 0 * q, 0 * q).gravity
+        return tau + jnp.tanh(qd / VELOCITY_SCALE) * (0.3 * jnp.exp(-((qd / 0.3) ** 2)) + 0.03 * jnp.abs(weight))
+
+    return jax.jit(jax.vmap(torque), compiler_options=quick_compilation())
+
+
+def motions(
+    torque: Plant, d: int, count: int, *, noise: float, seed: int, reach: float = 1.0, speed: float = 1.0
+) -> Trajectories:
+    """Motions of four sines a joint with drawn amplitudes, frequencies and phases.
+
+    Args:
+        torque: of a `plant`.
+        d: its joints.
+        count: of motions.
+        noise: standard deviation of the first torque's noise, N m; it falls to 30 % of that at the last joint.
+        seed: of everything drawn.
+        reach: multiplies amplitudes.
+        speed: multiplies frequencies.
+    """
+    random, t = np.random.default_rng(seed), np.arange(0, SECONDS, STEP)
+    rate = speed * 2 * np.pi * random.uniform(0.05, 0.5, (count, 1, d, 4))
+    size = reach * random.uniform(0.1, 0.5, (count, 1, d, 4))
+    phase = rate * t[:, None, None] + random.uniform(0, 2 * np.pi, (count, 1, d, 4))
+    middle = random.uniform(-0.3, 0.3, (count, 1, d))
+    q = middle + np.sum(size * np.sin(phase), axis=-1)
+    qd, qdd = np.sum(size * rate * np.cos(phase), axis=-1), -np.sum(size * rate**2 * np.sin(phase), axis=-1)
+    q, qd, qdd = (each.reshape(-1, d) for each in (q, qd, qdd))
+    tau = np.asarray(torque(q, qd, qdd))
+    tau = tau + noise * np.linspace(1, 0.3, d) * random.normal(size=tau.shape)
+    trajectory = np.repeat(np.arange(count), len(t))
+    return from_arrays({"t": np.tile(t, count), "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": trajectory})
+
+
+def filtered(
+    t: Float[np.ndarray, " n"],
+    q: Float[np.ndarray, "n d"],
+    tau: Float[np.ndarray, "n d"],
+    *,
+    cutoff: float,
+    rate: float,
+    seconds: float,
+) -> dict[str, np.ndarray]:
+    """One recording without delay, rates by differences of what is filtered, in blocks that count as trajectories.
+
+    Args:
+        t: increasing.
+        q: measured.
+        tau: measured, filtered alike.
+        cutoff: of a Butterworth low-pass of fourth order, run both ways, Hz.
+        rate: of the samples that are kept, Hz.
+        seconds: of a block; half a second at both ends of the recording is left out.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    step = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1], step)
+    low_pass = butter(4, cutoff, fs=1 / step, output="sos")
+    q, tau = (
+        sosfiltfilt(low_pass, np.stack([np.interp(even, t, column) for column in each.T], axis=1), axis=0)
+        for each in (q, tau)
+    )
+    qd = np.gradient(q, step, axis=0)
+    qdd = np.gradient(qd, step, axis=0)
+    inside = np.flatnonzero((even > even[0] + 0.5) & (even < even[-1] - 0.5))[:: max(1, round(1 / rate / step))]
+    block = ((even[inside] - even[inside[0]]) // seconds).astype(int)
+    arrays = {"t": even, "q": q, "qd": qd, "qdd": qdd, "tau": tau}
+    return {**{key: array[inside] for key, array in arrays.items()}, "trajectory": block}

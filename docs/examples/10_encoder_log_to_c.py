@@ -1,0 +1,129 @@
+"""
+From an encoder log to C
+========================
+
+A three-axis arm whose frames are known is logged: noisy encoders, noisy torques, dry friction, no rates. Filtering,
+identification with friction, how sure the torques are, and C for the control loop.
+"""
+
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import dln_jax
+from dln_jax.data.encoders import smooth
+from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import select
+from dln_jax.identification import identify, parameters_of
+from dln_jax.learning import uncertainty
+from dln_jax.learning.friction import fit_friction
+from dln_jax.mechanics import trees
+from dln_jax.models import make_rigid_tree
+from dln_jax.models.uncertainty import predictive
+
+jax.config.update("jax_enable_x64", True)
+random = np.random.default_rng(0)
+
+# %%
+# The arm
+# -------
+# Denavit-Hartenberg rows are the drawing; what the links weigh nobody knows. The true arm has motors and friction.
+
+rows = [[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0], [0, 0.4, 0, 0]]  # alpha, a, d, theta
+guess = trees.serial(*trees.dh_frames(rows), [trees.inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))] * 3)
+bodies = [
+    trees.inertial_parameters(mass, [0.15, 0.02, 0.03], np.diag([0.01, 0.03, 0.03]) * mass) for mass in (4.0, 3.0, 1.5)
+]
+true = guess._replace(inertias=np.stack(bodies), armature=np.array([0.2, 0.2, 0.1]))
+friction = dln_jax.joint_dissipation([0.5, 0.6, 0.3], [0.8, 1.0, 0.4], velocity_scale=0.03)
+plant = dln_jax.dynamics(dln_jax.tree_system(true, friction))
+
+# %%
+# The log
+# -------
+# Five motions of 6 s at 125 Hz. Encoders have 0.1 mrad of noise, torques 0.2 N m; velocities are not logged.
+
+
+def motion(amplitudes, phases, t):
+    """Three harmonics for each joint, rad."""
+    return jnp.sum(amplitudes * jnp.sin(jnp.arange(1, 4) * 1.3 * t + phases), axis=1)
+
+
+t, logs = np.arange(0, 6, 0.008), []
+for _ in range(5):
+    path = jax.tree_util.Partial(motion, random.uniform(0.1, 0.5, (3, 3)), random.uniform(0, 6, (3, 3)))
+    speed = jax.jacfwd(path)
+    q, qd, qdd = (np.asarray(jax.jit(jax.vmap(each))(t)) for each in (path, speed, jax.jacfwd(speed)))
+    logs.append((q, np.asarray(jax.jit(jax.vmap(plant.inverse_dynamics))(q, qd, qdd))))
+q, tau = (np.concatenate(each) for each in zip(*logs, strict=True))
+log = from_arrays(
+    {
+        "t": np.tile(t, 5),
+        "q": q + 1e-4 * random.normal(size=q.shape),
+        "tau": tau + 0.2 * random.normal(size=tau.shape),
+        "trajectory": np.repeat(np.arange(5), len(t)),
+    }
+)
+smoothed = smooth(log)
+print(f"filtered at {smoothed.cutoff:.1f} Hz; noise of torques {np.round(smoothed.noise_tau, 2)} N m")
+data = smoothed.data
+train, validation, test = (select(data, which) for which in ([0, 1, 2], [3], [4]))
+
+# %%
+# Identification
+# --------------
+# The velocity to which dry friction is resolved is found first; then inertias, armature and friction, weighted by the
+# joints' noise, with links that are bodies.
+
+laws = ("viscous", "coulomb", "offset")
+scales = fit_friction(guess, train, laws).shape["velocity_scale"]
+model = make_rigid_tree(guess, friction=laws, velocity_scale=tuple(scales.tolist()))
+known = model.init(jax.random.key(0))._replace(viscous=jnp.full(3, 0.1), coulomb=jnp.full(3, 0.1))
+found = identify(model, known, train)
+arm = parameters_of(found.theta, known)
+print(f"dry friction {np.round(arm.coulomb, 2)} N m, resolved to {np.round(scales, 3)} rad/s")
+print(f"{len(found.base.words)} base parameters, for example {found.base.words[2]}")
+assert np.abs(arm.coulomb - np.array([0.8, 1.0, 0.4])).max() < 0.1
+
+# %%
+# How sure it is
+# --------------
+# A standard deviation for the torque of any state, calibrated on motions that were left out.
+
+sure = uncertainty.estimate(model, arm, train, validation, ridge=0.0, unit=found.fit.noise, negligible=1e-12)
+std = predictive(model, arm, sure.uncertainty.factor, sure.uncertainty.noise, sure.uncertainty.inflation)
+inverse = dln_jax.dynamics(model.energies(arm)).inverse_dynamics
+predicted, band = (np.asarray(jax.jit(jax.vmap(each))(test.q, test.qd, test.qdd)) for each in (inverse, std))
+covered = np.mean(np.abs(predicted - test.tau) < 1.96 * band)
+print(f"{covered:.1%} of the torques of an unseen motion are in the band of 95 %")
+assert covered > 0.9
+
+# %%
+# C
+# -
+# Both functions, for a loop at 1 kHz.
+
+state = test.q[0], test.qd[0], test.qdd[0]
+folder = Path(tempfile.mkdtemp()) / "arm"
+dln_jax.export_c({"inverse_dynamics": (inverse, state), "torque_std": (std, state)}, folder)
+in_c = dln_jax.load_c(folder)
+assert np.abs(in_c.inverse_dynamics(*state) - inverse(*state)).max() < 1e-10
+assert np.abs(in_c.torque_std(*state) - std(*state)).max() < 1e-10
+
+# %%
+# An unseen motion, with bands of 95 %:
+
+figure, axes = plt.subplots(3, 1, figsize=(7, 6), sharex=True, layout="constrained")
+for joint, axis in enumerate(axes):
+    axis.plot(test.t, test.tau[:, joint], ".", markersize=2, color="0.6", label="measured")
+    axis.plot(test.t, predicted[:, joint], label="identified")
+    low, high = (predicted[:, joint] + sign * 1.96 * band[:, joint] for sign in (-1, 1))
+    axis.fill_between(test.t, low, high, alpha=0.25, label="95 %")
+    axis.set_ylabel(f"torque {joint + 1}, N m")
+axes[0].legend(ncols=3, loc="upper right", fontsize="small")
+axes[-1].set_xlabel("t, s")
+plt.show()

@@ -1,0 +1,3 @@
+from dln_jax.__main__ import command
+
+command("robot_report", "python -m scripts.robot_report")

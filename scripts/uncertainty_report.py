@@ -1,0 +1,3 @@
+from dln_jax.__main__ import command
+
+command("uncertainty_report", "python -m scripts.uncertainty_report")

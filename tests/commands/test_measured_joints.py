@@ -1,0 +1,89 @@
+"""Measured motions of two coupled joints, by the command: momenta of the model, stated tests and noise, the report."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax import load
+from dln_jax.commands import train_hnn_task
+from dln_jax.learning.measured_motions import motion
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.studies.hamiltonian.tasks import MEASURED, Stated, problem_of
+from dln_jax.types import InputError, Needs
+from tests.calls import command, refused
+
+NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
+COUNT, LENGTH, NOISE = 4, 64, 1e-3
+
+
+@pytest.fixture(scope="module")
+def double(tmp_path_factory):
+    """Angles from the vertical of a double pendulum, and a file of another recording."""
+    folder = tmp_path_factory.mktemp("double")
+    chain = make_planar_chain(NEEDS, coordinates="absolute")
+    parameters = chain.init(jax.random.key(0))._replace(
+        moments=jnp.array([2.0, 1.0, 1.0]), weight=jnp.array([19.62, 9.81]), viscous=jnp.array([0.1, 0.05])
+    )
+    plant, t, random = dynamics(chain.energies(parameters)), 0.02 * jnp.arange(LENGTH), np.random.default_rng(0)
+    starts = random.uniform(-1.5, 1.5, (COUNT, 4))
+    states = np.asarray(jax.jit(jax.vmap(lambda start: motion(plant, start, t, substeps=2)))(starts))
+    q = states[..., :2] + NOISE * random.normal(size=states[..., :2].shape)
+    arrays = {"t": np.tile(t, COUNT), "q": q.reshape(-1, 2), "trajectory": np.repeat(range(COUNT), LENGTH)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        np.savez("double.npz", **arrays, label=["a", "b", "c", "d"])
+        np.savez("other.npz", **{key: value[:LENGTH] for key, value in arrays.items()})
+        np.savez("single.npz", t=arrays["t"][:LENGTH], q=q[0, :, :1], trajectory=np.zeros(LENGTH))
+        yield folder
+
+
+MEASURE = ("--task", "measured", "--data", "double.npz", "--no-low-latency", "--no-figures")
+
+
+def test_coupled_joints_are_learned_and_reported(double, capsys):
+    options = ("--model", "planar-chain", "--coordinates", "absolute", "--test", "d", "--steps", "6")
+    command(train_hnn_task, *MEASURE, *options, "--out", "run")
+    assert "here the mean inertia at q = (0, 0) is 1" in capsys.readouterr().out
+    metrics = json.loads((double / "run" / "metrics.json").read_text())
+    assert {"vpt_seconds", "vpt_median_seconds", "energy_drift", "rollout_mse", "validation_error"} <= set(metrics)
+    assert metrics["q1_noise"] == pytest.approx(NOISE, rel=0.3)
+    assert 0 < metrics["vpt_seconds"] <= metrics["predicted_seconds"] and metrics["energy_drift"] < 1e-3
+    run = load(double / "run")
+    M = run.dynamics.mass_matrix(np.zeros(2))
+    assert np.trace(M) / 2 == pytest.approx(1, abs=0.02) and M[0, 1] / M[1, 1] == pytest.approx(1, abs=0.2)
+
+
+def test_tests_and_noise_may_be_stated(double):
+    data = double / "double.npz"
+    known = problem_of(MEASURED, data=data, stated=Stated(test="b, d", noise=(0.01, 0.02)))
+    assert known.noise is not None and known.noise.q == (0.01, 0.02) and known.noise.qd is None
+    assert len(known.truth) == 2 and len(known.fitted.t) == 2 * LENGTH
+    other = problem_of(MEASURED, data=data, stated=Stated(test=str(double / "other.npz")))
+    assert len(other.truth) == 1 and len(other.fitted.t) == COUNT * LENGTH
+    for stated, message in (
+        (Stated(test="e"), "labelled 'e'"),
+        (Stated(test="a,b,c,d"), "are for the test"),
+        (Stated(test=str(double / "single.npz")), "has 1 coordinates"),
+        (Stated(noise=(0.1, 0.1, 0.1)), "noise has 3 numbers"),
+    ):
+        with pytest.raises(InputError, match=message):
+            problem_of(MEASURED, data=data, stated=stated)
+
+
+def test_mistakes_are_one_line(double, capsys):
+    cases = [
+        ((*MEASURE, "--noise", "small"), "--noise is 'small'"),
+        ((*MEASURE, "--noise", "0"), "positive, finite"),
+        ((*MEASURE, "--coordinates", "absolute"), "--coordinates is for planar-chain"),
+        ((*MEASURE, "--model", "trigonometric", "--width", "3"), "--width is for networks"),
+        (("--task", "spring", "--test", "a"), "--test is for measured"),
+        (("--task", "spring", "--model", "trigonometric"), "is of no phase space"),
+    ]
+    for number, (options, message) in enumerate(cases):
+        assert message in refused(capsys, train_hnn_task, *options, "--out", f"no-{number}")
+        assert not (double / f"no-{number}").exists()

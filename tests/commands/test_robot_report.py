@@ -1,0 +1,57 @@
+"""The report of robots: what it refuses, and how its rows come of what was measured."""
+
+import numpy as np
+import pytest
+from calls import refused
+
+from dln_jax.commands import robot_report
+from dln_jax.studies.robots import cases
+from dln_jax.studies.robots.known_kinematics import rows_of_errors, rows_of_tracking
+from dln_jax.studies.robots.recorded_arm import rows_of
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--only", "nonsense"), "'nonsense' is unknown; choose from"),
+        (("--log", "log.npz"), "--log and --robot belong together"),
+        (("--log", "no.npz", "--robot", "no.urdf"), "no.npz: no such file"),
+        (("--only", "recordings"), "recordings without any"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(capsys, robot_report, *arguments, "--out", "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_recordings_are_cases_where_they_are_given(tmp_path):
+    names = {case.name for case in cases(log=tmp_path, robot=tmp_path, pendulum=tmp_path)}
+    assert names - {case.name for case in cases()} == {"recordings/arm", "recordings/double-pendulum"}
+
+
+def test_errors_are_held_against_the_rival():
+    errors = {"ours": [np.full(7, 1e-3), np.full(7, 2e-3)], "pinocchio": [np.full(7, 2e-3), np.full(7, 2e-3)]}
+    rows = {(row.case.split("/")[-1], row.quantity): row for row in rows_of_errors(errors, 2)}
+    assert rows["ours", "nmse"].value == pytest.approx(1.5e-3) and rows["ours", "nmse"].passed
+    assert rows["ours", "nmse_worst"].value == pytest.approx(2e-3)
+    assert rows["ours", "over_pinocchio"].value == pytest.approx(0.75)
+
+
+def test_tracking_is_held_against_true_parameters():
+    rows = rows_of_tracking({"true-parameters": [1.0, 2.0], "ours": [1.2, 2.4], "without": [20.0, 30.0]})
+    assert rows[-1].value == pytest.approx(1.2) and rows[-1].passed is False
+
+
+def test_blocks_count_by_the_whole_logs_variance():
+    squares = {
+        "usual-friction": [np.full((10, 2), 4.0), np.full((10, 2), 1.0)],
+        "chosen-friction": [np.full((10, 2), 2.0), np.full((10, 2), 1.0)],
+        "with-residual": [np.full((10, 2), 1.0), np.full((10, 2), 1.0)],
+        "pinocchio": [np.full((10, 2), 2.0), np.full((10, 2), 2.0)],
+    }
+    rows = {(row.case.split("/")[-1], row.quantity): row for row in rows_of(squares, np.array([10.0, 10.0]), "ab")}
+    assert rows["usual-friction", "nmse"].value == pytest.approx(0.25)
+    assert rows["usual-friction", "nmse"].passed is False
+    assert rows["usual-friction", "nmse_worst_blocks"].value == pytest.approx(0.4)
+    assert rows["with-residual", "over_without"].value == pytest.approx(2 / 3)

@@ -1,0 +1,243 @@
+"""Every check finds the fault that is planted, names its joint, and is silent on data without it."""
+
+import jax
+import numpy as np
+import pytest
+
+from dln_jax.data import schema
+from dln_jax.data.checks import as_recording, examine, page, quick, read
+from dln_jax.data.robots import Robot
+from dln_jax.datasets import generators
+from dln_jax.mechanics import trees
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError, Needs
+
+RATE, SAMPLES, RUNS = 100.0, 700, 4
+NOISE_TAU = np.array([0.15, 0.1, 0.02])
+RIGHT = np.pi / 2
+WIDE = np.tile([-np.inf, np.inf], (3, 1))
+
+
+def arm(gravity=(0.0, 0.0, -9.81)):
+    """Three joints: a vertical one, then two across it."""
+    rows = [[0, 0, 0.3, 0], [-RIGHT, 0.05, 0, -RIGHT], [0, 0.4, 0, 0]]
+    links = [
+        trees.inertial_parameters(mass, centre, size * np.eye(3))
+        for mass, centre, size in ((3.0, [0, 0, -0.1], 0.02), (2.5, [0.2, 0, 0], 0.03), (1.0, [0.15, 0.02, 0], 0.01))
+    ]
+    tree = trees.serial(*trees.dh_frames(rows), links, armature=np.array([0.1, 0.1, 0.02]), gravity=gravity)
+    return Robot(tree._replace(names=("base", "shoulder", "elbow")), np.zeros(3), np.zeros(3), WIDE, WIDE)
+
+
+def motions(seed):
+    """q, qd and qdd [RUNS, SAMPLES, 3] of sums of sines."""
+    random = np.random.default_rng(seed)
+    t = np.arange(SAMPLES) / RATE
+    w = 2 * np.pi * np.array([0.15, 0.4, 0.7, 1.1])
+    a, b = random.uniform(-1, 1, (2, RUNS, 3, 4)) * np.array([1.0, 0.7, 0.4, 0.25])
+    sine, cosine = np.sin(w[:, None] * t), np.cos(w[:, None] * t)
+
+    def total(first, second):
+        return np.moveaxis(first @ sine + second @ cosine, 1, 2)
+
+    return t, total(a, b), total(-b * w, a * w), total(-a * w**2, -b * w**2)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Arrays of a log of the arm with friction, its encoders' and torques' noise, and true rates."""
+    t, q, qd, qdd = motions(seed=1)
+    tree = arm().tree
+    flat = [x.reshape(-1, 3) for x in (q, qd, qdd)]
+    tau = np.asarray(jax.vmap(lambda *state: trees.newton_euler(tree, *state))(*flat))
+    tau = tau + flat[1] * [0.4, 0.4, 0.1] + np.tanh(flat[1] / 0.02) * [0.8, 0.8, 0.15]
+    random = np.random.default_rng(2)
+    return {
+        "t": np.tile(t, RUNS),
+        "q": flat[0] + 2e-5 * random.normal(size=flat[0].shape),
+        "qd": flat[1],
+        "tau": tau + NOISE_TAU * random.normal(size=tau.shape),
+        "trajectory": np.repeat(np.arange(RUNS), SAMPLES),
+        "needs": np.array('{"joints": ["revolute", "revolute", "revolute"], "friction": true}'),
+    }
+
+
+def column(array, joint, change):
+    changed = array.copy()
+    changed[:, joint] = change(changed[:, joint])
+    return changed
+
+
+def late(array, samples):
+    """Each run so many samples later; its first value is repeated."""
+    runs = array.reshape(RUNS, SAMPLES, -1)
+    return np.concatenate([np.repeat(runs[:, :1], samples, 1), runs[:, :-samples]], 1).reshape(array.shape)
+
+
+def without(keys, arrays):
+    return {key: value for key, value in arrays.items() if key not in keys}
+
+
+def shuffled(arrays):
+    order = np.random.default_rng(0).permutation(len(arrays["t"]))
+    return {key: value if key == "needs" else value[order] for key, value in arrays.items()}
+
+
+def jittered(arrays):
+    return {**arrays, "t": arrays["t"] + np.random.default_rng(0).uniform(0, 0.003, len(arrays["t"]))}
+
+
+def with_gap(arrays):
+    kept = np.ones(len(arrays["t"]), bool)
+    kept[200:300] = False
+    return {key: value if key == "needs" else value[kept] for key, value in arrays.items()}
+
+
+def one_run(arrays):
+    kept = arrays["trajectory"] == 0
+    return {key: value if key == "needs" else value[kept] for key, value in arrays.items()}
+
+
+LOG_FAULTS = {
+    "degrees per second": (lambda a: {**a, "qd": np.degrees(a["qd"])}, "qd-unit", (0, 1, 2), "degrees"),
+    "q in degrees": (lambda a: {**a, "q": np.degrees(a["q"])}, "qd-unit", (0, 1, 2), "q from degrees"),
+    "all in degrees": (lambda a: without(["qd"], {**a, "q": np.degrees(a["q"])}), "q-unit", None, "degrees"),
+    "q of a motor": (
+        lambda a: without(["qd"], {**a, "q": column(a["q"], 1, lambda x: 80 * x)}), "q-unit", (1,), "gear"
+    ),
+    "qd turned round": (lambda a: {**a, "qd": column(a["qd"], 2, np.negative)}, "qd-sign", (2,), "sign"),
+    "qd of a motor": (lambda a: {**a, "qd": column(a["qd"], 1, lambda x: 50 * x)}, "qd-unit", (1,), "50"),
+    "qd late": (lambda a: {**a, "qd": late(a["qd"], 3)}, "qd-delay", (0, 1, 2), "30 ms late"),
+    "qd exchanged": (lambda a: {**a, "qd": a["qd"][:, [1, 0, 2]]}, "qd-unlike", (0, 1), "order"),
+    "milliseconds": (lambda a: {**a, "t": 1000 * a["t"]}, "time-unit", (), "seconds"),
+    "jitter": (jittered, "jitter", (), "vary by"),
+    "gap": (with_gap, "gaps", (), "1 gap"),
+    "one run": (one_run, "split", (), "1 trajectories"),
+    "torque turned round": (lambda a: {**a, "tau": column(a["tau"], 1, np.negative)}, "torque-sign", (1,), "against"),
+    "torques late": (lambda a: {**a, "tau": late(a["tau"], 8)}, "delay", (), "late"),
+    "torques cut off": (lambda a: {**a, "tau": np.clip(a["tau"], -6, 6)}, "saturation-tau", None, "cut off"),
+    "q cut off": (
+        lambda a: {**a, "q": column(a["q"], 2, lambda x: np.minimum(x, 0.6 * x.max()))}, "saturation-q", (2,), "flat"
+    ),
+    "still": (lambda a: {**a, "q": column(a["q"], 2, lambda x: 0 * x + 1)}, "unexcited", (2,), "never moves"),
+    "hardly moved": (lambda a: {**a, "q": column(a["q"], 2, lambda x: 0.001 * x)}, "unexcited", (2,), "less than"),
+    "steps": (lambda a: {**a, "q": np.round(a["q"] / 2e-3) * 2e-3}, "quantisation", (0, 1, 2), "steps of up to 0.002"),
+    "raw differences": (
+        lambda a: without(["qd"], {**a, "q": a["q"] + 3e-4 * np.random.default_rng(0).normal(size=a["q"].shape)}),
+        *("raw-differences", (), "--cutoff auto"),
+    ),
+    "constant torque": (
+        lambda a: {**a, "tau": column(a["tau"], 0, lambda x: 0 * x + 2)}, "constant-torque", (0,), "constant"
+    ),
+    "friction not stated": (lambda a: without(["needs"], a), "friction", None, "friction is seen"),
+}  # fmt: skip
+
+
+def test_nothing_is_found_in_a_clean_log(clean):
+    assert quick(schema.from_arrays(clean)) == []
+    exact = schema.from_arrays(without(["qd"], {**clean, "q": motions(seed=1)[1].reshape(-1, 3)}))
+    assert quick(exact) == []
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_nothing_is_found_in_other_clean_logs(seed):
+    t, q, qd, qdd = motions(seed)
+    scene = two_link_arm()
+    data = schema.from_arrays(
+        {
+            "t": np.tile(t, RUNS),
+            **{key: x.reshape(-1, 3)[:, :2] for key, x in (("q", q), ("qd", qd), ("qdd", qdd))},
+            "trajectory": np.repeat(np.arange(RUNS), SAMPLES),
+        }
+    )
+    tau = jax.vmap(dynamics(scene.closed_form).inverse_dynamics)(data.q, data.qd, data.qdd)
+    assert quick(data._replace(tau=np.asarray(tau), estimated=(), needs=scene.needs)) == []
+
+
+def test_nothing_is_found_in_generated_data():
+    assert quick(generators.uniform(cart_pole(), samples=200)) == []
+    assert quick(generators.characters()) == []
+
+
+@pytest.mark.parametrize("name", LOG_FAULTS)
+def test_a_planted_fault_is_found(clean, name):
+    plant, check, joints, word = LOG_FAULTS[name]
+    findings = quick(schema.from_arrays(plant(dict(clean))))
+    found = [finding for finding in findings if finding.check == check]
+    assert found, f"{check} is not among {[finding.line for finding in findings]}"
+    assert word in found[0].line and "\n" not in found[0].line and found[0].remedy
+    if joints is not None:
+        assert found[0].joints == joints
+
+
+TREE_FAULTS = {
+    "torque turned round": (lambda a: {**a, "tau": column(a["tau"], 2, np.negative)}, arm(), "tree-sign", (2,)),
+    "motor's torque": (lambda a: {**a, "tau": a["tau"] / 100}, arm(), "gear", (0, 1, 2)),
+    "columns exchanged": (
+        lambda a: {**a, **{key: a[key][:, [0, 2, 1]] for key in ("q", "qd", "tau")}}, arm(), "order", ()
+    ),
+    "upside down": (dict, arm(gravity=(0.0, 0.0, 9.81)), "gravity", ()),
+    "on a wall": (dict, arm(gravity=(0.0, 9.81, 0.0)), "gravity", ()),
+    "torques late": (lambda a: {**a, "tau": late(a["tau"], 2)}, arm(), "delay", ()),
+    "beyond limits": (dict, arm()._replace(position_limits=np.tile([-0.5, 0.5], (3, 1))), "limits", (0, 1, 2)),
+}  # fmt: skip
+
+
+def test_a_clean_log_suits_its_robot(clean):
+    examined = examine(as_recording(schema.from_arrays(clean)), arm())
+    on_tree = examined.on_tree
+    assert examined.findings == []
+    assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
+    assert on_tree.gravity == pytest.approx([0, 0, -9.81], abs=0.3)
+    assert abs(on_tree.delays.delay) < 0.2
+    assert on_tree.friction.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
+    assert 0 < on_tree.rank < on_tree.parameters and 1 < on_tree.condition < 1000
+    assert "nothing was found" in page(examined, "log.npz")
+
+
+@pytest.mark.parametrize("name", TREE_FAULTS)
+def test_a_fault_against_the_robot_is_found(clean, name):
+    plant, robot, check, joints = TREE_FAULTS[name]
+    examined = examine(as_recording(schema.from_arrays(plant(dict(clean)))), robot)
+    findings = examined.findings
+    found = [finding for finding in findings if finding.check == check]
+    assert found, f"{check} is not among {[finding.line for finding in findings]}"
+    assert found[0].joints == joints and "\n" not in found[0].line
+    if name == "upside down":
+        assert "-9." in found[0].said
+    if name == "torques late":
+        assert examined.on_tree.delays.delay == pytest.approx(2, abs=0.3)
+
+
+def test_a_robot_of_another_size_is_refused(clean):
+    with pytest.raises(InputError, match="the robot has 3 joints, but the data have 2"):
+        examine(
+            as_recording(
+                schema.from_arrays({**without(["needs"], clean), **{k: clean[k][:, :2] for k in ("q", "qd", "tau")}})
+            ),
+            arm(),
+        )
+
+
+def test_times_out_of_order_or_double_are_repaired_and_said(clean, tmp_path):
+    arrays = shuffled(clean)
+    arrays = {key: x if key == "needs" else np.concatenate([x, x[:5]]) for key, x in arrays.items()}
+    np.savez(tmp_path / "log.npz", **arrays, joint_names=np.array(["elbow", "base", "shoulder"]))
+    recording = read(tmp_path / "log.npz")
+    assert [finding.check for finding in recording.repaired] == ["time-order", "time-double"]
+    assert np.array_equal(recording.data.q, clean["q"]) and recording.data.needs == Needs(
+        ("revolute",) * 3, friction=True
+    )
+    findings = examine(recording, arm()).findings
+    assert {"time-order", "time-double", "order"} <= {finding.check for finding in findings}
+
+
+def test_a_file_that_is_none_is_refused(tmp_path):
+    (tmp_path / "log.npz").write_text("no archive")
+    with pytest.raises(InputError, match="not a readable npz"):
+        read(tmp_path / "log.npz")
+    np.savez(tmp_path / "empty.npz", t=np.zeros(3))
+    with pytest.raises(InputError, match="key 'q' is missing"):
+        read(tmp_path / "empty.npz")

@@ -1,0 +1,100 @@
+"""Bodies that exist: the parametrisation reaches all of them and no other, and costs little where the truth is one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from planar_arm import ARM, FRICTION, motions
+
+from dln_jax.identification import consistent
+from dln_jax.identification.columns import columns_of, flat
+from dln_jax.identification.consistent import fit_consistent, is_consistent, nearest_body
+from dln_jax.identification.equations import compressed, regressor_of, squares, weighted
+from dln_jax.identification.weighted import fit_weighted
+from dln_jax.mechanics.trees import body_of_pseudo_inertia, inertial_parameters, moved, pseudo_inertia
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import InputError
+
+BODY = inertial_parameters(2.0, [0.1, -0.2, 0.3], np.diag([0.03, 0.04, 0.05]))
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """An arm known roughly, and noisy equations of it."""
+    model = make_rigid_tree(ARM, friction=True)
+    known = model.init(jax.random.key(0))._replace(inertias=jnp.asarray(0.6 * ARM.inertias))
+    given = compressed(regressor_of(model, known, motions(0, noise=0.2, trajectories=3)))
+    fit = fit_weighted(given, flat(known))
+    return given, columns_of(known), flat(known), fit
+
+
+def test_a_pseudo_inertia_is_a_body():
+    np.testing.assert_allclose(body_of_pseudo_inertia(pseudo_inertia(BODY)), BODY, rtol=1e-12)
+    np.testing.assert_allclose(body_of_pseudo_inertia(jnp.asarray(pseudo_inertia(BODY))), BODY, rtol=1e-12)
+
+
+def test_the_squares_sum_to_the_divergence():
+    """Of a random relative factor, against its definition; also where a series takes over."""
+    for scale in (1.0, 1e-2, 1e-5):
+        numbers = scale * np.random.default_rng(0).normal(size=10)
+        E = np.asarray(consistent._upper(jnp.asarray(numbers)))
+        M = E @ E.T
+        roots = np.asarray(consistent._divergence_roots(jnp.asarray(numbers)))
+        expected = np.trace(M) - np.linalg.slogdet(M)[1] - 4
+        np.testing.assert_allclose(np.sum(roots**2), expected, rtol=1e-6, atol=1e-14)
+    slope = jax.jacfwd(consistent._divergence_roots)(jnp.zeros(10))
+    np.testing.assert_allclose(slope, np.diag([2**0.5] * 4 + [1.0] * 6), atol=1e-12)
+
+
+def test_the_nearest_body():
+    np.testing.assert_array_equal(nearest_body(BODY), BODY)
+    hollow = BODY.copy()
+    hollow[4] = -1.0
+    assert np.linalg.eigvalsh(pseudo_inertia(nearest_body(hollow)))[0] > 0
+    with pytest.raises(InputError, match="no mass"):
+        nearest_body(np.zeros(10))
+
+
+def test_all_exist_and_it_costs_little(noisy):
+    given, columns, known, fit = noisy
+    found = fit_consistent(weighted(given, fit.noise), columns, known)
+    assert all(is_consistent(found.theta, columns)) and found.status.name == "IMPROVEMENT"
+    positive = np.array(columns.kinds) == "positive"
+    assert (found.theta[positive] > 0).all()
+    # Least squares is the least there is; a body that exists explains as much but for some standard errors.
+    free, bound = squares(given, fit.theta), squares(given, found.theta)
+    assert (bound <= free * 1.03).all()
+    # Friction, which data show alone, is what it was.
+    errors = fit.standard_errors(np.eye(len(known)))
+    for law, values in FRICTION.items():
+        for joint, value in enumerate(values):
+            k = columns.names.index(f"{law}_{joint + 1}")
+            assert abs(found.theta[k] - value) < 5 * errors[k] + 0.01
+    assert not all(is_consistent(fit.theta, columns))
+
+
+def test_regularisation_keeps_what_is_known(noisy):
+    """A hundred million measurements' worth of trust leave the bodies where they were, and none lets them go."""
+    given, columns, known, fit = noisy
+    triangle = weighted(given, fit.noise)
+    inertial = np.array(columns.kinds) == "inertia"
+    found = [fit_consistent(triangle, columns, known, regularisation=each) for each in (1e8, 1.0, 1e-3)]
+    np.testing.assert_allclose(found[0].theta[inertial], known[inertial], rtol=1e-2, atol=1e-3)
+    departures = [each.divergence.sum() for each in found]
+    assert departures[0] < 1e-3 < departures[1] < departures[2]
+    with pytest.raises(InputError, match="regularisation"):
+        fit_consistent(triangle, columns, known, regularisation=0.0)
+
+
+def test_frames_do_not_matter():
+    """The divergence is between bodies: the same for both as seen from elsewhere."""
+
+    def divergence(one, other):
+        M = np.linalg.solve(pseudo_inertia(other), pseudo_inertia(one))
+        return np.trace(M) - np.linalg.slogdet(M)[1] - 4
+
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    other = inertial_parameters(1.0, [0.0, 0.1, 0.1], np.diag([0.02, 0.02, 0.03]))
+    there = [moved(body, turn, np.array([1.0, 2.0, -3.0])) for body in (BODY, other)]
+    np.testing.assert_allclose(divergence(BODY, other), divergence(*there), rtol=1e-6)

@@ -1,0 +1,106 @@
+"""Friction by load: its formula, that its inverse is exact, and what each record makes of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.mechanics import jacobians
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.mechanics.loaded import Load, carried, carrying
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
+from dln_jax.mechanics.plain import InverseForward, PhaseRates
+from dln_jax.scenes import two_link_arm
+
+ARM = two_link_arm()
+SHARE, V = np.array([0.3, 0.1]), 0.02
+J = np.array([[1.0, 0.0], [-1.0, 1.0]])
+D = joint_dissipation([0.2, 0.1], [0.5, 0.3], 0.05, stribeck=0.2, velocity_scale=V)
+STATE = np.array([0.3, -0.8]), np.array([0.015, -0.4]), np.array([2.0, -1.0])
+
+
+def factor(q):
+    return jnp.linalg.cholesky(ARM.mass_matrix(q))
+
+
+def inverse_factor(q):
+    return jnp.linalg.cholesky(jnp.linalg.inv(ARM.mass_matrix(q)))
+
+
+known = dynamics(ARM.closed_form)
+RECORDS = {
+    "natural": NaturalSystem(factor, ARM.potential),
+    "closed-form": ARM.closed_form,
+    "lagrangian": LagrangianSystem(ARM.lagrangian),
+    "hamiltonian": NaturalHamiltonian(inverse_factor, ARM.potential),
+    "plain": InverseForward(known.inverse_dynamics, known.forward_dynamics),
+}
+
+
+@pytest.mark.parametrize("joint_map", [None, J], ids=["joints", "absolute"])
+@pytest.mark.parametrize("name", RECORDS)
+def test_torque_is_the_formula_and_forward_undoes_it(name, joint_map):
+    dissipation = joint_dissipation([0.2, 0.1], [0.5, 0.3], 0.05, velocity_scale=V, joint_map=joint_map)
+    system = dynamics(with_friction(RECORDS[name], dissipation, Load(SHARE, V, joint_map)))
+    q, qd, qdd = STATE
+    map_ = np.eye(2) if joint_map is None else joint_map
+    rates = map_ @ qd
+    link = np.linalg.solve(map_.T, known.inverse_dynamics(q, qd, qdd))
+    at_joints = (
+        link + SHARE * abs(link) * np.tanh(rates / V) + [0.2, 0.1] * rates + [0.5, 0.3] * np.tanh(rates / V) + 0.05
+    )
+    tau = system.inverse_dynamics(q, qd, qdd)
+    np.testing.assert_allclose(tau, map_.T @ at_joints, rtol=1e-11)
+    np.testing.assert_allclose(system.forward_dynamics(q, qd, tau), qdd, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["natural", "closed-form", "hamiltonian"])
+def test_jacobians_are_differences(name):
+    system = with_friction(RECORDS[name], D, Load(SHARE, V))
+    q, qd, qdd = map(jnp.asarray, STATE)
+    motion = dynamics(system)
+    tau, h = motion.inverse_dynamics(q, qd, qdd), 1e-6
+    found, by = jacobians.forward_dynamics_jacobians(system, q, qd, tau)
+    np.testing.assert_allclose(found, qdd, rtol=1e-9)
+    at = [q, qd, tau]
+    for place in range(3):
+        columns = []
+        for unit in np.eye(2):
+            ends = [
+                motion.forward_dynamics(*(x + side * h * unit * (k == place) for k, x in enumerate(at)))
+                for side in (1, -1)
+            ]
+            columns.append((ends[0] - ends[1]) / (2 * h))
+        np.testing.assert_allclose(by[place], np.stack(columns, axis=1), rtol=1e-5, atol=1e-5)
+
+
+def test_nothing_carried_is_where_its_slope_is_that_of_no_load():
+    load, qd = Load(SHARE, V), jnp.array([1.0, -1.0])
+    for function in (carrying, carried):
+        assert function(load, qd, jnp.zeros(2)).tolist() == [0, 0]
+        np.testing.assert_array_equal(jax.jacfwd(lambda tau, f=function: f(load, qd, tau))(jnp.zeros(2)), np.eye(2))
+    tau = jnp.array([-3.0, 2.0])
+    np.testing.assert_allclose(carried(load, qd, carrying(load, qd, tau)), tau, rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["natural", "lagrangian", "hamiltonian", "rates"])
+@pytest.mark.parametrize("load", [None, Load(SHARE, V)], ids=["free", "loaded"])
+def test_free_motion_loses_what_friction_takes(name, load):
+    q, qd, _ = map(jnp.asarray, STATE)
+    p = ARM.mass_matrix(q) @ qd
+    free = RECORDS["natural"]
+    system = PhaseRates(flow(free).rates) if name == "rates" else RECORDS[name]
+    velocity, change = flow(with_friction(system, D, load)).rates(q, p)
+    np.testing.assert_allclose(velocity, qd, rtol=1e-10)
+    lost = known.forward_dynamics(q, qd, jnp.zeros(2)) - dynamics(with_friction(free, D, load)).forward_dynamics(
+        q, qd, jnp.zeros(2)
+    )
+    np.testing.assert_allclose(flow(free).rates(q, p)[1] - change, ARM.mass_matrix(q) @ lost, rtol=1e-9)
+
+
+def test_without_friction_a_system_is_as_it_was():
+    assert with_friction(RECORDS["natural"], None) is RECORDS["natural"]

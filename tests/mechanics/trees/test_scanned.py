@@ -1,0 +1,27 @@
+"""The scan over links gives the forces of the recursions, for chains and trees, turning and sliding joints."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.mechanics.trees import make_tree, newton_euler
+from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
+
+KINDS = ("revolute", "prismatic", "revolute", "revolute")
+
+
+@pytest.mark.parametrize("parents", [(-1, 0, 1, 2), (-1, 0, 0, -1)])
+def test_forces_are_those_of_the_recursions(parents):
+    random = np.random.default_rng(0)
+    rotations, _ = np.linalg.qr(random.normal(size=(4, 3, 3)))
+    rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
+    positions, inertias, gravity = random.normal(size=(4, 3)), random.normal(size=(4, 10)), random.normal(size=3)
+    tree = make_tree(parents, KINDS, rotations, positions, np.tile([0, 0, 1], (4, 1)), inertias, gravity=gravity)
+    states = random.normal(size=(3, 5, 4))
+    known = parents, tree.joints, gravity, jnp.asarray(rotations), jnp.asarray(positions)
+    expected = jax.vmap(lambda *state: newton_euler(tree, *state))(*states)
+    found = jax.vmap(lambda *state: scanned_forces(*known, jnp.asarray(inertias), *state))(*states)
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+    Phi = jax.vmap(lambda *state: scanned_regressor(*known, *state))(*states)
+    np.testing.assert_allclose(np.einsum("njip,ip->nj", Phi, inertias), expected, atol=1e-11)

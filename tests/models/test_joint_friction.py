@@ -1,0 +1,157 @@
+"""Friction in the joints of any model: its force, its parametrisation, and what a linear model keeps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data.schema import from_arrays
+from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics.equations import dynamics, flow
+from dln_jax.mechanics.friction import LAWS, FrictionShape, joint_dissipation
+from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.loaded import Load
+from dln_jax.models.joint_friction import friction_of, with_joint_friction
+from dln_jax.scenes import double_pendulum
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build, describe
+
+ABSOLUTE = ((1.0, 0.0), (-1.0, 1.0))
+NEEDS = Needs(joints=("revolute", "revolute"), joint_map=ABSOLUTE, velocity_scale=0.05)
+EVERY = tuple(law for law in LAWS if law != "asymmetric")
+SMALL = {"width": 4, "depth": 1}
+KINDS = {
+    "structured-delan": SMALL,
+    "black-box-delan": {**SMALL, "activation": "softplus"},
+    "feed-forward": SMALL,
+    "structured-hnn": SMALL,
+    "black-box-hnn": SMALL,
+    "separable-hnn": SMALL,
+    "trigonometric": {},
+}
+STATE = np.array([0.3, -0.8]), np.array([0.02, -0.4]), np.array([2.0, -1.0])
+
+
+def model_of(kind, needs):
+    return build(describe(kind, needs=needs, precision="f64", **KINDS[kind]))
+
+
+def drawn(model, seed=3):
+    like = jax.eval_shape(model.init, jax.random.key(0))
+    draw = np.random.default_rng(seed).normal
+    return jax.tree.map(lambda leaf: jnp.asarray(0.4 * draw(size=leaf.shape) + 0.05, leaf.dtype), like)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_has_the_friction_that_its_needs_name(kind):
+    laws = tuple(law for law in EVERY if law != "load") if kind == "trigonometric" else EVERY
+    model, bare = model_of(kind, NEEDS._replace(joint_friction=laws)), model_of(kind, NEEDS)
+    parameters = drawn(model)
+    found, without = model.energies(parameters), bare.energies(parameters["model"])
+    q, qd, qdd = STATE
+    one_network = kind in ("black-box-hnn", "separable-hnn")  # whose velocities may have no momentum
+    if one_network:
+        qd, free = flow(without).rates(q, qdd)
+    J = np.array(ABSOLUTE)
+    coefficients, shape = friction_of(
+        parameters["friction"], FrictionShape(velocity_scale=0.05), linear=kind == "trigonometric"
+    )
+    force = jax.grad(joint_dissipation(**coefficients._asdict(), **shape._asdict()), argnums=1)(jnp.zeros(2), J @ qd)
+    share = 1 / (1 + np.exp(-parameters["friction"].shape.get("load", -np.inf))) * np.tanh(J @ qd / 0.05)
+    if one_network:
+        np.testing.assert_allclose(flow(found).rates(q, qdd)[0], qd)
+        link = -force / (1 - np.sign(force) * share)
+        np.testing.assert_allclose(flow(found).rates(q, qdd)[1], free + J.T @ link, rtol=1e-9)
+        return
+    link = np.linalg.solve(J.T, dynamics(without).inverse_dynamics(q, qd, qdd))
+    tau = dynamics(found).inverse_dynamics(q, qd, qdd)
+    np.testing.assert_allclose(tau, J.T @ (link + abs(link) * share + force), rtol=1e-9)
+    if kind != "feed-forward":
+        np.testing.assert_allclose(dynamics(found).forward_dynamics(q, qd, tau), qdd, rtol=1e-7, atol=1e-7)
+
+
+def test_a_phase_network_loses_momentum_by_friction():
+    needs = Needs(joints=("revolute",), joint_friction=("viscous", "coulomb"))
+    description = describe("phase-network", needs=needs, precision="f64", **SMALL)
+    model, bare = (
+        build(description),
+        build(describe("phase-network", needs=needs._replace(joint_friction=()), precision="f64", **SMALL)),
+    )
+    parameters = drawn(model)
+    velocity, change = flow(model.energies(parameters)).rates([0.3], [0.1])
+    alike, free = flow(bare.energies(parameters["model"])).rates([0.3], [0.1])
+    b, c = (jax.nn.softplus(parameters["friction"].coefficients[name]) for name in ("viscous", "coulomb"))
+    np.testing.assert_allclose(velocity, alike)
+    np.testing.assert_allclose(free - change, b * velocity + c * np.tanh(velocity / 0.01), rtol=1e-12)
+
+
+@pytest.mark.parametrize("laws", [("viscous", "coulomb", "stribeck", "sigmoid"), ("asymmetric", "load")], ids="-".join)
+def test_what_is_trained_takes_power_whatever_the_parameters(laws):
+    model, free = model_of("structured-delan", NEEDS._replace(joint_friction=laws)), model_of("structured-delan", NEEDS)
+
+    def power(parameters, qd):
+        tau, link = (
+            dynamics(each.energies(x)).inverse_dynamics(STATE[0], qd, STATE[2])
+            for each, x in ((model, parameters), (free, parameters["model"]))
+        )
+        return qd @ (tau - link)
+
+    rates = np.random.default_rng(0).normal(size=(20, 2))
+    for seed in range(5):
+        parameters = jax.tree.map(lambda leaf: 10 * leaf, drawn(model, seed))
+        assert (np.asarray(jax.jit(jax.vmap(power, (None, 0)))(parameters, rates)) >= -1e-9).all()
+
+
+def test_a_linear_model_stays_one_and_finds_the_friction_of_joints():
+    """The double pendulum in absolute angles: friction of the joint between the links acts on both."""
+    scene = double_pendulum()
+    needs = scene.needs._replace(joint_friction=("viscous", "coulomb", "offset"), joint_map=ABSOLUTE)
+    true = {"viscous": [0.1, 0.2], "coulomb": [0.3, 0.15], "offset": [0.05, -0.02]}
+    plant = with_friction(scene.closed_form, joint_dissipation(**true, joint_map=np.array(ABSOLUTE)))
+    state = np.random.default_rng(0).normal(size=(3, 200, 2))
+    tau = jax.jit(jax.vmap(dynamics(plant).inverse_dynamics))(*state)
+    names = dict(zip(("q", "qd", "qdd"), state, strict=True))
+    data = from_arrays({**names, "t": np.zeros(200), "tau": np.asarray(tau), "trajectory": np.arange(200)})
+    fit = fit_linear(build(describe("trigonometric", needs=needs, precision="f64")), data)
+    assert fit.torque_mse < 1e-20
+    for name, value in true.items():
+        np.testing.assert_allclose(fit.parameters["friction"].coefficients[name], value, atol=1e-9)
+    assert fit.parameters["friction"].shape == {}
+
+
+def test_learned_shapes_start_where_they_are_stated_and_the_scale_is_held():
+    needs = NEEDS._replace(joint_friction=("stribeck", "sigmoid"))
+    model = model_of("structured-delan", NEEDS)
+    start = FrictionShape(0.03, 0.2, 15.0, -0.01)
+    friction = with_joint_friction(model, needs, shape=start).init(jax.random.key(0))["friction"]
+    assert set(friction.shape) == {"stribeck_velocity", "sigmoid_slope", "sigmoid_shift"}
+    found = friction_of(friction, start)[1]
+    np.testing.assert_allclose(np.stack(found[1:]), np.tile([[0.2], [15.0], [-0.01]], 2), rtol=1e-6)
+    assert found.velocity_scale == 0.03
+    assert with_joint_friction(model, NEEDS) is model
+
+
+@pytest.mark.parametrize(
+    "kind, laws, message",
+    [
+        ("trigonometric", ("load",), "the model is not linear in its parameters; leave load out"),
+        ("structured-delan", ("viscous", "rust"), "joint_friction has 'rust'; expected some of viscous"),
+        ("polynomial-hamiltonian", ("viscous",), "conserves energy"),
+        ("pairwise-hnn", ("viscous",), "without friction"),
+    ],
+)
+def test_what_a_model_cannot_have_is_refused(kind, laws, message):
+    joints = ("prismatic",) * 4 if kind == "pairwise-hnn" else ("revolute",) * 2
+    needs = Needs(joints=joints)._replace(joint_friction=laws)
+    with pytest.raises(InputError, match=message) as caught:
+        build(describe(kind, needs=Needs(joints=joints), precision="f64") | {"needs": needs._asdict()})
+    assert "\n" not in str(caught.value)
+
+
+def test_load_of_a_plant_is_undone_in_its_map():
+    """What a wrapped model is fitted to: the same record as of known energies."""
+    scene = double_pendulum()
+    system = with_friction(scene.closed_form, None, Load(0.2, 0.05, np.array(ABSOLUTE)))
+    q, qd, qdd = STATE
+    motion = dynamics(system)
+    np.testing.assert_allclose(motion.forward_dynamics(q, qd, motion.inverse_dynamics(q, qd, qdd)), qdd, rtol=1e-10)

@@ -1,0 +1,77 @@
+"""A planar chain against the textbook's double pendulum and a tree of rigid bodies, in both kinds of coordinates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.closed_form import lagrangian as scalar
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.types import InputError, Needs
+
+NEEDS = Needs(joints=("revolute", "revolute"), friction=True)
+TO_RELATIVE = np.array([[1.0, 0.0], [-1.0, 1.0]])
+STATE = tuple(map(np.array, ([0.4, -1.3], [1.1, 2.0], [0.3, -0.7])))
+
+
+def random_parameters(model):
+    """Of a mass matrix that is definite."""
+    like = model.init(jax.random.key(0))
+    random = np.random.default_rng(0)
+    drawn = jax.tree.map(lambda leaf: jnp.asarray(0.1 + 0.2 * random.uniform(size=leaf.shape)), like)
+    return drawn._replace(moments=jnp.array([2.0, 0.4, 1.0]))
+
+
+def test_textbook_double_pendulum():
+    model = make_planar_chain(NEEDS._replace(friction=False), coordinates="absolute")
+    masses, lengths, g = (1.3, 0.7), (0.9, 1.2), 9.81
+    inner, outer = lengths
+    parameters = model.init(jax.random.key(0))._replace(
+        moments=jnp.array([sum(masses) * inner**2, masses[1] * inner * outer, masses[1] * outer**2]),
+        weight=jnp.array([sum(masses) * g * inner, masses[1] * g * outer]),
+    )
+    ours, book = (
+        dynamics(each)
+        for each in (model.energies(parameters), double_pendulum(masses=masses, lengths=lengths).energies)
+    )
+    np.testing.assert_allclose(ours.inverse_dynamics(*STATE), book.inverse_dynamics(*STATE), rtol=1e-13)
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_coordinates_do_not_matter(symmetric):
+    """Forces of angles from the vertical are those of joints, turned by the transpose of the map between rates."""
+    absolute, relative = (
+        make_planar_chain(NEEDS, coordinates=each, symmetric=symmetric, armature=True)
+        for each in ("absolute", "relative")
+    )
+    parameters = random_parameters(absolute)
+    own = dynamics(absolute.energies(parameters)).inverse_dynamics(*STATE)
+    turned = dynamics(relative.energies(parameters)).inverse_dynamics(*(TO_RELATIVE @ each for each in STATE))
+    np.testing.assert_allclose(own, TO_RELATIVE.T @ turned, rtol=1e-12)
+
+
+def test_forces_are_derivatives_of_the_energy():
+    model = make_planar_chain(NEEDS._replace(friction=False), symmetric=False, armature=True)
+    system = model.energies(random_parameters(model))
+    by_energy = lagrangian.inverse_dynamics(scalar(system), *(jnp.asarray(each) for each in STATE))
+    np.testing.assert_allclose(dynamics(system).inverse_dynamics(*STATE), by_energy, rtol=1e-12)
+
+
+def test_friction_acts_in_the_joints():
+    """Links that turn alike do not rub at the second joint."""
+    model = make_planar_chain(NEEDS, coordinates="absolute")
+    parameters = random_parameters(model)
+    friction = dynamics(model.energies(parameters)).friction
+    alike = np.asarray(friction(np.zeros(2), np.ones(2)))
+    assert alike[1] == 0 < alike[0]
+    np.testing.assert_allclose(friction(np.zeros(2), np.array([0.0, 1.0])) @ np.ones(2), 0, atol=1e-15)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(InputError, match="revolute joints only"):
+        make_planar_chain(Needs(joints=("prismatic",)))
+    with pytest.raises(InputError, match="coordinates are 'polar'"):
+        make_planar_chain(NEEDS, coordinates="polar")

@@ -1,0 +1,43 @@
+"""A planar arm, whose base parameters are known in closed form, and data of it."""
+
+import jax
+import numpy as np
+
+from dln_jax.data.schema import from_arrays
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.trees import inertial_parameters, serial, tree_system
+
+LENGTH = 0.5
+LINKS = [
+    inertial_parameters(2.0, [0.2, 0.05, 0.1], np.diag([0.02, 0.04, 0.05])),
+    inertial_parameters(1.0, [0.3, -0.02, 0.03], np.diag([0.01, 0.02, 0.015])),
+]
+ARM = serial(
+    np.stack([np.eye(3)] * 2),
+    [[0, 0, 0], [LENGTH, 0, 0]],
+    LINKS,
+    armature=[0.1, 0.2],
+    gravity=(0, -9.81, 0),
+    names=("shoulder", "elbow"),
+)
+FRICTION = {"viscous": np.array([0.2, 0.1]), "coulomb": np.array([0.5, 0.3]), "offset": np.array([0.1, -0.2])}
+
+
+def motions(seed, *, noise=0.0, trajectories=1, samples=120, friction=True, still=(), tree=ARM):
+    """Sums of sines, exact rates, and torques with noise."""
+    random, parts = np.random.default_rng(seed), []
+    t = np.linspace(0, 6, samples)
+    for index in range(trajectories):
+        a, w, p = random.uniform([0.1, 0.5, 0], [0.8, 3, 6], (2, 4, 3)).transpose(2, 0, 1)[:, :, :, None]
+        a = a * ~np.isin(np.arange(2), still)[:, None, None]
+        angle = w * t + p
+        state = [
+            np.sum(each, axis=1).T for each in (a * np.sin(angle), a * w * np.cos(angle), -a * w**2 * np.sin(angle))
+        ]
+        parts.append([t, *state, np.full(samples, index)])
+    t, q, qd, qdd, trajectory = (np.concatenate(each) for each in zip(*parts, strict=True))
+    system = tree_system(tree, joint_dissipation(*FRICTION.values()) if friction else None)
+    tau = np.asarray(jax.jit(jax.vmap(dynamics(system).inverse_dynamics))(q, qd, qdd))
+    tau = tau + noise * random.normal(size=tau.shape)
+    return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": trajectory})
