@@ -38,7 +38,8 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
         facts: JSON values to store in the manifest beside versions, shapes and digest.
         number: distinguishes successive states of one run.
     """
-    tensors = {key: np.asarray(leaf) for key, leaf in _flatten(tree).items()}
+    # safetensors writes memory as it lies: by rows, or the numbers come back in another order.
+    tensors = {key: np.asarray(leaf, order="C") for key, leaf in _flatten(tree).items()}
     data = safetensors.numpy.save(tensors)
     file_name = f"{name}.safetensors" if number is None else f"{name}-{number:09d}.safetensors"
     manifest = {

@@ -22,6 +22,15 @@ TREE = State(
 )
 
 
+def test_arrays_come_back_however_they_lie_in_memory(tmp_path):
+    numbers = np.arange(24.0).reshape(4, 6)
+    tree = {"transposed": numbers.T, "columns": numbers.T[:, [True, False, True, False]], "strided": numbers[::2, ::3]}
+    save_tree(tmp_path, "state", tree, {})
+    found = load_tree(tmp_path, "state", tree)
+    for name, expected in tree.items():
+        np.testing.assert_array_equal(found[name], expected)
+
+
 def test_a_tree_comes_back_bit_for_bit_and_old_states_are_removed(tmp_path):
     for number in (1, 2):
         save_tree(tmp_path, "checkpoint", TREE, {"note": number}, number=number)
