@@ -17,6 +17,7 @@ REDUCED = {
     "07_gait": {"GOAL": 0.3},
     "08_c_in_a_loop": {},
     "09_fine_tune": {"ITERATIONS": 5},
+    "10_encoder_log_to_c": {},
 }
 """Constants of the examples, and what they are here."""
 
