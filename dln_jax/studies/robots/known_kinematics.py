@@ -30,6 +30,7 @@ LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01
 """rad/s, of the rival's dry friction, which it does not fit."""
 DECIMATE = 3
+"""Every so manyth sample is fitted; torques are not filtered, which would smear dry friction."""
 CLEAN, SEEN = 1e-12, 1.65e-3
 """nMSE to reach: clean data, viscous friction; noisy ones with dry friction, which a regressor reached."""
 TRACKING = 1.1
@@ -94,7 +95,7 @@ def noisy(quick: bool) -> Findings:
     for seed in range(effort.seeds):
         random = np.random.default_rng(seed)
         train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
-        data = smooth(from_arrays(measured(train, random)), decimate=DECIMATE).data
+        data = every(smooth(from_arrays(measured(train, random))).data, DECIMATE)
         ours, scales = identified(robot.tree, data)
         methods: dict[str, Torque] = {"ours": ours}
         for name, scale in (("pinocchio", USUAL_SCALE), ("pinocchio-with-our-scales", scales)):
