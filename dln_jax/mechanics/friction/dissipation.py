@@ -33,7 +33,7 @@ def joint_dissipation(
     (the offset's part apart, which is no loss). The force is that of the formulas in `friction.laws`, and is exact.
 
     Args:
-        viscous, coulomb, offset, stribeck: coefficients as in `FrictionCoefficients`; for each joint [d] or one for all.
+        viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; for each joint [d] or one for all.
         viscous_forward, viscous_backward, coulomb_forward, coulomb_backward, sigmoid: likewise.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`.
         joint_map: J [d, d], known, of joint rates J qd where coordinates are others; D(J qd), with the force Jᵀ dD/du.
