@@ -65,7 +65,7 @@ def run(given: Options, command: str) -> None:
         if added is not None and added.settings:
             predicted[ADDED] = judge_residual(case, added, metrics)
         if given.uncertainty:
-            metrics |= store_uncertainty(folder, case, found, added)
+            metrics |= store_uncertainty(folder, case, found, added, figures=given.figures)
         write_json(folder / "metrics.json", {**metrics, "identify_seconds": seconds})
         write_json(folder / "parameters.json", {"base": base_rows(found), "parameters": parameter_rows(found)})
         write_bytes(folder / "report.txt", text(found).encode())

@@ -100,7 +100,7 @@ def _named(candidate: Candidate) -> str:
 
 
 def store_uncertainty(
-    folder: Path, case: Case, found: Identification, added: ResidualFit | None
+    folder: Path, case: Case, found: Identification, added: ResidualFit | None, *, figures: bool
 ) -> dict[str, float | int]:
     """Stores it with the run, draws it, and says how often held-out torques are within the bands of 95 %.
 
@@ -133,9 +133,9 @@ def store_uncertainty(
         for each in (inverse, run.torque_std, run.outside)
     )
     shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
-    write_figure(
-        folder / "uncertainty.png", torque_bands(test, predicted, std, outside, model=case.description["name"])
-    )
+    if figures:
+        name = case.description["name"]
+        write_figure(folder / "uncertainty.png", torque_bands(test, predicted, std, outside, model=name))
     return {
         "coverage_95_share": float(shares.mean()),
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
