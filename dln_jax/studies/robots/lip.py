@@ -62,9 +62,9 @@ def learned(arm: Arm, *, friction: bool, every: int = 10, seed: int = 0, tests: 
         tests: seeds of the test motions.
     """
     train = lip_trajectories(arm, friction=friction, every=every)
-    assert train.needs is not None
-    fit = fit_tree(train.needs, train, velocity_scale=VELOCITY_SCALE, settings=Search(seed=seed))
-    model = make_serial_tree(train.needs, velocity_scale=VELOCITY_SCALE)
+    needs = arm.tree.needs._replace(friction=friction)
+    fit = fit_tree(needs, train, velocity_scale=VELOCITY_SCALE, settings=Search(seed=seed))
+    model = make_serial_tree(needs, velocity_scale=VELOCITY_SCALE)
     nmse = unseen_errors(arm, model.energies(fit.parameters), friction=friction, tests=tests)
     return Outcome(nmse, fit.joint_mse, fit.agreeing, len(fit.losses), fit.seconds)
 
