@@ -3,10 +3,14 @@
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from matplotlib.figure import Figure
+
+from dln_jax.figures.robots import errors_by_arm, errors_by_joint
 from dln_jax.precision import in_float64
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.robots import double_pendulum, known_kinematics, learned_kinematics, speed
+from dln_jax.studies.robots import before_fitting, double_pendulum, known_kinematics, learned_kinematics, speed
 from dln_jax.studies.robots.recorded_arm import recorded_arm
 
 MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
@@ -16,9 +20,16 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "fewer-joints": learned_kinematics.fewer_joints,
         "fewer-samples": learned_kinematics.fewer_samples,
     },
+    "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
     "speed": {"seven-axis": speed.speed},
 }
 """quick -> findings, by subject and by name; only `speed` depends on the machine."""
+DRAWN: dict[str, Callable[[dict[str, Any]], Figure]] = {
+    "arm/noisy": errors_by_joint,
+    "recordings/arm": errors_by_joint,
+    **dict.fromkeys((f"learned/{name}" for name in MEASURES["learned"]), errors_by_arm),
+}
+"""Figures of their curves."""
 
 
 def cases(
@@ -39,4 +50,7 @@ def cases(
         measures["recordings/double-pendulum"] = lambda quick: Findings(
             double_pendulum.rows(pendulum, splits[:1] if quick else splits)
         )
-    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]
+    return [
+        Case(name, in_float64(functools.partial(measure, quick)), draw=DRAWN.get(name))
+        for name, measure in measures.items()
+    ]

@@ -28,7 +28,7 @@ from dln_jax.studies.robots.rivals import regression
 
 LAWS = ("viscous", "coulomb", "offset")
 USUAL_SCALE = 0.01
-"""rad/s, of the rival's dry friction, which it does not fit."""
+"""rad/s, of dry friction whose shape is not fitted: the rival's, and that of our robust fit."""
 DECIMATE = 3
 """Every so manyth sample is fitted; torques are not filtered, which would smear dry friction."""
 CLEAN, SEEN = 1e-12, 1.65e-3
@@ -63,14 +63,21 @@ def torque_of(model: Any, parameters: Any) -> Torque:
     return lambda q, qd, qdd: np.asarray(batch(q, qd, qdd))
 
 
-def identified(tree: Tree, data: Trajectories) -> tuple[Torque, Any]:
-    """Ours: shapes of friction by variable projection, then bodies that exist, torques weighted by their noise."""
-    friction = fit_friction(rough(tree), data, LAWS)
-    model = make_rigid_tree(rough(tree), friction=LAWS, velocity_scale=tuple(friction.shape["velocity_scale"].tolist()))
+def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> Torque:
+    """Ours: bodies that exist, torques weighted by their noise, or Huber's estimate.
+
+    Args:
+        tree: whose frames are known.
+        data: to fit.
+        scale: of dry friction, rad/s, for each joint or one for all.
+        robust: count errors of torque beyond the noise, as where friction turns round, by their size.
+    """
+    shape = tuple(np.broadcast_to(scale, D).tolist())
+    model = make_rigid_tree(rough(tree), friction=LAWS, velocity_scale=shape)
     known = model.init(jax.random.key(0))
     known = known._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
-    found = identify(model, known, data, joints=tree.joints)
-    return torque_of(model, parameters_of(found.theta, known)), friction.shape["velocity_scale"]
+    found = identify(model, known, data, joints=tree.joints, robust=robust)
+    return torque_of(model, parameters_of(found.theta, known))
 
 
 def clean(quick: bool) -> Findings:
@@ -88,7 +95,7 @@ def clean(quick: bool) -> Findings:
 
 
 def noisy(quick: bool) -> Findings:
-    """Encoders and torques with noise, dry friction: ours, and Pinocchio's regressor."""
+    """Encoders and torques with noise, dry friction: ours, with fitted shapes or robust, and Pinocchio's regressor."""
     effort, robot = (QUICK if quick else FULL), arm(coulomb=True)
     by_method: dict[str, list[np.ndarray]] = {}
     tracked: dict[str, list[float]] = {}
@@ -96,8 +103,11 @@ def noisy(quick: bool) -> Findings:
         random = np.random.default_rng(seed)
         train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
         data = every(smooth(from_arrays(measured(train, random))).data, DECIMATE)
-        ours, scales = identified(robot.tree, data)
-        methods: dict[str, Torque] = {"ours": ours}
+        scales = fit_friction(rough(robot.tree), data, LAWS).shape["velocity_scale"]
+        methods = {
+            "ours": identified(robot.tree, data, scales),
+            "ours-robust": identified(robot.tree, data, USUAL_SCALE, robust=True),
+        }
         for name, scale in (("pinocchio", USUAL_SCALE), ("pinocchio-with-our-scales", scales)):
             rival = regression(robot.tree, data, velocity_scale=scale)
             if rival is not None:
@@ -140,7 +150,7 @@ def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[R
         for joint, value in enumerate(np.median(by_method["ours"], axis=0))
     ]
     for name in means:
-        if name != "ours":
+        if name.startswith("pinocchio"):
             words = f"median over seeds of ours over {name}, the same samples and filter"
             rows.append(
                 expect("arm/noisy-coulomb/ours", f"over_{name}", words, np.median(means["ours"] / means[name]), 1)
@@ -151,9 +161,11 @@ def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[R
 def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
     """Medians over motions and seeds, and ours over that with the true parameters."""
     rows = [Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(each)), "mrad") for name, each in tracked.items()]
-    ratio = np.median(np.divide(tracked["ours"], tracked["true-parameters"]))
-    words = "median over motions of ours over that with true parameters and the same law of dry friction"
-    return [*rows, expect("arm/tracking/ours", "over_true_parameters", words, ratio, TRACKING)]
+    words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
+    for name in ("ours", "ours-robust"):
+        ratio = np.median(np.divide(tracked[name], tracked["true-parameters"]))
+        rows.append(expect(f"arm/tracking/{name}", "over_true_parameters", words, float(ratio), TRACKING))
+    return rows
 
 
 def curves_of(by_method: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:

@@ -1,6 +1,7 @@
 """Arms whose kinematics is not known, on the LIP protocol, as cases of the report."""
 
-from dln_jax.studies.case import Findings
+from dln_jax.studies.case import Findings, by_case
+from dln_jax.studies.report import Row
 from dln_jax.studies.robots.lip import rows
 
 SEEDS = range(10)
@@ -13,15 +14,15 @@ SMALLER = ("panda-3", "panda-4", "panda-5", "panda-6", "skew-arm", "sliding-arm"
 def seven_joints(quick: bool) -> Findings:
     """The Panda from 500 samples, over seeds of the starts, with friction and without."""
     if quick:
-        return Findings(rows("panda-3", friction=False, seeds=(0,), tests=(101, 102)))
-    return Findings([row for friction in (False, True) for row in rows("panda-7", friction=friction, seeds=SEEDS)])
+        return found(rows("panda-3", friction=False, seeds=(0,), tests=(101, 102)))
+    return found([row for friction in (False, True) for row in rows("panda-7", friction=friction, seeds=SEEDS)])
 
 
 def fewer_joints(quick: bool) -> Findings:
     """Three to six joints, and two arms that are not all perpendicular, one of them with a prismatic joint."""
     if quick:
-        return Findings(rows("sliding-arm", friction=False, seeds=(0,), tests=(101, 102)))
-    return Findings(
+        return found(rows("sliding-arm", friction=False, seeds=(0,), tests=(101, 102)))
+    return found(
         [
             row
             for name in SMALLER
@@ -34,8 +35,8 @@ def fewer_joints(quick: bool) -> Findings:
 def fewer_samples(quick: bool) -> Findings:
     """The Panda from 150 and from 50 samples."""
     if quick:
-        return Findings(rows("panda-3", friction=False, every=SAMPLES[150], seeds=(0,), tests=(101, 102)))
-    return Findings(
+        return found(rows("panda-3", friction=False, every=SAMPLES[150], seeds=(0,), tests=(101, 102)))
+    return found(
         [
             row
             for samples in (150, 50)
@@ -43,3 +44,12 @@ def fewer_samples(quick: bool) -> Findings:
             for row in rows("panda-7", friction=friction, every=SAMPLES[samples], seeds=SEEDS[:3])
         ]
     )
+
+
+def found(listed: list[Row]) -> Findings:
+    """The rows, and of each case the median and the worst error, to draw."""
+    curves = {}
+    for case, numbers in by_case(listed).items():
+        median = numbers["nmse_mean_median"]
+        curves[case.removeprefix("lip/")] = [median, numbers.get("nmse_mean_worst", median)]
+    return Findings(listed, curves)

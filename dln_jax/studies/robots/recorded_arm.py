@@ -60,7 +60,9 @@ def recorded_arm(log: Path, robot: Path, quick: bool) -> Findings:
         held = select(data, pair)
         for name, predict in methods(tree, select(data, np.setdiff1d(np.unique(data.trajectory), pair))).items():
             squares.setdefault(name, []).append((predict(held) - held.tau) ** 2)
-    return Findings(rows_of(squares, data.tau.var(axis=0), tree.names))
+    variance = data.tau.var(axis=0)
+    curves = {name: (np.mean(np.concatenate(found), axis=0) / variance).tolist() for name, found in squares.items()}
+    return Findings(rows_of(squares, variance, tree.names), curves)
 
 
 def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:

@@ -52,13 +52,13 @@ def pinocchio_model(pin: Any, tree: Tree) -> Any:
     return model
 
 
-def regression(tree: Tree, data: Trajectories, *, velocity_scale: float) -> Regression | None:
+def regression(tree: Tree, data: Trajectories, *, velocity_scale: Any) -> Regression | None:
     """Pinocchio's regressor with armature, viscous, dry friction and an offset of each joint; `None` without Pinocchio.
 
     Args:
         tree: whose frames are known.
         data: to fit; hold out those that the result is judged by.
-        velocity_scale: of dry friction, as `mechanics.friction.joint_dissipation` has it.
+        velocity_scale: of dry friction, for each joint or one for all, as `mechanics.friction.joint_dissipation` has it.
     """
     pin = pinocchio()
     if pin is None:
