@@ -1,0 +1,54 @@
+"""Figures of the report of robots: errors of each joint by method, and of arms by what is known of them."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.figures import style
+
+SPREAD = 0.5
+"""Of a joint's place that its marks share."""
+
+
+def errors_by_joint(errors: Mapping[str, Sequence[float]], names: Sequence[str] = ()) -> Figure:
+    """nMSE of each joint, a mark for each method; lines only lead the eye.
+
+    Args:
+        errors: of each joint, by method.
+        names: of the joints; by default their numbers.
+    """
+    figure, [[axis]] = style.figure(height=3.2)
+    joints = np.arange(max(map(len, errors.values())))
+    shifts = SPREAD * (np.arange(len(errors)) / max(len(errors) - 1, 1) - 0.5)
+    for shift, (method, values), shade, mark in zip(shifts, errors.items(), style.CYCLE, style.MARKERS, strict=False):
+        axis.plot(joints + shift, values, mark, color=shade, markersize=5, label=method.replace("-", " "))
+    axis.set_yscale("log")
+    axis.set_xticks(joints, list(names) or [str(joint + 1) for joint in joints])
+    axis.set_xlabel("" if names else "joint")
+    axis.set_ylabel("nMSE, held-out motions")
+    style.legend(figure, loc="outside lower center", ncols=min(len(errors), 3))
+    return figure
+
+
+def errors_by_arm(errors: Mapping[str, Sequence[float]]) -> Figure:
+    """Median and worst nMSE, the mean over joints, of each arm by what was known of it.
+
+    Args:
+        errors: by "ARM/FRICTION/SAMPLES/METHOD", the median and the worst over seeds.
+    """
+    places = list(dict.fromkeys(name.rsplit("/", 1)[0] for name in errors))
+    methods = list(dict.fromkeys(name.rsplit("/", 1)[1] for name in errors))
+    figure, [[axis]] = style.figure(height=0.9 + 0.28 * len(places))
+    for method, shade, mark in zip(methods, style.CYCLE, style.MARKERS, strict=False):
+        shown = [place for place in places if f"{place}/{method}" in errors]
+        heights = [places.index(place) for place in shown]
+        medians, worst = np.array([errors[f"{place}/{method}"] for place in shown]).T
+        axis.hlines(heights, medians, worst, color=shade, linewidth=1.2)
+        axis.plot(medians, heights, mark, color=shade, markersize=5, label=method.replace("-", " "))
+    axis.set_xscale("log")
+    axis.set_ylim(len(places) - 0.5, -0.5)
+    axis.set_yticks(range(len(places)), [place.replace("/", ", ") for place in places])
+    axis.set_xlabel("nMSE on unseen motions, median (mark) to worst (line) over seeds")
+    style.legend(figure, loc="outside lower center", ncols=len(methods))
+    return figure
