@@ -86,7 +86,7 @@ def encoder_rows(
                 errors[way].append(error(found.parameters))
                 if say is not None:
                     say(f"{way}, part {seed}: {errors[way][-1]:.3e}")
-    expected = "mean over joints of the squared error of torques over their variance, on motions that were not fitted"
+    expected = "mean over joints, on motions that were not fitted"
     return [
         Row(f"encoders/{way}", f"nmse_{name}", float(statistic(values)), expected=expected)
         for way, values in errors.items()

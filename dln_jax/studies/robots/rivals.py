@@ -58,7 +58,7 @@ def regression(tree: Tree, data: Trajectories, *, velocity_scale: Any) -> Regres
     Args:
         tree: whose frames are known.
         data: to fit; hold out those that the result is judged by.
-        velocity_scale: of dry friction, for each joint or one for all, as `mechanics.friction.joint_dissipation` has it.
+        velocity_scale: of dry friction, as `joint_dissipation` has it, for each joint or one for all.
     """
     pin = pinocchio()
     if pin is None:
