@@ -16,7 +16,7 @@ from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.momentum_form import fit_momentum
+from dln_jax.learning.weak_forms import fit_energy, fit_momentum
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -30,9 +30,10 @@ WAYS = (
     "acceleration-twice-the-cutoff",
     "momentum",
     "momentum-twice-the-cutoff",
+    "energy",
 )
 """Rates by differences; q filtered at the cut-off that its spectra ask for, tau as it is; tau filtered like q; and the
-weak form, which reads no accelerations."""
+weak forms, which read no accelerations."""
 
 
 def encoder_rows(
@@ -103,6 +104,8 @@ def _fit(way: str, model: Any, log: Trajectories) -> Any:
         found = smooth(log, 2 * found.cutoff)
     if way.startswith("momentum"):
         return fit_momentum(model, found.data, **TOLERANCES)
+    if way == "energy":
+        return fit_energy(model, found.data, **TOLERANCES)
     return fit_linear(model, found.data, **TOLERANCES)
 
 

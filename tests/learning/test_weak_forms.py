@@ -1,5 +1,7 @@
 """The weak form of the equations of motion: exact without accelerations, and steadier than them under noise."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from dln_jax.data import schema
 from dln_jax.data.encoders import smooth
 from dln_jax.learning.linear import fit_linear
-from dln_jax.learning.momentum_form import fit_momentum, momentum_and_rest, window_weights
+from dln_jax.learning.weak_forms import energy_and_loss, fit_energy, fit_momentum, momentum_and_rest, window_weights
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -52,7 +54,7 @@ def log(seed, *, noise_q=0.0, noise_tau=0.0):
 
 
 MODEL = make_rigid_tree(arm(), friction=True, velocity_scale=SCALE)
-TOLERANCES = {"negligible": 1e-9, "rank_tolerance": 1e-8}
+TOLERANCES: dict[str, Any] = {"negligible": 1e-9, "rank_tolerance": 1e-8}
 
 
 @jax.jit
@@ -76,6 +78,14 @@ def test_momentum_and_rest_are_the_torque():
     assert np.asarray(change + rest) == pytest.approx(np.asarray(plant.inverse_dynamics(q, qd, qdd)), rel=1e-12)
 
 
+def test_power_changes_the_energy_or_is_lost():
+    plant = dynamics(MODEL.energies(MODEL.init(jax.random.key(0))._replace(viscous=jnp.ones(2), coulomb=jnp.ones(2))))
+    q, qd, qdd = jnp.array([0.3, -0.7]), jnp.array([1.2, 0.4]), jnp.array([-2.0, 3.0])
+    _, change = jax.jvp(lambda *state: energy_and_loss(plant, *state)[0], (q, qd), (qd, qdd))
+    power = qd @ plant.inverse_dynamics(q, qd, qdd)
+    assert float((change + energy_and_loss(plant, q, qd)[1])[0]) == pytest.approx(float(power), rel=1e-12)
+
+
 def test_windows_end_at_zero_and_integrate_by_parts():
     t = np.arange(21) / RATE
     w, slope = window_weights(20, 1 / RATE)
@@ -84,10 +94,11 @@ def test_windows_end_at_zero_and_integrate_by_parts():
     assert -slope @ p == pytest.approx(w @ (9 * np.cos(9 * t + 0.4)), rel=1e-4)
 
 
-def test_a_clean_motion_is_identified_without_accelerations():
+@pytest.mark.parametrize("fit_form", [fit_momentum, fit_energy])
+def test_a_clean_motion_is_identified_without_accelerations(fit_form):
     arrays, rates = log(seed=0)
     data = schema.from_arrays({**arrays, "qd": rates["qd"], "qdd": np.full_like(rates["qdd"], 1e3)})
-    fit = fit_momentum(MODEL, data, **TOLERANCES)
+    fit = fit_form(MODEL, data, **TOLERANCES)
     assert error(fit.parameters) < 1e-7
     assert np.asarray(fit.parameters.coulomb) == pytest.approx(DRY, rel=1e-3)
     assert fit.equations > 3 * fit.parameter_count > 3 * fit.rank

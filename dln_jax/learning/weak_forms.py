@@ -5,16 +5,17 @@ is left of the Coriolis forces. Multiplied by a window w(t) that is zero at both
 
     - integral w' p dt + integral w s dt = integral w tau dt
 
-(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987 and of Gautier and Khalil
-1988.) Both sides are linear in the parameters, one equation for each joint and window. No acceleration appears, whose
-noise grows with the square of the frequency, and both sides go through the same low-pass, so that dry friction is not
-distorted: the result hardly depends on the cut-off of q.
+(modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Both sides are linear in
+the parameters, one equation for each joint and window. No acceleration appears, whose noise grows with the square of
+the frequency, and both sides go through the same low-pass, so that dry friction is not distorted: the result hardly
+depends on the cut-off of q. The energy E = T + V obeys the same with the power of motors and of friction (Gautier and
+Khalil 1988), qdᵀ tau = dE/dt + qdᵀ dD/dqd: one equation for all joints, less to compute and less to learn from.
 
 The windows are sin⁴ (pi t / W), with weights that make plain sums over samples exact to the smoothness of the motion.
 """
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +45,7 @@ CHUNK = 4096
 """Samples whose columns are in memory at a time."""
 
 
-class MomentumFit(NamedTuple):
+class WeakFit(NamedTuple):
     """Identified parameters, and how well the data determine them; otherwise as `learning.linear.LinearFit`."""
 
     parameters: Any
@@ -53,9 +54,20 @@ class MomentumFit(NamedTuple):
     rank: int
     condition: float
     equations: int
-    """Windows times joints."""
-    torque_mse: float
-    """Mean over windows of the sum over joints of the squared error of the windows' mean torque; (N m)² or N²."""
+    """Windows, times joints for the momentum."""
+    mse: float
+    """Mean over windows of the squared error of their mean torque, summed over joints, or power; (N m)² or W²."""
+
+
+class _Form(NamedTuple):
+    """Of which equations there are windows: `right` = d/dt of the first of `left` + the second."""
+
+    left: Callable[[Dynamics, Vector, Vector], tuple[Array, Array]]
+    """(plant, q, qd) -> [k] each."""
+    right: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """(qd, tau) [N, d] -> [N, k]."""
+    noise: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """(qd [N, d], deviations of tau [d]) -> those of the right side [N, k]."""
 
 
 def fit_momentum(
@@ -67,8 +79,8 @@ def fit_momentum(
     ridge: float = 0.0,
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
-) -> MomentumFit:
-    """The parameters of least squared error of the windows' equations, in float64; qdd is not read.
+) -> WeakFit:
+    """The parameters of least squared error of the windows' momenta, in float64; qdd is not read.
 
     Args:
         model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
@@ -83,6 +95,39 @@ def fit_momentum(
         InputError: steps that are not equal, no stretch as long as a window, torques that do not vary, or settings
             out of range.
     """
+    form = _Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
+    tolerances = {"ridge": ridge, "rank_tolerance": rank_tolerance, "negligible": negligible}
+    return _fit(model, data, form, window, noise, tolerances)
+
+
+def fit_energy(
+    model: Model,
+    data: Trajectories,
+    *,
+    window: float = WINDOW,
+    noise: Float[np.ndarray, " d"] | None = None,
+    ridge: float = 0.0,
+    rank_tolerance: float | None = None,
+    negligible: float = 0.0,
+) -> WeakFit:
+    """The same of the windows' energies; arguments and errors as for `fit_momentum`."""
+    form = _Form(
+        energy_and_loss,
+        lambda qd, tau: np.sum(qd * tau, axis=1, keepdims=True),
+        lambda qd, noise: np.linalg.norm(qd * noise, axis=1, keepdims=True),
+    )
+    tolerances = {"ridge": ridge, "rank_tolerance": rank_tolerance, "negligible": negligible}
+    return _fit(model, data, form, window, noise, tolerances)
+
+
+def _fit(
+    model: Model,
+    data: Trajectories,
+    form: _Form,
+    window: float,
+    noise: Float[np.ndarray, " d"] | None,
+    tolerances: dict[str, Any],
+) -> WeakFit:
     require_positive(window=window)
     with jax.enable_x64(True):
         zero, unravel = ravel_pytree(model.init(jax.random.key(0)))
@@ -92,29 +137,36 @@ def fit_momentum(
             raise InputError(
                 f"noise is {scale}; expected a positive number for each of {data.degrees_of_freedom} joints"
             )
-        equations = list(_equations(model, unravel, zero, data, window))
+        equations = list(_equations(model, unravel, zero, data, form, scale, window))
     if not equations:
         raise InputError(f"no stretch of the data is as long as a window of {window:g} s; give a shorter one")
-    weighted = (
-        (A.reshape(-1, zero.size), b.ravel()) for A, b in ((A / scale[:, None], b / scale) for A, b in equations)
-    )
-    solution = least_squares.solve_chunks(weighted, ridge=ridge, rank_tolerance=rank_tolerance, negligible=negligible)
-    squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b in equations)
-    windows = sum(len(b) for _, b in equations)
-    return MomentumFit(
+    weighted = ((_divided(A, unit).reshape(-1, zero.size), (b / unit).ravel()) for A, b, unit in equations)
+    solution = least_squares.solve_chunks(weighted, **tolerances)
+    squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b, _ in equations)
+    windows = sum(len(b) for _, b, _ in equations)
+    return WeakFit(
         parameters=unravel(jnp.asarray(solution.x, zero.dtype)),
         parameter_count=zero.size,
         rank=solution.rank,
         condition=solution.condition,
-        equations=windows * data.degrees_of_freedom,
-        torque_mse=squares / windows,
+        equations=sum(b.size for _, b, _ in equations),
+        mse=squares / windows,
     )
+
+
+def _divided(A: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    return A / unit[..., None]
 
 
 def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, Vector]:
     """p = M qd and s = tau(q, qd, 0) - dM/dt qd of one state: tau = dp/dt + s."""
     p, change = jax.jvp(lambda place: plant.mass_matrix(place) @ qd, (q,), (qd,))
     return p, plant.inverse_dynamics(q, qd, jnp.zeros_like(qd)) - change
+
+
+def energy_and_loss(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+    """E = T + V and the power that friction takes, of one state: qdᵀ tau = dE/dt + loss."""
+    return plant.energy(q, qd)[None], (qd @ plant.friction(q, qd))[None]
 
 
 def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -125,12 +177,18 @@ def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _equations(
-    model: Model, unravel: Any, zero: Array, data: Trajectories, window: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Columns [W, d, P] and right-hand sides [W, d] of the windows of one chunk after the other."""
+    model: Model,
+    unravel: Any,
+    zero: Array,
+    data: Trajectories,
+    form: _Form,
+    noise: Float[np.ndarray, " d"],
+    window: float,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Columns [W, k, P], right-hand sides and their deviations [W, k] of the windows of one chunk after the other."""
 
     def both(theta: Parameters, q: Vector, qd: Vector) -> Array:
-        return jnp.concatenate(momentum_and_rest(dynamics(model.energies(unravel(theta))), q, qd))
+        return jnp.concatenate(form.left(dynamics(model.energies(unravel(theta))), q, qd))
 
     def columns(q: Vector, qd: Vector) -> Array:
         values, pull_back = jax.vjp(functools.partial(both, q=q, qd=qd), zero)
@@ -153,11 +211,13 @@ def _equations(
             mine = starts[(starts >= begin) & (starts < begin + max(1, length - steps))]
             rows = piece[np.minimum(np.arange(begin, begin + max(length, steps + 1)), len(piece) - 1)]
             found = np.asarray(program(data.q[rows], data.qd[rows]))
-            d = data.degrees_of_freedom
-            A, b = [], []
+            k = found.shape[1] // 2
+            A, b, unit = [], [], []
             for start in mine:
                 part = slice(start - begin, start - begin + steps + 1)
-                A.append(np.tensordot(w, found[part, d:], 1) - np.tensordot(slope, found[part, :d], 1))
-                b.append(w @ data.tau[rows[part]])
+                qd, tau = data.qd[rows[part]], data.tau[rows[part]]
+                A.append(np.tensordot(w, found[part, k:], 1) - np.tensordot(slope, found[part, :k], 1))
+                b.append(w @ form.right(qd, tau))
+                unit.append(np.sqrt(w**2 @ form.noise(qd, noise) ** 2))
             if A:
-                yield np.stack(A), np.stack(b)
+                yield np.stack(A), np.stack(b), np.stack(unit)
