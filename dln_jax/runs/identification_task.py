@@ -143,13 +143,16 @@ def with_description(case: Case, **changes: Any) -> Case:
     return case._replace(description=description, model=model, known=known)
 
 
-def with_shapes(given: Options, case: Case) -> Case:
-    """The case with friction curves whose shapes the training data show, and as it is where none is to be found."""
-    held = () if given.velocity_scale is None else ("velocity_scale",)
+def with_shapes(velocity_scale: float | None, case: Case) -> Case:
+    """The case with friction curves whose shapes the training data show, and as it is where none is to be found.
+
+    The velocity scale is fitted where it is not given.
+    """
+    held = () if velocity_scale is None else ("velocity_scale",)
     if not set(shape_of(case.laws)) - set(held):
         return case
     thin = -(-len(case.sets.train.t) // MOST_SAMPLES)
-    start = FrictionShape(**({} if given.velocity_scale is None else {"velocity_scale": given.velocity_scale}))
+    start = FrictionShape(**({} if velocity_scale is None else {"velocity_scale": velocity_scale}))
     fitted = fit_friction(
         case.robot.tree, every(case.sets.train, thin), case.laws, shape=start, held=held, noise=case.noise
     )
