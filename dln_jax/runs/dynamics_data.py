@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from dln_jax.command_line.arguments import refuse_given
 from dln_jax.command_line.encoders import checked, preparation, smoothed
 from dln_jax.command_line.running import needs_from_option
@@ -10,7 +12,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import Split, split
+from dln_jax.data.splits import BLOCKS, Split, in_blocks, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.sketch import Sketch, sketch_from_json
@@ -72,6 +74,9 @@ def read(given: Options) -> Recorded:
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
+    if given.model == AUTO and labels is None and len(np.unique(data.trajectory)) == 1:
+        data = in_blocks(data, BLOCKS)
+        said.append(f"one trajectory: taken as {BLOCKS} blocks of time, some for validation and for the test")
     parents = parents_of(given, needs.degrees_of_freedom)
     return Recorded(
         name=name,

@@ -31,7 +31,6 @@ from dln_jax.runs.dynamics_task import Task, needs_of_tree, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.identification_additions import with_network
 from dln_jax.runs.identification_task import Case, Sets, with_description, with_shapes
-from dln_jax.types import Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import Description, build, describe
 
@@ -39,7 +38,7 @@ RUNG_SECONDS = 120.0
 """Of a search or of the training of a network, where --seconds says nothing."""
 MOST_SAMPLES = 4_000
 """That networks beside a tree are fitted to."""
-NETWORK, KERNEL = "structured-delan", "trigonometric-kernel"
+NETWORK, EXPLICIT, KERNEL = "structured-delan", "trigonometric", "trigonometric-kernel"
 BESIDE = "-residual"
 """Behind the name of a model to which a network is added."""
 
@@ -125,17 +124,21 @@ def _rungs(given: Options, recorded: Recorded, folder: Path) -> list[Rung]:
 
     known = [] if recorded.robot is None else of_tree("rigid-tree", lambda left: _rigid_tree(given, recorded))
     learned = of_tree("learned-tree", by_name("learned-tree"))
-    return [*known, *learned, *_trigonometric(recorded.needs, by_name), Rung(NETWORK, by_name(NETWORK))]
+    first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
+    # A small basis is fitted in a second, a tree of unknown frames in half a minute.
+    small = second is not None and second <= MOST_PARAMETERS
+    explicit = [
+        Rung(EXPLICIT, by_name(EXPLICIT) if first is not None and first <= MOST_PARAMETERS else _too_large(first))
+    ]
+    kernel = [Rung(KERNEL, by_name(KERNEL))] if KERNEL in CATALOGUE and not small else []
+    direct = [*known[:1], *(explicit if small else []), learned[0], *([] if small else explicit), *kernel]
+    return [*direct, *known[1:], *learned[1:], Rung(NETWORK, by_name(NETWORK))]
 
 
-def _trigonometric(needs: Needs, by_name: Callable[[str], Callable[[float], Fitted]]) -> list[Rung]:
-    """The explicit basis where it is small, and its kernel where that is not."""
-    first, second = (parameters_of_degree(needs, degree) for degree in (1, 2))
-    size = "too many" if first is None else f"{first:,}"
-    large = f"a basis of {size} coefficients; at most {MOST_PARAMETERS:,} are tried"
-    explicit = by_name("trigonometric") if first is not None and first <= MOST_PARAMETERS else lambda left: large
-    kernel = KERNEL in CATALOGUE and (second is None or second > MOST_PARAMETERS)
-    return [Rung("trigonometric", explicit), *([Rung(KERNEL, by_name(KERNEL))] if kernel else [])]
+def _too_large(size: int | None) -> Callable[[float], str]:
+    """A rung of no model."""
+    number = "too many" if size is None else f"{size:,}"
+    return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
 
 def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, left: float) -> Fitted:

@@ -34,9 +34,11 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     (default: what the scene or the file states, else revolute joints with gravity)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
-    gauss-newton while its equations are small. The trigonometric model and the learned tree need none."""
+    gauss-newton while its equations are small and, for structured models of four joints or more, while the data show no
+    more than a small network holds. The trigonometric model and the learned tree need none."""
     width: Unstated[int] = None
-    """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
+    """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam; chosen by the data for
+    structured models of four joints or more)."""
     depth: Unstated[int] = None
     """Hidden layers (default: 2)."""
     activation: Unstated[Literal["tanh", "softplus", "silu", "gelu", "sin", "cos"]] = None
@@ -45,6 +47,9 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     """trigonometric: degree of the polynomials in every joint (default: for each joint what validation asks for)."""
     steps: Unstated[int] = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
+    samples: Unstated[int] = None
+    """gauss-newton: training samples that are drawn and fitted (default: all; of an arm of four joints or more, so many
+    that there are 14 equations a parameter)."""
     batch: Unstated[int] = None
     """adam: samples per step (default: 512)."""
     learning_rate: Unstated[float] = None
@@ -106,6 +111,7 @@ def check_options(given: Options, kind: str) -> None:
         if kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1:
             raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
         refuse_given(given, ["width", "depth"], "what --target grows")
+        refuse_given(given, ["samples"], "for one network, and --target grows several")
         require_positive(target=given.target)
 
 
@@ -113,7 +119,7 @@ def check_direct_options(given: Options, others: tuple[str, ...], model: str, wh
     """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
     if given.seeds > 1:
         raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
-    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
+    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "samples", "target", *others), f"for networks; {model} {why}")
     if given.optimizer != "auto":
         raise InputError(f"{model} {why}; leave --optimizer out")
 

@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 from dln_jax.command_line.arguments import refuse_given, resolved
 from dln_jax.command_line.optimisers import name_of, optimiser_named
-from dln_jax.data.splits import Split
+from dln_jax.data.splits import Split, drawn
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, require_finite_start
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
+from dln_jax.learning.suited import MANY_JOINTS, suited_network
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.runs.dynamics_data import Recorded
 from dln_jax.runs.dynamics_options import OF_ADAM, Options, check_options
@@ -86,14 +87,19 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Tas
     objective = objective_of(kind, sets.train)
     if objective is TORQUE and given.target is None:
         objective = SCALED_TORQUE
-    description, optimiser, reason = model_and_optimiser(given, kind, recorded, objective)
+    description, optimiser, samples, reason = model_and_optimiser(given, kind, recorded, objective)
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
     limit = resolved(given, {"seconds": math.inf})
     require_positive(**limit)
     model, solver = build(description), None
     if optimiser is not None:
-        problem = dynamics.problem(model, sets, objective, seeds=seeds)
-        require_finite_start(problem, dynamics.samples(model, sets, objective))
+        require_finite_start(
+            dynamics.problem(model, sets, objective, seeds=seeds), dynamics.samples(model, sets, objective)
+        )
+        scale, some = objective.scale(sets.train), sets
+        if samples is not None:
+            some = sets._replace(train=drawn(sets.train, samples, given.seed))
+        problem = dynamics.problem(model, some, objective._replace(scale=lambda data: scale), seeds=seeds)
         solver = Solver(optimiser, reason, problem)
     return Task(recorded, kind, description, objective, solver, seeds, **limit)
 
@@ -111,31 +117,42 @@ def needs_of_tree(needs: Needs) -> Needs:
 
 def model_and_optimiser(
     given: Options, kind: str, recorded: Recorded, objective: Objective
-) -> tuple[dict[str, Any], Optimiser | None, str]:
-    """Description of the model, its optimiser, and why that one."""
+) -> tuple[dict[str, Any], Optimiser | None, int | None, str]:
+    """Description of the model, its optimiser, how many samples that sees (`None`: all), and why that one."""
     needs, sets = recorded.needs, recorded.sets
-    properties, adam = CATALOGUE[kind].properties, given.optimizer == "adam"
-    precision = given.precision or ("f32" if adam else "f64")
+    properties, optimizer = CATALOGUE[kind].properties, given.optimizer
     if properties.searched:
         needs = needs_of_tree(needs)
         stated = {"parents": recorded.parents, "velocity_scale": needs.velocity_scale}
-        return describe_for(kind, sets.train, needs, precision=precision, **stated), None, ""
+        return describe_for(kind, sets.train, needs, precision=given.precision or "f64", **stated), None, None, ""
     if properties.linear:
         degree = 1 if given.degree is None else given.degree
-        return describe_for(kind, sets.train, needs, precision=precision, degree=degree), None, ""
+        description = describe_for(kind, sets.train, needs, precision=given.precision or "f64", degree=degree)
+        return description, None, None, ""
+    suited = None
+    sized = given.width is None and given.depth is None and given.target is None
+    if kind == "structured-delan" and optimizer == "auto" and sized and needs.degrees_of_freedom >= MANY_JOINTS:
+        suited = suited_network(needs, sets.train)
+        optimizer = suited.optimizer
+    adam = optimizer == "adam"
+    precision = given.precision or ("f32" if adam else "f64")
     # Structure needs fewer units, and first-order training more.
     width = 64 if adam else 8 if properties.definite else 16
     keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
+    keywords |= {} if suited is None else suited.keywords
     require_positive(width=keywords["width"], depth=keywords["depth"])
     description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
-    optimizer, reason = given.optimizer, ""
+    reason = "" if suited is None else suited.reason
     if optimizer == "auto":
-        suited, reason = dynamics.suited_optimiser(build(description), sets, objective)
-        optimizer = name_of(suited)
-        precision = given.precision or ("f32" if optimizer == "adam" else "f64")
-        description["precision"] = precision
+        kind_suited, reason = dynamics.suited_optimiser(build(description), sets, objective)
+        optimizer = name_of(kind_suited)
+        description["precision"] = precision = given.precision or ("f32" if optimizer == "adam" else "f64")
     if optimizer == "gauss-newton":
         chosen = "auto chose gauss-newton" if reason else "the optimizer is gauss-newton"
         refuse_given(given, OF_ADAM, f"for adam, but {chosen}: add --optimizer adam")
+    elif given.samples is not None:
+        chosen = "auto chose adam: add --optimizer gauss-newton" if reason else "the optimizer is adam"
+        raise InputError(f"--samples is for gauss-newton, but {chosen}; or leave it out")
     settings = {name: getattr(given, name) for name in (*OF_ADAM, "steps", "target")}
-    return description, optimiser_named(optimizer, precision=precision, **settings), reason
+    samples = given.samples if suited is None or given.samples is not None else suited.samples
+    return description, optimiser_named(optimizer, precision=precision, **settings), samples, reason
