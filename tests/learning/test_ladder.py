@@ -40,6 +40,7 @@ def test_a_small_joint_counts_as_much_as_a_large_one():
     found = climb([rung("large joint", 1.0, 3.0), rung("both, nearly", 1.1, 1.1)], TRAIN, VALIDATION)
     assert found.chosen.name == "both, nearly"
     share = (NOISE**2 + (0.1 * UNIT) ** 2 * ARRAYS["qdd"][N:].var(axis=0)) / TAU[:N].var(axis=0)
+    assert found.chosen.nmse is not None
     np.testing.assert_allclose(found.chosen.nmse, share, rtol=0.4)
 
 
