@@ -159,7 +159,8 @@ def _rigid_tree(given: Options, recorded: Recorded) -> Fitted:
     assert robot is not None
     train_set, validation, _ = recorded.sets
     began = time.perf_counter()
-    description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree))
+    stated = {"needs": needs, "tree": tree_to_json(robot.tree), "velocity_scale": needs.velocity_scale}
+    description = describe("rigid-tree", precision="f64", **stated)
     sets = Sets(train_set, validation, blocks=False)
     case = with_description(Case(robot, robot.tree.names, sets, description, None, None, None, (), ()))
     scale = given.velocity_scale if isinstance(given, ArmOptions) else None
@@ -174,13 +175,17 @@ def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitte
     if base is None:
         return "there is no tree to add a network to"
     began = time.perf_counter()
-    task = base.outcome[0]
-    if task.kind == "learned-tree":
+    if base.outcome[0].kind == "learned-tree":
         base = _as_rigid(base, recorded)
     train_set, validation, _ = recorded.sets
     thin = -(-len(train_set.t) // MOST_SAMPLES)
     added = fit_residual(
-        base.model, base.parameters, recorded.needs, every(train_set, thin), validation, seconds=min(left, RUNG_SECONDS)
+        base.model,
+        base.parameters,
+        recorded.needs,
+        every(train_set, thin),
+        validation,
+        seconds=min(left, RUNG_SECONDS),
     )
     if not added.settings:
         return "no network makes it better on validation motions"

@@ -158,7 +158,7 @@ def draw(
     """Writes what there is to draw."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
-    if len(training.history) > 1:
+    if training.history and task.solver is not None:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))
