@@ -1,12 +1,17 @@
 """The structured network, its optimiser and its samples that suit an arm of many joints.
 
-Measured on a simulated arm of seven axes, nMSE on unseen motions and processor time, one core of two:
+Measured on the simulated arm of seven axes (`studies.robots.arm`, viscous friction, no noise), mean nMSE on twelve unseen
+motions, each after half a minute of processor time; with two seeds where two numbers stand:
 
-    15 motions of 10 s   8 x 8 by Gauss-Newton on all samples, as for few joints   TABLE
+    motions of 10 s                                15               30      75
+    independent equations a parameter               4                8      19
+    16 units, Gauss-Newton, 1,480 samples    0.026, 0.035         0.025   0.024
+    64 x 64, AdamW, all samples (6,000 steps) 0.062, 0.059        0.023   0.0075
 
-A step of Gauss-Newton forms JᵀJ, some N d P² operations, and samples of one motion that follow each other closely say
-the same: a part of them is enough. What limits a small network is what it can hold, and a large one what the motions
-show: the number of equations that are independent decides.
+Wider and deeper small networks (16 x 16, 32) came to the same 0.025 from 15 motions, slower; 8 units to 0.056. A step of
+Gauss-Newton forms JᵀJ, some N d P² operations, and neighbouring samples of one motion say the same: a part of them is
+enough. A small network is limited by what it can hold, a large one by what the motions show: the number of independent
+equations decides.
 """
 
 from typing import NamedTuple
@@ -25,7 +30,7 @@ MANY_JOINTS = 4
 WIDTH = 16
 """Of the one hidden layer that mass matrix and potential share."""
 ROWS_PER_PARAMETER = 14
-"""Equations that a step of Gauss-Newton sees; from seven on, errors on unseen motions were the same."""
+"""Equations that a step of Gauss-Newton sees. Of 16 x 16 units, seven did as well."""
 MOST_INDEPENDENT = 6
 """Independent equations for each parameter of the small network, above which a large one by Adam is better."""
 
