@@ -1,17 +1,17 @@
 """The structured network, its optimiser and its samples that suit an arm of many joints.
 
-Measured on the simulated arm of seven axes (`studies.robots.arm`, viscous friction, no noise), mean nMSE on twelve unseen
-motions, each after half a minute of processor time; with two seeds where two numbers stand:
+Measured on the simulated arm of seven axes (`studies.robots.arm`, viscous friction, no noise), mean nMSE on twelve
+unseen motions, each after half a minute of processor time; of two seeds where two numbers stand:
 
     motions of 10 s                                15               30      75
     independent equations a parameter               4                8      19
     16 units, Gauss-Newton, 1,480 samples    0.026, 0.035         0.025   0.024
     64 x 64, AdamW, all samples (6,000 steps) 0.062, 0.059        0.023   0.0075
 
-Wider and deeper small networks (16 x 16, 32) came to the same 0.025 from 15 motions, slower; 8 units to 0.056. A step of
-Gauss-Newton forms JᵀJ, some N d P² operations, and neighbouring samples of one motion say the same: a part of them is
-enough. A small network is limited by what it can hold, a large one by what the motions show: the number of independent
-equations decides.
+From 15 motions wider and deeper small networks (16 x 16, 32) came to the same 0.025, slower, 8 units to 0.056, and a
+ridge to no better. A step of Gauss-Newton forms JᵀJ, some N d P² operations, and neighbouring samples of one motion say
+the same: a part of them is enough. A small network is limited by what it can hold, a large one by what the motions
+show: the number of independent equations decides.
 """
 
 from typing import NamedTuple
