@@ -42,6 +42,8 @@ class Suited(NamedTuple):
     """gauss-newton or adam."""
     keywords: dict[str, int | bool]
     """Of `make_delan`: width, depth, and whether there is one trunk."""
+    steps: int
+    """Of the optimiser: half a minute."""
     samples: int | None
     """Drawn for the fit; `None` for all."""
     reason: str
@@ -56,10 +58,10 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
     told = f"{independent:,} independent equations for the {size:,} parameters of a small network"
     if independent > MOST_INDEPENDENT * size:
         large = {"width": 64, "depth": 2, "shared_trunk": False}
-        return Suited("adam", large, None, f"{told}: a large one holds more")
+        return Suited("adam", large, 6_000, None, f"{told}: a large one holds more")
     samples = ROWS_PER_PARAMETER * size // d
     drawn = f"; {samples:,} of {len(train.t):,} samples are fitted" if samples < len(train.t) else ""
-    return Suited("gauss-newton", small, samples, told + drawn)
+    return Suited("gauss-newton", small, 40, samples, told + drawn)
 
 
 def independent_equations(data: Trajectories) -> int:

@@ -46,7 +46,8 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     degree: Unstated[int] = None
     """trigonometric: degree of the polynomials in every joint (default: for each joint what validation asks for)."""
     steps: Unstated[int] = None
-    """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
+    """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000); of structured models of four joints
+    or more 40 and 6000."""
     samples: Unstated[int] = None
     """gauss-newton: training samples that are drawn and fitted (default: all; of an arm of four joints or more, so many
     that there are 14 equations a parameter)."""

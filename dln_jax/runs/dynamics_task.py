@@ -154,5 +154,7 @@ def model_and_optimiser(
         chosen = "auto chose adam: add --optimizer gauss-newton" if reason else "the optimizer is adam"
         raise InputError(f"--samples is for gauss-newton, but {chosen}; or leave it out")
     settings = {name: getattr(given, name) for name in (*OF_ADAM, "steps", "target")}
+    if suited is not None and given.steps is None:
+        settings["steps"] = suited.steps
     samples = given.samples if suited is None or given.samples is not None else suited.samples
     return description, optimiser_named(optimizer, precision=precision, **settings), samples, reason
