@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from dln_jax.runs.dynamics import run
-from dln_jax.runs.dynamics_task import Options
+from dln_jax.runs.dynamics_options import Options
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,10 @@ from dln_jax.types import InputError, require_positive, require_seed
 PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 
 
+BLOCKS = 10
+"""Of one trajectory, where there is no other to be judged by."""
+
+
 class Split(NamedTuple):
     """Three disjoint sets of trajectories: fitted to, selected by, and reported on."""
 
@@ -30,6 +34,21 @@ def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajector
 def every(data: Trajectories, step: int) -> Trajectories:
     """Every so manyth sample."""
     return data._replace(**{key: getattr(data, key)[::step] for key in PER_SAMPLE if getattr(data, key) is not None})
+
+
+def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
+    """All samples, or so many that are drawn, in their order.
+
+    Raises:
+        InputError: no samples to be drawn, or a seed out of range.
+    """
+    require_positive(samples=most)
+    require_seed(seed)
+    count = len(data.t)
+    if count <= most:
+        return data
+    rows = np.sort(np.random.default_rng([seed, count]).choice(count, most, replace=False))
+    return data._replace(**{key: getattr(data, key)[rows] for key in PER_SAMPLE if getattr(data, key) is not None})
 
 
 def in_blocks(data: Trajectories, blocks: int) -> Trajectories:

@@ -5,12 +5,14 @@ on validation motions is lower by more than the standard error of the difference
 to be independent, which neighbouring samples are not.
 """
 
+import math
+import time
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
@@ -18,16 +20,11 @@ from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.growth import Trial, grow
-from dln_jax.learning.objectives import TORQUE, arrays, residuals
+from dln_jax.learning.growth import Trial, grow, stretches
+from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
 from dln_jax.types import InputError, Needs, ResidualTerm
-
-SCALED = TORQUE._replace(selects_by="scaled")
-"""Every joint counts alike, however small its torques are."""
-STRETCH = 0.5
-"""s of validation motion whose mean error counts as one measurement."""
 
 
 class Candidate(NamedTuple):
@@ -70,6 +67,7 @@ def fit_residual(
     *,
     candidates: tuple[Candidate, ...] = CANDIDATES,
     iterations: int = 40,
+    seconds: float = math.inf,
     seed: int = 0,
 ) -> ResidualFit:
     """Fits networks to what an identified tree leaves, and keeps the smallest that held-out motions call enough.
@@ -82,6 +80,7 @@ def fit_residual(
         validation: other motions; what is chosen is to be judged by others again.
         candidates: in order of size, the first without terms.
         iterations: of Gauss-Newton, at most; kept are the parameters with the lowest validation error.
+        seconds: after which the network in training is left as it is then, and no further one is tried.
         seed: of the networks.
 
     Raises:
@@ -89,11 +88,12 @@ def fit_residual(
     """
     if not candidates or candidates[0].terms:
         raise InputError("candidates start with a network; expected none at all first, which others have to better")
+    began = time.perf_counter()
     with jax.enable_x64(True):
-        scale = SCALED.scale(train)
+        scale = SCALED_TORQUE.scale(train)
         stretch = stretches(validation)
-        of_train, of_validation = (arrays(SCALED, data, jnp.float64) for data in (train, validation))
-        judge = jax.jit(lambda system_of, batch: residuals(SCALED, system_of(), batch) / scale, static_argnums=0)
+        of_train, of_validation = (arrays(SCALED_TORQUE, data, jnp.float64) for data in (train, validation))
+        judge = jax.jit(lambda system_of, batch: residuals(SCALED_TORQUE, system_of(), batch) / scale, static_argnums=0)
         left = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
         sizes = _sizes(train, left)
         sets = Split(train, validation, validation)
@@ -105,10 +105,17 @@ def fit_residual(
         def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " stretches"]]:
             if not candidate.terms:
                 return None, errors(lambda: rigid.energies(parameters))
+            time_left = began + seconds - time.perf_counter()
+            if time_left <= 0:
+                return None, np.full(stretch.max() + 1, np.inf)
             settings = {"terms": candidate.terms, "width": candidate.width, **sizes}
             both = make_with_residual(rigid, make_residual(needs, **settings))
             part = frozen(both, parameters)
-            training = fit(dynamics.problem(part, sets, SCALED, seeds=seed), GaussNewton(steps=iterations))
+            training = fit(
+                dynamics.problem(part, sets, SCALED_TORQUE, seeds=seed),
+                GaussNewton(steps=iterations),
+                seconds=time_left,
+            )
             found = ResidualParameters(parameters, training.parameters)
             return (both, found, settings), errors(lambda: both.energies(found))
 
@@ -117,14 +124,6 @@ def fit_residual(
         return ResidualFit(rigid, parameters, chosen.candidate, {}, trials)
     model, found, settings = chosen.outcome
     return ResidualFit(model, found, chosen.candidate, settings, trials)
-
-
-def stretches(data: Trajectories, seconds: float = STRETCH) -> Int[np.ndarray, " N"]:
-    """The number of the stretch of time that each sample is in; stretches do not reach across trajectories."""
-    within = np.floor(data.t / seconds).astype(int)
-    within -= within.min()
-    _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
-    return numbers
 
 
 def _sizes(train: Trajectories, left: Float[np.ndarray, "N d"]) -> dict[str, tuple[float, ...]]:

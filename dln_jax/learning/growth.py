@@ -9,7 +9,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+
+from dln_jax.data.schema import Trajectories
+
+STRETCH = 0.5
+"""s of motion whose mean error counts as one measurement: neighbouring samples are not independent."""
 
 
 class Trial(NamedTuple):
@@ -30,7 +35,7 @@ class Trial(NamedTuple):
 
 def significantly_better(errors: Float[np.ndarray, " N"], others: Float[np.ndarray, " N"]) -> bool:
     """Whether `errors` are lower than `others` on average, by more than the standard error of the difference."""
-    if not np.isfinite(np.mean(others)):
+    if not np.isfinite(np.mean(errors)) or not np.isfinite(np.mean(others)):
         return bool(np.isfinite(np.mean(errors)))
     gain = others - errors
     standard_error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
@@ -65,5 +70,18 @@ def grow(
             waited += 1
         if waited >= patience or (target is not None and trial.validation <= target):
             break
+    return smallest_enough(trials), trials
+
+
+def smallest_enough(trials: Sequence[Trial]) -> Trial:
+    """The first whose error no other betters significantly."""
     lowest = min(trials, key=lambda trial: trial.validation)
-    return next(trial for trial in trials if not significantly_better(lowest.errors, trial.errors)), trials
+    return next(trial for trial in trials if not significantly_better(lowest.errors, trial.errors))
+
+
+def stretches(data: Trajectories, seconds: float = STRETCH) -> Int[np.ndarray, " N"]:
+    """The number of the stretch of time that each sample is in; stretches do not reach across trajectories."""
+    within = np.floor(data.t / seconds).astype(int)
+    within -= within.min()
+    _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)
+    return numbers

@@ -182,15 +182,17 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
     """The chosen degrees, one for each joint, and all that were tried.
 
     Of a `Trial`, the candidate is the degrees, the outcome the `LinearFit` in float64, and the errors are those of the
-    torque, squared, at the validation samples. Degrees above 1 are tried while they have no more parameters than the
-    training data have equations, and than `MOST_PARAMETERS`.
+    torques at the validation samples, squared, in units of each joint's `torque_scale` and summed over joints. Degrees
+    above 1 are tried while they have no more parameters than the training data have equations, and than
+    `MOST_PARAMETERS`.
 
     Raises:
         InputError: the basis of degree 1 is too large, or what `fit_linear` refuses.
     """
     d = needs.degrees_of_freedom
     make = CATALOGUE["trigonometric"].factory
-    target = ROUNDING**2 * float(np.mean(np.sum(validation.tau**2, axis=1)))
+    scale = np.asarray(torque_scale(train))
+    target = ROUNDING**2 * float(np.mean(np.sum((validation.tau / scale) ** 2, axis=1)))
 
     def fit(degrees: tuple[int, ...]) -> tuple[LinearFit, Float[np.ndarray, " N"]]:
         with jax.enable_x64(True):
@@ -198,11 +200,11 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
             found = fit_linear(model, train)
             judge = jax.jit(lambda parameters, batch: residuals(TORQUE, model.energies(parameters), batch))
             errors = judge(found.parameters, arrays(TORQUE, validation, jnp.float64))
-        return found, np.sum(np.asarray(errors) ** 2, axis=1)
+        return found, np.sum((np.asarray(errors) / scale) ** 2, axis=1)
 
     def fits(degree: int) -> bool:
-        size = count(jax.eval_shape(make(needs, degree=degree).init, jax.random.key(0)))
-        return size <= min(MOST_PARAMETERS, train.tau.size)
+        size = parameters_of_degree(needs, degree)
+        return size is not None and size <= min(MOST_PARAMETERS, train.tau.size)
 
     most = next((n - 1 for n in range(2, LARGEST_DEGREE + 1) if not fits(n)), LARGEST_DEGREE)
     chosen, trials = grow([(n,) * d for n in range(1, most + 1)], fit, patience=1, target=target)
@@ -214,3 +216,12 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
                 break
             chosen = trials[-1]
     return chosen, trials
+
+
+def parameters_of_degree(needs: Needs, degree: int) -> int | None:
+    """Of the trigonometric model with this degree in every joint; `None` where it is too large to be made."""
+    try:
+        model = CATALOGUE["trigonometric"].factory(needs, degree=degree)
+    except InputError:
+        return None
+    return count(jax.eval_shape(model.init, jax.random.key(0)))

@@ -26,7 +26,13 @@ class Objective(NamedTuple):
     residual: Callable[..., Float[Array, " r"]]
     """(system, *sample) -> residuals of one sample, in SI units."""
     selects_by: str
-    """"torque": validation is the mean square of the residual in (N m)², as published; "scaled": in its own units."""
+    """"torque": validation is the mean square of the residual in (N m)², as published, to which large joints contribute
+    most; "scaled": in its own units, so that every joint counts alike."""
+
+    @property
+    def of_torques(self) -> bool:
+        """Whether its residuals are those of torques, and of nothing else."""
+        return self.residual is TORQUE.residual
 
 
 def torque_scale(data: Trajectories) -> Float[Array, " d"]:
@@ -52,6 +58,9 @@ TORQUE = Objective(
     selects_by="torque",
 )
 """tau_hat(q, qd, qdd) - tau, the published loss of DeLaN."""
+
+SCALED_TORQUE = TORQUE._replace(selects_by="scaled")
+"""The same, selected by errors in units of each joint's `torque_scale`."""
 
 
 def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:

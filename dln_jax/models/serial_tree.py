@@ -72,11 +72,16 @@ def make_serial_tree(
     require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
     if needs.actuation is not None:
         raise InputError("a learned tree has a motor at each joint; leave actuation out of the needs")
+    if needs.joint_map is not None:
+        raise InputError("a learned tree takes coordinates of its joints; leave joint_map out of the needs")
+    if needs.joint_friction:
+        raise InputError(
+            "a learned tree has viscous, dry and offset friction: state friction in its needs, and no joint_friction"
+        )
     d = needs.degrees_of_freedom
     order = tuple(range(-1, d - 1)) if parents is None else tuple(parents)
     if len(order) != d or any(not -1 <= parent < link for link, parent in enumerate(order)):
         raise InputError(f"parents are {order}; expected for each of {d} links one before it, or -1 for the ground")
-    gravity = np.array([0.0, 0.0, -acceleration if needs.gravity else 0.0])
 
     def init(key: Array) -> SerialTreeParameters:
         turns, positions = jax.random.normal(key, (2, d, 3), dtype)
@@ -90,21 +95,31 @@ def make_serial_tree(
         if needs.friction:
             coefficients = parameters.viscous, parameters.coulomb, parameters.offset
             dissipation = joint_dissipation(*coefficients, velocity_scale=velocity_scale)
-        return tree_system(tree_of(parameters), dissipation)
-
-    def tree_of(parameters: SerialTreeParameters) -> Tree:
-        return Tree(
-            parents=order,
-            joints=needs.joints,
-            rotations=jax.vmap(rotation)(parameters.turns),
-            positions=parameters.positions,
-            axes=np.tile([0.0, 0.0, 1.0], (d, 1)),
-            inertias=parameters.inertias,
-            armature=parameters.armature,
-            gravity=gravity,
-        )
+        tree = tree_of(parameters, needs, parents=order, acceleration=acceleration)
+        return tree_system(tree, dissipation)
 
     return Model(init, energies)
+
+
+def tree_of(
+    parameters: SerialTreeParameters,
+    needs: Needs,
+    *,
+    parents: Sequence[int] | None = None,
+    acceleration: float = 9.81,
+) -> Tree:
+    """The tree of these parameters, as one of known frames; other arguments as for `make_serial_tree`."""
+    d = needs.degrees_of_freedom
+    return Tree(
+        parents=tuple(range(-1, d - 1)) if parents is None else tuple(parents),
+        joints=needs.joints,
+        rotations=jax.vmap(rotation)(jnp.asarray(parameters.turns)),
+        positions=parameters.positions,
+        axes=np.tile([0.0, 0.0, 1.0], (d, 1)),
+        inertias=parameters.inertias,
+        armature=parameters.armature,
+        gravity=np.array([0.0, 0.0, -acceleration if needs.gravity else 0.0]),
+    )
 
 
 def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:

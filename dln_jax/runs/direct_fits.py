@@ -12,7 +12,8 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.models.model import Parameters
 from dln_jax.precision import data_type
-from dln_jax.runs.dynamics_task import Options, Task
+from dln_jax.runs.dynamics_options import Options
+from dln_jax.runs.dynamics_task import Task, needs_of_tree
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 
@@ -26,19 +27,25 @@ def fit_directly(task: Task, given: Options) -> tuple[Task, Training]:
 
 def fit_learned_tree(task: Task, given: Options) -> tuple[Task, Training]:
     """Joint frames by Gauss-Newton from random starts, all else by elimination."""
+    needs, sketch = needs_of_tree(task.needs), task.recorded.sketch
+    near = (
+        {}
+        if sketch is None
+        else {"sketch": sketch.frames, "sketch_angle": sketch.angle, "sketch_length": sketch.length}
+    )
     fit = fit_tree(
-        task.needs,
+        needs,
         task.sets.train,
         task.sets.validation,
         parents=task.description["parents"],
         acceleration=task.description["acceleration"],
         velocity_scale=task.description["velocity_scale"],
-        settings=Search(seed=given.seed, seconds=task.seconds),
+        settings=Search(seed=given.seed, seconds=task.seconds, **near),
         report=print,
     )
     size = f"{fit.parameter_count} parameters, of the linear ones rank {fit.rank}, condition {fit.condition:.3g}"
     print(f"learned tree: {size}")
-    return task, _training(task, fit.parameters, fit.torque_mse, fit.seconds)
+    return task, training_of(task, fit.parameters, fit.torque_mse, fit.seconds)
 
 
 def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
@@ -53,10 +60,10 @@ def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
     fitted = chosen.outcome if chosen is not None else fit_linear(build(task.description), task.sets.train)
     size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
     print(f"least squares: {size}")
-    return task, _training(task, fitted.parameters, fitted.torque_mse, time.perf_counter() - began)
+    return task, training_of(task, fitted.parameters, fitted.torque_mse, time.perf_counter() - began)
 
 
-def _training(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:
+def training_of(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:
     """A fit as if it were a training of one step."""
     model, dtype = build(task.description), data_type(task.precision)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)

@@ -5,22 +5,22 @@ from pathlib import Path
 import numpy as np
 
 from dln_jax.command_line.optimisers import name_of
-from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, write_config
 from dln_jax.data.splits import merged
 from dln_jax.files import write_json
-from dln_jax.learning import dynamics
-from dln_jax.learning.engine.checkpoint import Checkpoint
-from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.objectives import TORQUE
+from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
 from dln_jax.runs.direct_fits import fit_directly
+from dln_jax.runs.dynamics_data import Recorded, read
 from dln_jax.runs.dynamics_growth import grow_to_target
+from dln_jax.runs.dynamics_ladder import climb_ladder
+from dln_jax.runs.dynamics_options import AUTO, Options, check_options
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
-from dln_jax.runs.dynamics_task import Options, Solver, Task, prepare
+from dln_jax.runs.dynamics_task import Task, task_of
+from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
-from dln_jax.runs.results import losses, settings_of
+from dln_jax.runs.results import settings_of
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -33,15 +33,19 @@ def run(given: Options, command: str) -> None:
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
-    task = prepare(given)
+    recorded = read(given)
+    chosen = None
+    if given.model == AUTO:
+        check_options(given, AUTO)
+    else:
+        chosen = task_of(given, recorded)
     with command_folder(given, command) as folder:
-        announce(task)
-        if task.solver is None:
-            task, training = fit_directly(task, given)
-        elif given.target is not None:
-            task, training = grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume)
+        announce(recorded)
+        if chosen is None:
+            task, training = climb_ladder(given, recorded, folder)
         else:
-            training = train(task, task.solver, folder, resume=given.resume)
+            announce_model(chosen)
+            task, training = trained(chosen, given, folder)
         if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
@@ -50,13 +54,15 @@ def run(given: Options, command: str) -> None:
         save(folder, task.description, parameters)
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
+        unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
         metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
-        filtered = {} if task.cutoff is None else {"cutoff_hz": task.cutoff}
-        write_config(folder, given, **task.description, **optimiser, **filtered, seeds=task.seeds)
+        more = {"cutoff_hz": recorded.cutoff, "validation_units": unit}
+        more = {name: value for name, value in more.items() if value is not None}
+        write_config(folder, given, **task.description, **optimiser, **more, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
             print(f"the run keeps seed {given.seed + best}, the best in validation")
@@ -64,36 +70,35 @@ def run(given: Options, command: str) -> None:
         warn(task, training, folder)
 
 
-def announce(task: Task) -> None:
-    """Says what is trained on what, and what was assumed."""
-    counts = ", ".join(f"{len(part.t)} {role}" for role, part in task.sets._asdict().items())
-    joints = "-".join(task.needs.joints)
-    terms = [name for name in ("gravity", "friction") if getattr(task.needs, name)] or ["no potential, no friction"]
-    print(f"{task.name}: {counts} samples")
-    print(f"{joints} with {' and '.join(terms)} ({task.needs_origin})")
-    if task.needs.joint_friction:
-        print(f"friction of joints: {', '.join(task.needs.joint_friction)}")
-    for line in task.said:
+def announce(recorded: Recorded) -> None:
+    """Says what is trained on, and what was assumed."""
+    counts = ", ".join(f"{len(part.t)} {role}" for role, part in recorded.sets._asdict().items())
+    needs = recorded.needs
+    terms = [name for name in ("gravity", "friction") if getattr(needs, name)] or ["no potential, no friction"]
+    print(f"{recorded.name}: {counts} samples")
+    print(f"{'-'.join(needs.joints)} with {' and '.join(terms)} ({recorded.needs_origin})")
+    if needs.joint_friction:
+        print(f"friction of joints: {', '.join(needs.joint_friction)}")
+    for line in recorded.said:
         print(line)
-    if CATALOGUE[task.kind].properties.canonical and task.objective is TORQUE:
+
+
+def announce_model(task: Task) -> None:
+    """Says what is trained, and how."""
+    if CATALOGUE[task.kind].properties.canonical and task.objective.of_torques:
         print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.solver is not None:
         why = f" ({task.solver.reason})" if task.solver.reason else ""
         print(f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}")
 
 
-def train(task: Task, solver: Solver, folder: Path, *, resume: bool) -> Training:
-    """Trains the task's model, one seed or several."""
-    total = solver.optimiser.steps
-    identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
-    with progress(total) as show:
-        return fit(
-            solver.problem,
-            solver.optimiser,
-            checkpoint=Checkpoint(folder, identity, resume),
-            report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
-            seconds=task.seconds,
-        )
+def trained(task: Task, given: Options, folder: Path) -> tuple[Task, Training]:
+    """The task's model, and the task with whatever of it the fit has chosen."""
+    if task.solver is None:
+        return fit_directly(task, given)
+    if given.target is not None:
+        return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume)
+    return task, train(task, task.solver, folder, resume=given.resume)
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:
@@ -102,7 +107,7 @@ def warn(task: Task, training: Training, folder: Path) -> None:
     if found is not None and found.share_not_definite > 0:
         properties = CATALOGUE[task.kind].properties
         structured = f"--model {'structured-hnn' if properties.canonical else 'structured-delan'}"
-        remedy = f"another --degree, {structured}" if properties.linear else structured
+        remedy = f"another --degree, {structured}" if "degree" in task.description else structured
         print(
             f"the mass matrix is not positive definite at {found.share_not_definite:.1%} of the states of the data: "
             f"accelerations and rollouts are wrong or infinite there; try {remedy}, or more varied motions"

@@ -39,6 +39,7 @@ CEILINGS = {
 MEANINGS = {
     "torque_mse": "torque, mean square error",
     "forward_mse": "acceleration, mean square error",
+    "validation_error": "validation error, sum over joints",
     "power_mse": "power, mean square error",
     "inertial_mse": "inertial force, mean square error",
     "coriolis_mse": "Coriolis force, mean square error",
@@ -157,7 +158,7 @@ def draw(
     """Writes what there is to draw."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
-    if training.history and not CATALOGUE[task.kind].properties.direct:
+    if training.history and task.solver is not None:
         torque = task.objective.selects_by == "torque"
         units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
         best = int(np.max(training.best_step))

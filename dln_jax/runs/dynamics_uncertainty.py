@@ -9,7 +9,6 @@ import numpy as np
 
 from dln_jax.figures.uncertainty import torque_bands
 from dln_jax.files import write_figure
-from dln_jax.learning.objectives import TORQUE
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
 from dln_jax.precision import data_type
@@ -23,13 +22,20 @@ from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
     """Estimates it by the training and validation trajectories; of models that are fitted to torques alone."""
-    if task.objective is not TORQUE:
+    if not task.objective.of_torques:
         print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
         return
-    linear = CATALOGUE[task.kind].properties.linear
+    linear, tree = CATALOGUE[task.kind].properties.linear, "tree" in task.description
     model = build({**task.description, "precision": "f64"})
     try:
-        found = estimate(model, parameters, task.sets.train, task.sets.validation, ridge=0.0 if linear else None)
+        found = estimate(
+            model,
+            parameters,
+            task.sets.train,
+            task.sets.validation,
+            ridge=0.0 if linear else None,
+            negligible=1e-12 * tree,
+        )
     except (InputError, np.linalg.LinAlgError) as error:
         # The model is trained: what its data cannot tell is left out, not refused.
         print(f"the run does not say what it does not know: {error}")

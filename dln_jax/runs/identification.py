@@ -44,7 +44,7 @@ def run(given: Options, command: str) -> None:
     with command_folder(given, command) as folder:
         announce(given, case)
         began = time.perf_counter()
-        case = with_shapes(given, case)
+        case = with_shapes(given.velocity_scale, case)
         found = identify(
             case.model,
             case.known,

@@ -61,9 +61,12 @@ def add_residual(case: Case, kept: Parameters) -> ResidualFit:
 
 def stored_description(case: Case, added: ResidualFit | None) -> Description:
     """Of the model that the run keeps."""
-    if added is None or not added.settings:
-        return case.description
-    keywords = {key: value for key, value in case.description.items() if key not in ("name", "precision")}
+    return case.description if added is None or not added.settings else with_network(case.description, added)
+
+
+def with_network(description: Description, added: ResidualFit) -> Description:
+    """Of a rigid tree with what was added to it."""
+    keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
     return describe("rigid-tree-residual", precision="f64", **keywords, **added.settings)
 
 

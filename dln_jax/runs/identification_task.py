@@ -16,7 +16,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import every, in_blocks, label_indices, require_no_copies, select
+from dln_jax.data.splits import BLOCKS, every, in_blocks, label_indices, require_no_copies, select
 from dln_jax.identification.consistent import REGULARISATION
 from dln_jax.learning.friction import fit_friction
 from dln_jax.mechanics.friction import LAWS, FrictionShape, require_laws, shape_of
@@ -26,8 +26,6 @@ from dln_jax.models.rigid_tree import USUAL
 from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
-BLOCKS = 10
-"""Of one trajectory, where there is no other to be judged by."""
 IDENTIFIED = tuple(law for law in LAWS if law != "load")
 """Laws that forces are linear in the coefficients of."""
 NO_FRICTION = "none"
@@ -143,13 +141,16 @@ def with_description(case: Case, **changes: Any) -> Case:
     return case._replace(description=description, model=model, known=known)
 
 
-def with_shapes(given: Options, case: Case) -> Case:
-    """The case with friction curves whose shapes the training data show, and as it is where none is to be found."""
-    held = () if given.velocity_scale is None else ("velocity_scale",)
+def with_shapes(velocity_scale: float | None, case: Case) -> Case:
+    """The case with friction curves whose shapes the training data show, and as it is where none is to be found.
+
+    The velocity scale is fitted where it is not given.
+    """
+    held = () if velocity_scale is None else ("velocity_scale",)
     if not set(shape_of(case.laws)) - set(held):
         return case
     thin = -(-len(case.sets.train.t) // MOST_SAMPLES)
-    start = FrictionShape(**({} if given.velocity_scale is None else {"velocity_scale": given.velocity_scale}))
+    start = FrictionShape(**({} if velocity_scale is None else {"velocity_scale": velocity_scale}))
     fitted = fit_friction(
         case.robot.tree, every(case.sets.train, thin), case.laws, shape=start, held=held, noise=case.noise
     )

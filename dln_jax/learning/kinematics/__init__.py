@@ -7,5 +7,18 @@ make_serial_tree(needs).energies(fit.parameters)
 from dln_jax.learning.kinematics.fit import TreeFit, fit_tree
 from dln_jax.learning.kinematics.frames import Frames, mirrored, random_frames, rough_frames, turned_round
 from dln_jax.learning.kinematics.search import Search
+from dln_jax.learning.kinematics.sketch import Sketch, frames_of_axes, sketch_from_json
 
-__all__ = ["Frames", "Search", "TreeFit", "fit_tree", "mirrored", "random_frames", "rough_frames", "turned_round"]
+__all__ = [
+    "Frames",
+    "Search",
+    "Sketch",
+    "TreeFit",
+    "fit_tree",
+    "frames_of_axes",
+    "mirrored",
+    "random_frames",
+    "rough_frames",
+    "sketch_from_json",
+    "turned_round",
+]

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import drawn
 from dln_jax.learning.kinematics.descent import Program, State, compiled, descend
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.learning.kinematics.projection import Samples, Structure, design, inertias_of
@@ -113,8 +114,8 @@ def fit_tree(
         solved = [_solved(columns, state, unit, train, rank_tolerance) for state, unit in refined]
         pairs = [(state.frames, solution.x) for (state, _), solution in zip(refined, solved, strict=True)]
         errors = [_joint_errors(columns, *pair, train) for pair in pairs]
-        judged = [_joint_errors(columns, *pair, validation or train).sum() for pair in pairs]
-        best = int(np.argmin(judged))
+        judged = [_joint_errors(columns, *pair, validation or train) for pair in pairs]
+        best = int(np.argmin([np.sum(each / scale**2) for each in judged]))
         (frames, linear), solution = pairs[best], solved[best]
         parameters = _parameters(structure, frames, linear)
     return TreeFit(
@@ -122,7 +123,7 @@ def fit_tree(
         frames=jax.tree.map(np.asarray, frames),
         torque_mse=float(errors[best].sum()),
         joint_mse=errors[best],
-        validation_error=float("nan") if validation is None else float(judged[best]),
+        validation_error=float("nan") if validation is None else float(judged[best].sum()),
         parameter_count=len(refined[best][0].at.slope) + structure.linear_count,
         rank=solution.rank,
         condition=solution.condition,
@@ -134,10 +135,8 @@ def fit_tree(
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:
     """All samples, or so many that are drawn."""
-    rows = np.arange(len(data.tau))
-    if len(rows) > most:
-        rows = np.sort(np.random.default_rng([seed, len(rows)]).choice(rows, most, replace=False))
-    return Samples(data.q[rows], data.qd[rows], data.qdd[rows], data.tau[rows])
+    some = drawn(data, most, seed)
+    return Samples(some.q, some.qd, some.qdd, some.tau)
 
 
 def _finalists(found: list[State], validation: Trajectories | None) -> list[State]:

@@ -1,0 +1,80 @@
+"""The ladder chooses the first rung that no other betters on validation motions, with every joint counted alike."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import select
+from dln_jax.learning.ladder import Fitted, Rung, climb
+from dln_jax.mechanics.natural import NaturalSystem
+from dln_jax.models.model import Model
+from dln_jax.types import InputError
+
+RANDOM = np.random.default_rng(0)
+N = 120
+ARRAYS = {key: RANDOM.normal(size=(2 * N, 2)) for key in ("q", "qd", "qdd")}
+UNIT = np.array([1.0, 1e-3])
+"""Masses of a large joint and a small one: forces are masses times accelerations."""
+NOISE = 0.1 * UNIT
+TAU = UNIT * ARRAYS["qdd"] + NOISE * RANDOM.normal(size=(2 * N, 2))
+TIMES = {"t": np.tile(0.1 * np.arange(N), 2), "trajectory": np.repeat([0, 1], N)}
+TRAIN, VALIDATION = (select(from_arrays({**ARRAYS, **TIMES, "tau": TAU}), [index]) for index in range(2))
+MASSES = Model(lambda key: jnp.ones(2), lambda masses: NaturalSystem(lambda q: jnp.diag(jnp.sqrt(masses))))
+
+
+def rung(name, *shares):
+    """Masses that are wrong by these factors."""
+    return Rung(name, lambda left: Fitted(MASSES, jnp.asarray(UNIT * shares)))
+
+
+def names(found, **wanted):
+    return [step.name for step in found.steps if all(getattr(step, key) == value for key, value in wanted.items())]
+
+
+def refuse(left):
+    raise InputError("too large a basis")
+
+
+def test_a_small_joint_counts_as_much_as_a_large_one():
+    found = climb([rung("large joint", 1.0, 3.0), rung("both, nearly", 1.1, 1.1)], TRAIN, VALIDATION)
+    assert found.chosen.name == "both, nearly"
+    share = (NOISE**2 + (0.1 * UNIT) ** 2 * ARRAYS["qdd"][N:].var(axis=0)) / TAU[:N].var(axis=0)
+    assert found.chosen.nmse is not None
+    np.testing.assert_allclose(found.chosen.nmse, share, rtol=0.4)
+
+
+def test_of_equals_the_first_is_chosen_and_what_cannot_be_built_says_why():
+    rungs = [Rung("refused", refuse), Rung("absent", lambda left: "no arm"), rung("true", 1, 1), rung("same", 1.001, 1)]
+    told = []
+    found = climb(rungs, TRAIN, VALIDATION, report=told.append)
+    assert found.chosen.name == "true" and found.ended == "" and list(found.steps) == told
+    assert [step.reason for step in found.steps] == ["too large a basis", "no arm", "", ""]
+
+
+def test_the_climb_ends_at_the_noise_and_not_where_that_is_overestimated():
+    rungs = [rung("wrong", 2, 2), rung("true", 1, 1), rung("further", 1, 1)]
+    found = climb(rungs, TRAIN, VALIDATION, noise=NOISE)
+    assert "true" in found.ended and names(found, tried=False) == ["further"]
+    assert not climb(rungs, TRAIN, VALIDATION, noise=3 * NOISE).ended
+    exact = VALIDATION._replace(tau=UNIT * VALIDATION.qdd)
+    assert climb(rungs, TRAIN, exact).ended == "true is exact"
+
+
+def test_out_of_time_the_first_that_can_be_fitted_is_kept():
+    found = climb([Rung("refused", refuse), rung("first", 1, 1), rung("second", 1, 1)], TRAIN, VALIDATION, seconds=1e-9)
+    assert found.chosen.name == "first" and found.ended == "time is out"
+    assert found.steps[-1].reason == "time is out" and not found.steps[-1].tried
+
+
+@pytest.mark.parametrize(
+    ("rungs", "seconds", "message"),
+    [
+        ([Rung("refused", refuse)], 1.0, "no model could be fitted: refused: too large a basis"),
+        ([rung("infinite", np.inf, 1)], 1.0, "not finite on validation motions"),
+        ([rung("true", 1, 1)], 0.0, "seconds is 0.0"),
+    ],
+)
+def test_what_cannot_be_climbed_is_refused(rungs, seconds, message):
+    with pytest.raises(InputError, match=message):
+        climb(rungs, TRAIN, VALIDATION, seconds=seconds)
