@@ -1,11 +1,11 @@
 """Train a model of dynamics on trajectories (q, qd, qdd, tau), and report its errors, its rollouts and its speed.
 
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
-trigonometric (linear in its parameters, one least-squares problem), learned-tree (an arm's bodies and joint frames,
-found from random starts) and feed-forward (no physics). Without --data it trains on the embedded set: the tip of a
-two-link arm writes 20 letters, of which e, q and v are the test. A run folder gets config.json, metrics.json,
-model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume from, and figures. For
-Hamiltonian networks see train_hnn.
+trigonometric (linear in its parameters, one least-squares problem), trigonometric-kernel (the same energies of six or
+seven joints, as a Gaussian process), learned-tree (an arm's bodies and joint frames, found from random starts) and
+feed-forward (no physics). Without --data it trains on the embedded set: the tip of a two-link arm writes 20 letters, of
+which e, q and v are the test. A run folder gets config.json, metrics.json, model.safetensors and model.json (load them
+with dln_jax.load), a checkpoint to --resume from, and figures. For Hamiltonian networks see train_hnn.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from dln_jax.runs.dynamics_task import Options
 class Arguments(Options):
     """What to train on, how, and where the results go."""
 
-    model: Literal["structured-delan", "black-box-delan", "trigonometric", "learned-tree", "feed-forward"] = (
-        "structured-delan"
-    )
+    model: Literal[
+        "structured-delan", "black-box-delan", "trigonometric", "trigonometric-kernel", "learned-tree", "feed-forward"
+    ] = "structured-delan"
     """What is learned."""
 
 

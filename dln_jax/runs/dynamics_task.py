@@ -27,6 +27,8 @@ from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
 
 OF_NETWORKS = ("width", "depth", "activation")
+SAMPLES = 600
+"""Of a kernel, by default."""
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
@@ -47,7 +49,7 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     (default: what the scene or the file states, else revolute joints with gravity)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
-    gauss-newton while its equations are small. The trigonometric model and the learned tree need none."""
+    gauss-newton while its equations are small. The trigonometric models and the learned tree need none."""
     width: Unstated[int] = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam)."""
     depth: Unstated[int] = None
@@ -56,6 +58,8 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     """Of the hidden layers (default: tanh)."""
     degree: Unstated[int] = None
     """trigonometric: degree of the polynomials in every joint (default: for each joint what validation asks for)."""
+    samples: Unstated[int] = None
+    """trigonometric-kernel: samples of the training data that it is made of, at most (default: 600)."""
     steps: Unstated[int] = None
     """Iterations of gauss-newton (default: 150), or steps of adam (default: 20000)."""
     batch: Unstated[int] = None
@@ -164,6 +168,12 @@ def check_options(given: Options, kind: str) -> None:
     require_positive(seeds=given.seeds)
     require_seed(given.seed, given.seeds)
     properties = CATALOGUE[kind].properties
+    if properties.kernel:
+        others = ("degree", "seconds")
+        check_direct_options(given, others, "the trigonometric kernel", "is one linear problem after a few on less")
+        require_positive(**resolved(given, {"samples": SAMPLES}))
+        return
+    refuse_given(given, ["samples"], "for the trigonometric kernel")
     if properties.searched:
         check_direct_options(given, ("degree",), "the learned tree", "has a search of its own")
         return
@@ -207,6 +217,9 @@ def model_and_optimiser(
     precision = given.precision or ("f32" if adam else "f64")
     if properties.searched:
         return describe_for(kind, sets.train, needs, precision=precision), None, ""
+    if properties.kernel:
+        sizes = resolved(given, {"samples": SAMPLES})
+        return describe_for(kind, sets.train, needs, precision=precision, **sizes), None, ""
     if properties.linear:
         degree = 1 if given.degree is None else given.degree
         return describe_for(kind, sets.train, needs, precision=precision, degree=degree), None, ""

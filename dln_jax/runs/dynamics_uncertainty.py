@@ -26,10 +26,15 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
     if task.objective is not TORQUE:
         print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
         return
-    linear = CATALOGUE[task.kind].properties.linear
+    properties = CATALOGUE[task.kind].properties
+    if properties.kernel:
+        print(f"a {task.kind} has as many parameters as data: the run does not say what it does not know")
+        return
     model = build({**task.description, "precision": "f64"})
     try:
-        found = estimate(model, parameters, task.sets.train, task.sets.validation, ridge=0.0 if linear else None)
+        found = estimate(
+            model, parameters, task.sets.train, task.sets.validation, ridge=0.0 if properties.linear else None
+        )
     except (InputError, np.linalg.LinAlgError) as error:
         # The model is trained: what its data cannot tell is left out, not refused.
         print(f"the run does not say what it does not know: {error}")
