@@ -21,7 +21,7 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
-from dln_jax.mechanics.friction import FrictionShape, coefficients_of, joint_rates, unit_force
+from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
 from dln_jax.models.torque_covariance import States, torque_covariance
 from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales
@@ -143,8 +143,8 @@ def choose_kernel(
 ) -> tuple[Trial, list[Trial]]:
     """A chain of bodies, or none assumed: the lower error at the validation samples, and both.
 
-    Of a `Trial` the candidate is `serial`, the outcome the `KernelFit`, and the errors are those of the torque, squared,
-    each joint's in units of its deviation.
+    Of a `Trial` the candidate is `serial`, the outcome the `KernelFit`, and the errors are squares of torques, each
+    joint's in units of its deviation.
 
     Raises:
         InputError: as `fit_kernel`.
@@ -165,11 +165,11 @@ def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "
     d = needs.degrees_of_freedom
     if "load" in needs.joint_friction:
         raise InputError("friction by load multiplies what the energies give; leave load out, or train a network")
-    rates = np.asarray(joint_rates(needs.joint_map, jnp.asarray(qd)))
     lever = np.eye(d) if needs.joint_map is None else np.asarray(needs.joint_map).T
     shape = FrictionShape(velocity_scale=needs.velocity_scale)
-    units = [np.asarray(unit_force(name, jnp.asarray(rates), shape)) for name in coefficients_of(needs.joint_friction)]
-    columns = [lever * each[:, None, :] for each in units]
+    names, rates = coefficients_of(needs.joint_friction), jnp.asarray(qd @ lever)
+    units = [jax.vmap(lambda u, name=name: unit_force(name, u, shape))(rates) for name in names]
+    columns = [lever * np.asarray(each)[:, None, :] for each in units]
     if needs.friction:
         columns.insert(0, np.eye(d) * qd[:, None, :])
     return np.concatenate([np.zeros((len(qd), d, 0)), *columns], axis=2)

@@ -15,6 +15,7 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "seven-joints": learned_kinematics.seven_joints,
         "fewer-joints": learned_kinematics.fewer_joints,
         "fewer-samples": learned_kinematics.fewer_samples,
+        "kernels": learned_kinematics.kernels,
     },
     "speed": {"seven-axis": speed.speed},
 }

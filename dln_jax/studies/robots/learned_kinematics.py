@@ -1,7 +1,7 @@
 """Arms whose kinematics is not known, on the LIP protocol, as cases of the report."""
 
 from dln_jax.studies.case import Findings
-from dln_jax.studies.robots.lip import rows
+from dln_jax.studies.robots.lip import kernel_rows, rows
 
 SEEDS = range(10)
 """Of the starts."""
@@ -43,3 +43,13 @@ def fewer_samples(quick: bool) -> Findings:
             for row in rows("panda-7", friction=friction, every=SAMPLES[samples], seeds=SEEDS[:3])
         ]
     )
+
+
+def kernels(quick: bool) -> Findings:
+    """Energies in kernel form, of the Panda's first three to seven joints, and of all from fewer samples."""
+    if quick:
+        return Findings(kernel_rows("panda-3", friction=False, every=SAMPLES[50], tests=(101,)))
+    arms = [(f"panda-{d}", SAMPLES[500]) for d in range(3, 8)] + [("panda-7", SAMPLES[150]), ("panda-7", SAMPLES[50])]
+    by_case = [kernel_rows(name, friction=friction, every=every) for name, every in arms for friction in (False, True)]
+    any_order = [kernel_rows("panda-7", friction=friction, serial=False) for friction in (False, True)]
+    return Findings([row for rows in (*by_case, *any_order) for row in rows])
