@@ -2,7 +2,7 @@
 
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
-with O the Euler-Lagrange operator, K the `torque_covariance` of the samples, Phi the friction of coefficients c, whose
+with O the Euler-Lagrange operator, K the `own_covariance` of the samples, Phi the friction of coefficients c, whose
 prior is normal with deviations S, and a noise for each joint: the regulariser, of which nothing is hidden. Scales and
 noises maximise the marginal likelihood of the torques of some samples (L-BFGS; its gradient is exact), weights are the
 solution of N d equations (Cholesky).
@@ -23,7 +23,7 @@ from dln_jax.learning.growth import Trial
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
-from dln_jax.models.torque_covariance import States, torque_covariance
+from dln_jax.models.torque_covariance import States, own_covariance
 from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -98,7 +98,7 @@ def fit_kernel(
 
     Raises:
         InputError: torques that do not vary, joints that are not the data's, friction by load, or a setting that is not
-            positive.
+            positive, or a least noise that is lost in rounding.
     """
     from scipy.linalg import cho_factor, cho_solve
 
@@ -118,10 +118,16 @@ def fit_kernel(
         some = _equations(train, columns * deviations, min(samples, likelihood_samples))
         unknowns = _likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)
         scales, noise = jax.tree.map(np.exp, unknowns)
-        covariance = np.array(_compiled(needs.joints, serial)(scales, every.states, every.states))
+        covariance = np.array(_compiled(needs.joints, serial)(scales, every.states))
         covariance += every.friction @ every.friction.T
         covariance[np.diag_indices_from(covariance)] += np.tile(noise**2, len(every.tau))
-        factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+        try:
+            factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                f"the covariance of {len(covariance):,} torques is not positive definite to rounding: least_noise is "
+                f"{least_noise}; take a larger one, or fewer samples"
+            ) from error
         weights = cho_solve(factor, every.tau.ravel())
     found = deviations * (every.friction.T @ weights)
     diagonal = np.log(np.diagonal(factor[0])).sum() + 0.5 * weights.size * np.log(2 * np.pi)
@@ -183,7 +189,7 @@ def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: i
 
 def _compiled(joints: tuple, serial: bool) -> Callable[..., Any]:
     return jax.jit(
-        lambda scales, states, others: torque_covariance(joints, serial, scales, states, others),
+        lambda scales, states: own_covariance(joints, serial, scales, states),
         compiler_options=quick_compilation(),
     )
 
@@ -228,7 +234,7 @@ def _likelihood(joints: tuple, serial: bool) -> Callable[[_Unknowns, _Equations]
         count = tau.size
 
         def covariance(scales: KernelScales) -> Any:
-            return torque_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states, states)
+            return own_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
 
         variance = jnp.exp(2 * unknowns.noise)
         noise = jnp.tile(variance, len(tau))
@@ -263,7 +269,7 @@ def _start(needs: Needs, serial: bool, equations: _Equations, unit: np.ndarray) 
 
     def size(scales: KernelScales) -> float:
         """Mean variance of torques in units of those that were measured."""
-        variance = np.diagonal(_compiled(needs.joints, serial)(scales, few, few)).reshape(-1, d)
+        variance = np.diagonal(_compiled(needs.joints, serial)(scales, few)).reshape(-1, d)
         return float(np.mean(variance / unit**2))
 
     without = scales._replace(weight=none if needs.gravity else None)

@@ -9,6 +9,7 @@ One pass along the joints gives all of them, since each of P, Q, v and dv/dt of 
 before.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +26,7 @@ PAIRS = 500
 
 
 class States(NamedTuple):
-    """[N, d] each."""
+    """[N, d] each; or with axes of pairs after the joints'."""
 
     q: Any
     qd: Any
@@ -48,27 +49,66 @@ class Products(NamedTuple):
 def torque_covariance(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States, others: States
 ) -> Float[Array, "Nd Md"]:
-    """cov(tau(state), tau(other)) of N and M states, the joints of a state next to each other; (N m)².
+    """cov(tau(state), tau(other)) of N and M states, the joints of a state next to each other; (N m)²."""
+    N, d = np.shape(states.q)
+    states, others = _on_device(states), _on_device(others)
+    columns = _joints_first(States(*(each[None] for each in others)))
 
-    Derivatives by the scales compute again what blocks of rows went through, which is more than fits into caches.
+    def block(rows: Array) -> Array:
+        return _block(joints, serial, scales, _joints_first(States(*(each[rows][:, None] for each in states))), columns)
+
+    return _by_rows(block, N, len(others.q)).transpose(0, 2, 1, 3).reshape(N * d, -1)
+
+
+def own_covariance(
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States
+) -> Float[Array, "Nd Nd"]:
+    """The `torque_covariance` of states among each other, at half the work.
+
+    Each state is paired with the N/2 that follow it, the first ones after the last; other pairs are these, exchanged.
     """
     N, d = np.shape(states.q)
-    rows = max(1, min(N, PAIRS // len(others.q)))
-    count = -(-N // rows)
-    filled = [jnp.concatenate([each, each[:1].repeat(count * rows - N, axis=0)]) for each in map(jnp.asarray, states)]
-    blocks = States(*(each.reshape(count, rows, d) for each in filled))
-    block = jax.checkpoint(lambda some: _block(joints, serial, scales, some, others))
-    return lax.map(block, blocks).reshape(count * rows * d, -1)[: N * d]
+    states = _on_device(states)
+    following = (np.arange(N)[:, None] + np.arange(N // 2 + 1)) % N
+
+    def block(rows: Array) -> Array:
+        x, y = (States(*(each[at] for each in states)) for at in (rows[:, None], jnp.asarray(following)[rows]))
+        return _block(joints, serial, scales, _joints_first(x), _joints_first(y))
+
+    pairs = _by_rows(block, N, N // 2 + 1)
+    row, column = np.indices((N, N))
+    ahead = (column - row) % N
+    follows = ahead <= N // 2
+    found = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
+    found = jnp.where(follows[..., None, None], found, found.swapaxes(2, 3))
+    return found.transpose(0, 2, 1, 3).reshape(N * d, N * d)
+
+
+def _on_device(states: States) -> States:
+    return States(*map(jnp.asarray, states))
+
+
+def _joints_first(states: States) -> States:
+    return States(*(jnp.moveaxis(each, 2, 0) for each in states))
+
+
+def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array, "N K d d"]:
+    """Pairs of N states with `width` others each, from a function of the indices of some rows.
+
+    Derivatives compute again what blocks of rows went through, which is more than fits into caches.
+    """
+    rows = max(1, min(N, PAIRS // width))
+    places = np.arange(-(-N // rows) * rows) % N
+    found = lax.map(jax.checkpoint(block), jnp.asarray(places.reshape(-1, rows)))
+    return found.transpose(0, 3, 4, 1, 2).reshape(len(places), width, *found.shape[1:3])[:N]
 
 
 def _block(
-    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States, others: States
-) -> Float[Array, "R d M d"]:
-    """Pairs are the last axes, so that loops over them are long."""
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
+) -> Float[Array, "d d R K"]:
+    """Of states x [d, R, 1] with y [d, 1, K] or [d, R, K]; pairs are the last axes, so that loops are long."""
     d = len(joints)
-    x = States(*(jnp.asarray(each).T[:, :, None] for each in states))
-    y = States(*(jnp.asarray(each).T[:, None, :] for each in others))
-    pairs = jnp.zeros((len(states.q), len(others.q)), x.q.dtype)
+    pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
     turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)
     has_potential = scales.weight is not None and scales.lifts is not None
     lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
@@ -108,7 +148,7 @@ def _block(
     weight = of_body(scales.weight) if has_potential else None
     links = (joint_axes, scales.rates, turns, of_body(scales.inertia), lifts, weight)
     (_, _, total), _ = lax.scan(jax.checkpoint(link), (products, heights, nothing[:d, :d]), links)
-    return total.transpose(2, 0, 3, 1)
+    return total
 
 
 def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Array, x: Array, y: Array) -> Any:

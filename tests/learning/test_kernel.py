@@ -32,7 +32,7 @@ def arm():
 
 def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
     train, test = arm
-    fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-7)
+    fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-5)
     make = CATALOGUE["trigonometric-kernel"].factory
     kernel = make(train.needs, samples=fit.samples).energies(fit.parameters)
     fewer = CATALOGUE["trigonometric"].factory(train.needs, degree=1)

@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.models.torque_covariance import States, torque_covariance
+from dln_jax.models.torque_covariance import States, own_covariance, torque_covariance
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.types import Needs
 
@@ -57,7 +57,7 @@ def test_covariance_is_that_of_explicit_features_and_of_the_energies(joints, ser
     size = features(joints, serial, parameters.scales, *jnp.ones((2, len(joints)))).size
     columns = jax.jit(jax.vmap(jax.jacrev(torque), (None, 0, 0, 0)))(jnp.zeros(size), *map(jnp.asarray, states))
     columns = columns.reshape(-1, size)
-    covariance = torque_covariance(joints, serial, parameters.scales, states, states)
+    covariance = own_covariance(joints, serial, parameters.scales, states)
     np.testing.assert_allclose(covariance, columns @ columns.T, rtol=0, atol=1e-12 * abs(covariance).max())
 
     others = States(parameters.q, parameters.qd, parameters.qdd)
