@@ -9,7 +9,6 @@ solution of N d equations (Cholesky).
 """
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,23 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.growth import Trial
+from dln_jax.learning.marginal_likelihood import Equations, compiled_covariance, likeliest
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.mechanics.friction import FrictionShape, coefficients_of, unit_force
 from dln_jax.models.joint_friction import FrictionParameters
-from dln_jax.models.torque_covariance import States, own_covariance
+from dln_jax.models.torque_covariance import States
 from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
-
-FIRST_NOISE = 0.05
-"""Of the torques' deviation, from which the search starts."""
-FEW = 16
-"""States whose torques' variance sets the scales to start from."""
-_REFUSED = 1e10
-"""Likelihood of scales whose covariance rounding leaves indefinite."""
 
 
 class KernelFit(NamedTuple):
@@ -55,29 +47,13 @@ class KernelFit(NamedTuple):
     """Of the whole call, compilation included."""
 
 
-class _Equations(NamedTuple):
-    states: States
-    friction: Any
-    """Phi S [N d, P]."""
-    tau: Any
-    """[N, d]."""
-
-
-class _Unknowns(NamedTuple):
-    """Logarithms."""
-
-    scales: KernelScales
-    noise: Any
-    """[d]."""
-
-
 def fit_kernel(
     needs: Needs,
     train: Trajectories,
     *,
     samples: int = 600,
     serial: bool = True,
-    likelihood_samples: int = 80,
+    likelihood_samples: int = 60,
     iterations: int = 60,
     least_noise: float = 1e-4,
     friction_scale: float = 1.0,
@@ -116,9 +92,9 @@ def fit_kernel(
         deviations = friction_scale / np.where(sizes > 0, sizes, 1.0)
         every = _equations(train, columns * deviations, samples)
         some = _equations(train, columns * deviations, min(samples, likelihood_samples))
-        unknowns = _likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)
+        unknowns = likeliest(needs, serial, some, unit, iterations=iterations, least_noise=least_noise)
         scales, noise = jax.tree.map(np.exp, unknowns)
-        covariance = np.array(_compiled(needs.joints, serial)(scales, every.states))
+        covariance = np.array(compiled_covariance(needs.joints, serial)(scales, every.states))
         covariance += every.friction @ every.friction.T
         covariance[np.diag_indices_from(covariance)] += np.tile(noise**2, len(every.tau))
         try:
@@ -181,102 +157,10 @@ def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "
     return np.concatenate([np.zeros((len(qd), d, 0)), *columns], axis=2)
 
 
-def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: int) -> _Equations:
+def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: int) -> Equations:
     rows = np.unique(np.round(np.linspace(0, len(data.tau) - 1, min(most, len(data.tau)))).astype(int))
     states = States(*(np.asarray(each[rows], float) for each in (data.q, data.qd, data.qdd)))
-    return _Equations(states, friction[rows].reshape(data.tau[rows].size, -1), np.asarray(data.tau[rows], float))
-
-
-def _compiled(joints: tuple, serial: bool) -> Callable[..., Any]:
-    return jax.jit(
-        lambda scales, states: own_covariance(joints, serial, scales, states),
-        compiler_options=quick_compilation(),
-    )
-
-
-def _likeliest(
-    needs: Needs, serial: bool, equations: _Equations, unit: np.ndarray, *, iterations: int, least_noise: float
-) -> _Unknowns:
-    """Scales and noise that maximise the marginal likelihood."""
-    from scipy.optimize import minimize
-
-    start = _Unknowns(_start(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
-    leaves, structure = jax.tree.flatten(start)
-    ends = np.cumsum([leaf.size for leaf in leaves])
-
-    def unknowns_of(x: np.ndarray) -> _Unknowns:
-        parts = [each.reshape(leaf.shape) for each, leaf in zip(np.split(x, ends[:-1]), leaves, strict=True)]
-        return jax.tree.unflatten(structure, parts)
-
-    evaluate = jax.jit(_likelihood(needs.joints, serial), compiler_options=quick_compilation())
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slopes = evaluate(unknowns_of(x), equations)
-        slope = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(slopes)])
-        if not (np.isfinite(value) and np.isfinite(slope).all()):
-            return _REFUSED, np.zeros_like(x)
-        return float(value), slope
-
-    lowest = [(None, None)] * (ends[-1] - unit.size) + [(each, None) for each in np.log(least_noise * unit)]
-    first = np.concatenate([leaf.ravel() for leaf in leaves])
-    options = {"maxiter": iterations, "maxcor": 30}
-    return unknowns_of(minimize(objective, first, jac=True, method="L-BFGS-B", bounds=lowest, options=options).x)
-
-
-def _likelihood(joints: tuple, serial: bool) -> Callable[[_Unknowns, _Equations], Any]:
-    """(unknowns, equations) -> minus its logarithm by the torque without the constant, and the slope.
-
-    The slope is sum(W dK), W = (K⁻¹ - weights weightsᵀ) / 2: no derivative of a factorisation is taken.
-    """
-
-    def evaluate(unknowns: _Unknowns, equations: _Equations) -> Any:
-        states, friction, tau = equations
-        count = tau.size
-
-        def covariance(scales: KernelScales) -> Any:
-            return own_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
-
-        variance = jnp.exp(2 * unknowns.noise)
-        noise = jnp.tile(variance, len(tau))
-        lower = jnp.linalg.cholesky(covariance(unknowns.scales) + friction @ friction.T + jnp.diag(noise))
-        inverse = jax.scipy.linalg.cho_solve((lower, True), jnp.eye(count, dtype=lower.dtype))
-        weights = inverse @ tau.ravel()
-        value = 0.5 * tau.ravel() @ weights + jnp.sum(jnp.log(jnp.diagonal(lower)))
-        W = 0.5 * (inverse - jnp.outer(weights, weights))
-        scales = jax.grad(lambda scales: jnp.vdot(W, covariance(scales)))(unknowns.scales)
-        by_joint = 2 * variance * jnp.sum(jnp.diagonal(W).reshape(tau.shape), axis=0)
-        return value / count, jax.tree.map(lambda each: each / count, _Unknowns(scales, by_joint))
-
-    return evaluate
-
-
-def _start(needs: Needs, serial: bool, equations: _Equations, unit: np.ndarray) -> KernelScales:
-    """Logarithms of scales at which each energy explains torques of the size that they have, with random frames.
-
-    A vector in a randomly turned frame keeps a third of its square where it is parallel to the joint's axis.
-    """
-    d = needs.degrees_of_freedom
-    bodies = d if serial else 1
-    q, _, qdd = (np.sqrt(np.mean(each**2, axis=0)) for each in equations.states)
-    slides = np.array([joint == "prismatic" for joint in needs.joints])
-    rotated = np.tile([1 / 3, 2 / 3], (d, 1))
-    slid = np.stack([np.full(d, 2 / 3), 1 / (3 * np.where(q > 0, q, 1.0) ** 2)], axis=1)
-    pairs = np.where(slides[:, None], slid, rotated)
-    rates = unit / np.where(qdd > 0, qdd, 1.0)
-    ones, none = np.ones(bodies), np.zeros(bodies)
-    scales = KernelScales(rates / rates.mean(), ones, pairs, *((ones, pairs) if needs.gravity else (None, None)))
-    few = States(*(each[:: max(1, len(each) // FEW)] for each in equations.states))
-
-    def size(scales: KernelScales) -> float:
-        """Mean variance of torques in units of those that were measured."""
-        variance = np.diagonal(_compiled(needs.joints, serial)(scales, few)).reshape(-1, d)
-        return float(np.mean(variance / unit**2))
-
-    without = scales._replace(weight=none if needs.gravity else None)
-    scales = scales._replace(inertia=ones * 0.5 / size(without))
-    if needs.gravity:
-        scales = scales._replace(weight=ones / size(scales._replace(inertia=none)))
-    return jax.tree.map(np.log, scales)
+    return Equations(states, friction[rows].reshape(data.tau[rows].size, -1), np.asarray(data.tau[rows], float))
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:

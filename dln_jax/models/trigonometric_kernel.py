@@ -27,13 +27,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics import lagrangian
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
+
+CHUNK = 128
+"""Samples that are worked on at a time."""
 
 
 class KernelScales(NamedTuple):
@@ -147,14 +150,20 @@ def _closed_form(parameters: KernelParameters, joints: tuple[JointKind, ...], se
     scales, friction = parameters.scales, parameters.friction
 
     def kinetic(q: Vector, qd: Vector) -> Scalar:
-        bodies = _shared(parameters, joints, serial, q, qd)
-        each = [jnp.sum(s.momentum * s.acceleration + s.velocity * s.force) for s in bodies]
-        return 2 * jnp.stack(each) @ scales.inertia
+        def of(some: KernelParameters) -> Scalar:
+            bodies = _shared(some, joints, serial, q, qd)
+            each = [jnp.sum(s.momentum * s.acceleration + s.velocity * s.force) for s in bodies]
+            return 2 * jnp.stack(each) @ scales.inertia
+
+        return _summed(of, parameters)
 
     def mass_matrix(q: Vector) -> Array:
-        bodies = jax.vmap(lambda qd: _shared(parameters, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
-        half = [s.momentum @ s.acceleration.T + s.velocity @ s.force.T for s in bodies]
-        M = jnp.einsum("kij,k->ij", jnp.stack(half), scales.inertia)
+        def half(some: KernelParameters) -> Array:
+            bodies = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
+            each = [s.momentum @ s.acceleration.T + s.velocity @ s.force.T for s in bodies]
+            return jnp.einsum("kij,k->ij", jnp.stack(each), scales.inertia)
+
+        M = _summed(half, parameters)
         return 2 * (M + M.T)
 
     potential = _potential(parameters, joints, serial)
@@ -205,14 +214,35 @@ def _potential(
     if weight is None or lifts is None:
         return None
 
-    def potential(q: Vector) -> Scalar:
-        height, force = jnp.ones_like(parameters.q[:, 0]), jnp.zeros_like(parameters.q[:, 0])
+    def of(some: KernelParameters, q: Vector) -> Scalar:
+        height, force = jnp.ones_like(some.q[:, 0]), jnp.zeros_like(some.q[:, 0])
         bodies = []
         for joint, kind in enumerate(joints):
-            h = lift_factor(kind, lifts[joint], q[joint], parameters.q[:, joint])
-            force = h.value * force + h.by_y * parameters.weights[:, joint] * height
+            h = lift_factor(kind, lifts[joint], q[joint], some.q[:, joint])
+            force = h.value * force + h.by_y * some.weights[:, joint] * height
             height = h.value * height
             bodies.append(jnp.sum(force))
         return jnp.stack(bodies if serial else bodies[-1:]) @ weight
 
-    return potential
+    return lambda q: _summed(lambda some: of(some, q), parameters)
+
+
+def _summed(function: Callable[[KernelParameters], Array], parameters: KernelParameters) -> Array:
+    """A sum over samples, of so many at a time that a batch of states fits into memory with its derivatives."""
+    samples = (parameters.q, parameters.qd, parameters.qdd, parameters.weights)
+    n, d = parameters.q.shape
+    if n <= CHUNK:
+        return function(parameters)
+    # What fills up the last chunk has no weight.
+    pieces = [jnp.pad(each, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for each in samples]
+
+    def of(q: Array, qd: Array, qdd: Array, weights: Array) -> Array:
+        return function(parameters._replace(q=q, qd=qd, qdd=qdd, weights=weights))
+
+    @jax.checkpoint
+    def add(total: Array, piece: list[Array]) -> tuple[Array, None]:
+        return total + of(*piece), None
+
+    like = jax.eval_shape(of, *(each[0] for each in pieces))
+    total, _ = lax.scan(add, jnp.zeros(like.shape, like.dtype), pieces)
+    return total

@@ -170,7 +170,7 @@ def check_options(given: Options, kind: str) -> None:
     properties = CATALOGUE[kind].properties
     if properties.kernel:
         others = ("degree", "seconds")
-        check_direct_options(given, others, "the trigonometric kernel", "is one linear problem after a few on less")
+        check_direct_options(given, others, "the trigonometric kernel", "is one linear problem")
         require_positive(**resolved(given, {"samples": SAMPLES}))
         return
     refuse_given(given, ["samples"], "for the trigonometric kernel")

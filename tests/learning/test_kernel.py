@@ -7,9 +7,11 @@ import pytest
 
 from dln_jax.data.splits import select
 from dln_jax.datasets.generators import uniform
-from dln_jax.learning.kernel import _equations, _likelihood, _start, _Unknowns, fit_kernel
+from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.marginal_likelihood import Equations, Unknowns, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.torque_covariance import States
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
@@ -57,11 +59,11 @@ def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
 def test_slope_of_the_likelihood_is_that_of_its_differences():
     scene = pendulum(friction=0.2)
     data = uniform(scene, samples=20, rate_bound=3.0, acceleration_bound=5.0)
-    equations = _equations(data, np.zeros((20, 1, 0)), 20)
+    equations = Equations(States(data.q, data.qd, data.qdd), np.zeros((20, 0)), data.tau)
     unit = data.tau.std(axis=0)
-    start = _Unknowns(_start(scene.needs, False, equations, unit), np.log(0.1 * unit))
+    start = Unknowns(start_of(scene.needs, False, equations, unit), np.log(0.1 * unit))
     leaves, structure = jax.tree.flatten(start)
-    evaluate = jax.jit(_likelihood(scene.needs.joints, False))
+    evaluate = jax.jit(likelihood(scene.needs.joints, False))
     _, slopes = evaluate(start, equations)
     for place, slope in enumerate(jax.tree.leaves(slopes)):
         step = 1e-5 * np.ones_like(leaves[place])

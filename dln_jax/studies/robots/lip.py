@@ -44,6 +44,10 @@ PUBLISHED = {"panda-6": 0.03, "panda-7": 0.1}
 FRICTION: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
 
 
+STATES = 5_001
+"""Whose torques are computed at a time: those of a motion."""
+
+
 class Outcome(NamedTuple):
     """Of one fit."""
 
@@ -117,7 +121,10 @@ def unseen_errors(
 
 def _torques(system: RecursiveSystem | ClosedForm, data: Trajectories) -> Float[np.ndarray, "N d"]:
     inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
-    return np.asarray(inverse(data.q, data.qd, data.qdd))
+    states = (data.q, data.qd, data.qdd)
+    # A kernel takes memory for each state.
+    pieces = [slice(first, first + STATES) for first in range(0, len(data.q), STATES)]
+    return np.concatenate([inverse(*(each[piece] for each in states)) for piece in pieces])
 
 
 def kernel_rows(
