@@ -2,8 +2,8 @@
 
     -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   cov = K + Phi S² Phiᵀ + diag(noise²)
 
-as `learning.kernel` has it. Its slope is sum(W dK), W = (cov⁻¹ - weights weightsᵀ) / 2, so that no factorisation is
-differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning", equation 5.9). L-BFGS descends it.
+as `learning.kernel` has it. L-BFGS descends it. The slope is sum(W dK), W = (cov⁻¹ - weights weightsᵀ) / 2, so that no
+factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning", equation 5.9).
 """
 
 import functools
