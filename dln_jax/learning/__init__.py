@@ -22,6 +22,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser, sui
 from dln_jax.learning.engine.problem import Problem, Progress, Stop, Training
 from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.growth import grow
+from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
 from dln_jax.learning.rates import match_linear
@@ -41,9 +42,11 @@ __all__ = [
     "Training",
     "accelerations",
     "choose_degrees",
+    "choose_kernel",
     "dynamics",
     "fit",
     "fit_friction",
+    "fit_kernel",
     "fit_linear",
     "frames",
     "functions",

@@ -17,6 +17,7 @@ from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 
 __all__ = [
     "FrictionParameters",
@@ -38,5 +39,6 @@ __all__ = [
     "make_serial_tree",
     "make_structured_hamiltonian",
     "make_trigonometric",
+    "make_trigonometric_kernel",
     "with_joint_friction",
 ]

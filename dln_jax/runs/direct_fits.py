@@ -1,4 +1,4 @@
-"""Models with a fit of their own, without an optimiser: one linear problem, or a search for joint frames."""
+"""Models with a fit of their own, without an optimiser: one linear problem, a kernel, or a search for joint frames."""
 
 import time
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.kernel import choose_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.models.model import Parameters
@@ -20,8 +21,11 @@ from dln_jax.zoo.descriptions import build
 
 def fit_directly(task: Task, given: Options) -> tuple[Task, Training]:
     """The fit of the task's model, and the task with whatever of the model it has chosen."""
-    if CATALOGUE[task.kind].properties.searched:
+    properties = CATALOGUE[task.kind].properties
+    if properties.searched:
         return fit_learned_tree(task, given)
+    if properties.kernel:
+        return fit_trigonometric_kernel(task)
     return fit_trigonometric(task, grown=given.degree is None)
 
 
@@ -61,6 +65,28 @@ def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
     size = f"{fitted.parameter_count} parameters, rank {fitted.rank}, condition {fitted.condition:.3g}"
     print(f"least squares: {size}")
     return task, training_of(task, fitted.parameters, fitted.torque_mse, time.perf_counter() - began)
+
+
+def fit_trigonometric_kernel(task: Task) -> tuple[Task, Training]:
+    """Two kernels, a chain of bodies and none assumed, of which validation chooses."""
+    began = time.perf_counter()
+    most, given = task.description["samples"], len(task.sets.train.tau)
+    chosen, trials = choose_kernel(task.needs, task.sets.train, task.sets.validation, samples=most)
+    fit = chosen.outcome
+    if fit.samples < given:
+        print(f"kernel: {fit.samples} of {given} samples, evenly spaced; --samples takes more")
+    tried = ", ".join(f"{_order(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+    print(f"validation error in units of the torques' variance by order of the bodies: {tried}")
+    noise = ", ".join(f"{each:.2g}" for each in fit.noise)
+    size = f"{fit.parameter_count} equations, log likelihood {fit.likelihood:.2f} by the torque"
+    print(f"kernel: {_order(chosen.candidate)}, {size}, noise of the joints {noise}")
+    description = {**task.description, "samples": fit.samples, "serial": chosen.candidate}
+    task = task._replace(description=description)
+    return task, training_of(task, fit.parameters, fit.torque_mse, time.perf_counter() - began)
+
+
+def _order(serial: bool) -> str:
+    return "a chain" if serial else "any order"
 
 
 def training_of(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:

@@ -11,6 +11,7 @@ from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 
+SAMPLES_OF_KERNEL = 600
 AUTO = "auto"
 """The model that the ladder chooses."""
 OF_NETWORKS = ("width", "depth", "activation")
@@ -35,7 +36,7 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
     gauss-newton while its equations are small and, for structured models of four joints or more, while the data show no
-    more than a small network holds. The trigonometric model and the learned tree need none."""
+    more than a small network holds. The trigonometric models and the learned tree need none."""
     width: Unstated[int] = None
     """Hidden units per layer (default: 8 for structured models, 16 for others; 64 for adam; chosen by the data for
     structured models of four joints or more)."""
@@ -50,7 +51,7 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
     or more 40 and 6000."""
     samples: Unstated[int] = None
     """gauss-newton: training samples that are drawn and fitted (default: all; of an arm of four joints or more, so many
-    that there are 14 equations a parameter)."""
+    that there are 14 equations a parameter). trigonometric-kernel: those that it is made of, at most (default: 600)."""
     batch: Unstated[int] = None
     """adam: samples per step (default: 512)."""
     learning_rate: Unstated[float] = None
@@ -98,14 +99,19 @@ def check_options(given: Options, kind: str) -> None:
     if isinstance(given, ArmOptions):
         check_arm_options(given, kind)
     if kind == AUTO:
-        check_direct_options(given, ("degree", "precision"), "the ladder", "chooses by validation")
+        check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
         return
     properties = CATALOGUE[kind].properties
+    if properties.kernel:
+        others = ("degree", "seconds")
+        check_direct_options(given, others, "the trigonometric kernel", "is one linear problem")
+        require_positive_if_given(given, ["samples"])
+        return
     if properties.searched:
-        check_direct_options(given, ("degree",), "the learned tree", "has a search of its own")
+        check_direct_options(given, ("degree", "samples"), "the learned tree", "has a search of its own")
         return
     if properties.linear:
-        check_direct_options(given, ("seconds",), "the trigonometric model", "is one least-squares problem")
+        check_direct_options(given, ("seconds", "samples"), "the trigonometric model", "is one least-squares problem")
         return
     refuse_given(given, ["degree"], "for the trigonometric model")
     if given.target is not None:
@@ -120,7 +126,7 @@ def check_direct_options(given: Options, others: tuple[str, ...], model: str, wh
     """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
     if given.seeds > 1:
         raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
-    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "samples", "target", *others), f"for networks; {model} {why}")
+    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
     if given.optimizer != "auto":
         raise InputError(f"{model} {why}; leave --optimizer out")
 

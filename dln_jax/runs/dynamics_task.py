@@ -13,7 +13,7 @@ from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, object
 from dln_jax.learning.suited import MANY_JOINTS, suited_network
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.runs.dynamics_data import Recorded
-from dln_jax.runs.dynamics_options import OF_ADAM, Options, check_options
+from dln_jax.runs.dynamics_options import OF_ADAM, SAMPLES_OF_KERNEL, Options, check_options
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -125,6 +125,9 @@ def model_and_optimiser(
         needs = needs_of_tree(needs)
         stated = {"parents": recorded.parents, "velocity_scale": needs.velocity_scale}
         return describe_for(kind, sets.train, needs, precision=given.precision or "f64", **stated), None, None, ""
+    if properties.kernel:
+        sizes = resolved(given, {"samples": SAMPLES_OF_KERNEL})
+        return describe_for(kind, sets.train, needs, precision=given.precision or "f64", **sizes), None, None, ""
     if properties.linear:
         degree = 1 if given.degree is None else given.degree
         description = describe_for(kind, sets.train, needs, precision=given.precision or "f64", degree=degree)

@@ -25,7 +25,10 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
     if not task.objective.of_torques:
         print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
         return
-    linear, tree = CATALOGUE[task.kind].properties.linear, "tree" in task.description
+    properties, tree = CATALOGUE[task.kind].properties, "tree" in task.description
+    if properties.kernel:
+        print(f"a {task.kind} has as many parameters as data: the run does not say what it does not know")
+        return
     model = build({**task.description, "precision": "f64"})
     try:
         found = estimate(
@@ -33,7 +36,7 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
             parameters,
             task.sets.train,
             task.sets.validation,
-            ridge=0.0 if linear else None,
+            ridge=0.0 if properties.linear else None,
             negligible=1e-12 * tree,
         )
     except (InputError, np.linalg.LinAlgError) as error:

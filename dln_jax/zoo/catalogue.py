@@ -31,6 +31,7 @@ from dln_jax.models.residual import make_residual, make_with_residual
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, ResidualTerm, require_network, require_positive
 from dln_jax.zoo.differential_network import make_differential_network
@@ -50,11 +51,13 @@ class Properties(NamedTuple):
     """Its parameters enter linearly, so that one least-squares problem fits them."""
     searched: bool = False
     """A search of its own finds its parameters (`learning.kinematics`)."""
+    kernel: bool = False
+    """It is made of samples, by as many equations as they have torques (`learning.kernel`)."""
 
     @property
     def direct(self) -> bool:
         """Whether it is fitted without an optimiser."""
-        return self.linear or self.searched
+        return self.linear or self.searched or self.kernel
 
 
 class Entry(NamedTuple):
@@ -190,6 +193,7 @@ CATALOGUE = {
     "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
     "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
     "trigonometric": Entry(with_friction_laws(make_trigonometric, linear=True), Properties(linear=True)),
+    "trigonometric-kernel": Entry(with_friction_laws(make_trigonometric_kernel, linear=True), Properties(kernel=True)),
     "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
     "rigid-tree-residual": Entry(make_stored_residual, Properties()),

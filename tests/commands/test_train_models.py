@@ -58,6 +58,18 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     assert "has no seeds" in refused(capsys, train_delan, *options, "--seeds", "2")
 
 
+def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workplace, capsys):
+    options = ("--data", "swing.npz", "--model", "trigonometric-kernel", "--no-figures", "--no-low-latency")
+    command(train_delan, *options, "--samples", "40", "--out", "kernel")
+    said = capsys.readouterr().out
+    assert re.search(r"kernel: 40 of \d+ samples", said) and "by order of the bodies: a chain: " in said
+    assert metrics_of(workplace / "kernel")["torque_mse"] < 1e-4
+    assert load(workplace / "kernel").description["samples"] == 40
+    assert "is one linear problem" in refused(capsys, train_delan, *options, "--width", "3")
+    assert "samples is 0" in refused(capsys, train_delan, *options, "--samples", "0")
+    assert "--samples" in refused(capsys, train_delan, "--data", "swing.npz", "--samples", "9")
+
+
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
     asked = []
 

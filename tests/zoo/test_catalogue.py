@@ -33,6 +33,7 @@ MODELS = {
     "structured-delan": {"needs": SWING, **SMALL, "shared_trunk": True},
     "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
+    "trigonometric-kernel": {"needs": SWING, "samples": 4, "serial": False},
     "rigid-tree": {"needs": SWING, "tree": tree_to_json(PENDULUM), "velocity_scale": 0.1},
     "rigid-tree-residual": {
         **{"needs": SWING._replace(friction=False, joint_friction=("asymmetric",)), "tree": tree_to_json(PENDULUM)},

@@ -19,6 +19,7 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "seven-joints": learned_kinematics.seven_joints,
         "fewer-joints": learned_kinematics.fewer_joints,
         "fewer-samples": learned_kinematics.fewer_samples,
+        "kernels": learned_kinematics.kernels,
     },
     "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
     "speed": {"seven-axis": speed.speed},

@@ -2,7 +2,7 @@
 
 from dln_jax.studies.case import Findings, by_case
 from dln_jax.studies.report import Row
-from dln_jax.studies.robots.lip import rows
+from dln_jax.studies.robots.lip import kernel_rows, rows
 
 SEEDS = range(10)
 """Of the starts."""
@@ -44,6 +44,16 @@ def fewer_samples(quick: bool) -> Findings:
             for row in rows("panda-7", friction=friction, every=SAMPLES[samples], seeds=SEEDS[:3])
         ]
     )
+
+
+def kernels(quick: bool) -> Findings:
+    """Energies in kernel form, of the Panda's first three to seven joints, and of all from fewer samples."""
+    if quick:
+        return found(kernel_rows("panda-3", friction=False, every=SAMPLES[50], tests=(101,)))
+    arms = [(f"panda-{d}", SAMPLES[500]) for d in range(3, 8)] + [("panda-7", SAMPLES[150]), ("panda-7", SAMPLES[50])]
+    by_case = [kernel_rows(name, friction=friction, every=every) for name, every in arms for friction in (False, True)]
+    any_order = [kernel_rows("panda-7", friction=friction, serial=False) for friction in (False, True)]
+    return found([row for rows in (*by_case, *any_order) for row in rows])
 
 
 def found(listed: list[Row]) -> Findings:

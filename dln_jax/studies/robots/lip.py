@@ -1,4 +1,4 @@
-"""Torques of arms that were not seen, by a learned tree and by one of known kinematics, on the LIP protocol.
+"""Torques of arms that were not seen, by a learned tree, a kernel and a tree of known kinematics: the LIP protocol.
 
 One motion of 50 s trains, motions of other seeds test (`datasets.robot_arms`); the torques of the tests are exact, so
 that errors may fall below the noise of the training torques.
@@ -13,8 +13,10 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.datasets.robot_arms import lip_trajectories
+from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
+from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -23,6 +25,8 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.panda import panda
 from dln_jax.scenes.robot_arms import Arm, skew_arm, sliding_arm
 from dln_jax.studies.report import Row
+from dln_jax.types import FrictionLaw
+from dln_jax.zoo.catalogue import CATALOGUE
 
 ARMS: dict[str, Callable[[], Arm]] = {
     **{f"panda-{d}": (lambda d=d: panda(d)) for d in range(3, 8)},
@@ -33,8 +37,17 @@ VELOCITY_SCALE = 1e-3
 """1/s or m/s, of the models' dry friction; that of the arms changes sign at once."""
 TESTS = tuple(range(101, 121))
 """Seeds of the test motions."""
+TEST_EVERY = 10
+"""Samples of test motions of which a kernel, which is slow, has one: 10 a second."""
 TARGET = 1e-3
 """Mean nMSE to reach at seven joints from 500 samples."""
+PUBLISHED = {"panda-6": 0.03, "panda-7": 0.1}
+"""Mean nMSE of the LIP paper's own kernel from 500 samples without friction: some 3 %, and below 10 %."""
+FRICTION: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
+
+
+STATES = 5_001
+"""Whose torques are computed at a time: those of a motion."""
 
 
 class Outcome(NamedTuple):
@@ -81,19 +94,61 @@ def known(arm: Arm, *, friction: bool, every: int = 10, tests: Sequence[int] = T
     return Outcome(nmse, joint_mse, 0, 0, fit.seconds)
 
 
+@in_float64
+def kernel(arm: Arm, *, friction: bool, every: int = 10, serial: bool = True, tests: Sequence[int] = TESTS) -> Outcome:
+    """Trigonometric energies in kernel form, which know no kinematics; other arguments as for `learned`.
+
+    Args:
+        serial: whether they know that each body carries the next.
+    """
+    train = lip_trajectories(arm, friction=friction, every=every)
+    laws = FRICTION if friction else ()
+    needs = arm.tree.needs._replace(joint_friction=laws, velocity_scale=VELOCITY_SCALE)
+    fit = fit_kernel(needs, train, serial=serial)
+    model = CATALOGUE["trigonometric-kernel"].factory(needs, samples=fit.samples, serial=serial)
+    system = model.energies(fit.parameters)
+    joint_mse = np.mean((_torques(system, train) - train.tau) ** 2, axis=0)
+    nmse = unseen_errors(arm, system, friction=friction, tests=tests, every=TEST_EVERY)
+    return Outcome(nmse, joint_mse, 0, 0, fit.seconds)
+
+
 def unseen_errors(
-    arm: Arm, system: RecursiveSystem, *, friction: bool, tests: Sequence[int]
+    arm: Arm, system: RecursiveSystem | ClosedForm, *, friction: bool, tests: Sequence[int], every: int = 1
 ) -> Float[np.ndarray, "T d"]:
-    """nMSE by test motion and joint, against torques without noise."""
-    test = lip_trajectories(arm, tests, friction=friction, noise=0.0)
+    """nMSE by test motion and joint, against torques without noise; of the motions' samples `every` so many."""
+    test = lip_trajectories(arm, tests, friction=friction, noise=0.0, every=every)
     errors = (_torques(system, test) - test.tau) ** 2
     motions = [test.trajectory == index for index in range(len(tests))]
     return np.array([errors[motion].mean(axis=0) / test.tau[motion].var(axis=0) for motion in motions])
 
 
-def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "N d"]:
+def _torques(system: RecursiveSystem | ClosedForm, data: Trajectories) -> Float[np.ndarray, "N d"]:
     inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
-    return np.asarray(inverse(data.q, data.qd, data.qdd))
+    states = (data.q, data.qd, data.qdd)
+    # A kernel takes memory for each state.
+    pieces = [slice(first, first + STATES) for first in range(0, len(data.q), STATES)]
+    return np.concatenate([inverse(*(each[piece] for each in states)) for piece in pieces])
+
+
+def kernel_rows(
+    name: str, *, friction: bool, every: int = 10, serial: bool = True, tests: Sequence[int] = TESTS
+) -> list[Row]:
+    """Numbers of one arm, by name; bounded by what the paper's kernel was published with."""
+    found = kernel(ARMS[name](), friction=friction, every=every, serial=serial, tests=tests)
+    means = found.nmse.mean(axis=1)
+    compared = serial and every == 10 and not friction
+    reference = PUBLISHED.get(name) if compared else None
+    case = f"lip/{name}/{'friction' if friction else 'frictionless'}/{5000 // every}/kernel"
+    case = case if serial else f"{case}-any-order"
+    return [
+        Row(case, "nmse_mean_median", float(np.median(means)), reference=reference, bound=reference),
+        Row(case, "nmse_mean_worst", float(means.max())),
+        *(
+            Row(case, f"nmse_joint_{joint + 1}", float(value))
+            for joint, value in enumerate(np.median(found.nmse, axis=0))
+        ),
+        Row(case, "fit_seconds", found.seconds, "s"),
+    ]
 
 
 def rows(

@@ -32,6 +32,7 @@ MODELS = {
     "structured-delan": {"needs": MIXED, **SMALL},
     "black-box-delan": {"needs": MIXED, **SMALL, "activation": "softplus"},
     "trigonometric": {"needs": FREE, "degree": 1},
+    "trigonometric-kernel": {"needs": MIXED, "samples": 3},
     "rigid-tree": {"needs": MIXED, "tree": tree_to_json(CART)},
     "rigid-tree-residual": {
         **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},

@@ -1,0 +1,136 @@
+"""Scales and noise of the energies of `models.trigonometric_kernel`, by the marginal likelihood of torques.
+
+    -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   cov = K + Phi S² Phiᵀ + diag(noise²)
+
+as `learning.kernel` has it. L-BFGS descends it. The slope is sum(W dK), W = (cov⁻¹ - weights weightsᵀ) / 2, so that no
+factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning", equation 5.9).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.models.torque_covariance import States, own_covariance
+from dln_jax.models.trigonometric_kernel import KernelScales
+from dln_jax.types import JointKind, Needs
+
+FIRST_NOISE = 0.05
+"""Of the torques' deviation, from which the search starts."""
+FEW = 16
+"""States whose torques' variance sets the scales to start from."""
+_REFUSED = 1e10
+"""Likelihood of scales whose covariance rounding leaves indefinite."""
+
+
+class Equations(NamedTuple):
+    """Torques of samples, and what friction has in them."""
+
+    states: States
+    friction: Any
+    """Phi S [N d, P]."""
+    tau: Any
+    """[N, d]."""
+
+
+class Unknowns(NamedTuple):
+    """Logarithms."""
+
+    scales: KernelScales
+    noise: Any
+    """[d]."""
+
+
+def likeliest(
+    needs: Needs, serial: bool, equations: Equations, unit: np.ndarray, *, iterations: int, least_noise: float
+) -> Unknowns:
+    """Scales and noise that maximise the marginal likelihood."""
+    from scipy.optimize import minimize
+
+    start = Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
+    leaves, structure = jax.tree.flatten(start)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+
+    def unknowns_of(x: np.ndarray) -> Unknowns:
+        parts = [each.reshape(leaf.shape) for each, leaf in zip(np.split(x, ends[:-1]), leaves, strict=True)]
+        return jax.tree.unflatten(structure, parts)
+
+    evaluate = jax.jit(likelihood(needs.joints, serial), compiler_options=quick_compilation())
+
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slopes = evaluate(unknowns_of(x), equations)
+        slope = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(slopes)])
+        if not (np.isfinite(value) and np.isfinite(slope).all()):
+            return _REFUSED, np.zeros_like(x)
+        return float(value), slope
+
+    lowest = [(None, None)] * (ends[-1] - unit.size) + [(each, None) for each in np.log(least_noise * unit)]
+    first = np.concatenate([leaf.ravel() for leaf in leaves])
+    options = {"maxiter": iterations, "maxcor": 30}
+    return unknowns_of(minimize(objective, first, jac=True, method="L-BFGS-B", bounds=lowest, options=options).x)
+
+
+def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, Equations], Any]:
+    """(unknowns, equations) -> minus its logarithm by the torque, without the constant, and the slope."""
+
+    def evaluate(unknowns: Unknowns, equations: Equations) -> Any:
+        states, friction, tau = equations
+        count = tau.size
+
+        def covariance(scales: KernelScales) -> Any:
+            return own_covariance(joints, serial, jax.tree.map(jnp.exp, scales), states)
+
+        variance = jnp.exp(2 * unknowns.noise)
+        noise = jnp.tile(variance, len(tau))
+        lower = jnp.linalg.cholesky(covariance(unknowns.scales) + friction @ friction.T + jnp.diag(noise))
+        inverse = jax.scipy.linalg.cho_solve((lower, True), jnp.eye(count, dtype=lower.dtype))
+        weights = inverse @ tau.ravel()
+        value = 0.5 * tau.ravel() @ weights + jnp.sum(jnp.log(jnp.diagonal(lower)))
+        W = 0.5 * (inverse - jnp.outer(weights, weights))
+        scales = jax.grad(lambda scales: jnp.vdot(W, covariance(scales)))(unknowns.scales)
+        by_joint = 2 * variance * jnp.sum(jnp.diagonal(W).reshape(tau.shape), axis=0)
+        return value / count, jax.tree.map(lambda each: each / count, Unknowns(scales, by_joint))
+
+    return evaluate
+
+
+def start_of(needs: Needs, serial: bool, equations: Equations, unit: np.ndarray) -> KernelScales:
+    """Logarithms of scales at which each energy explains torques of the size that they have, with random frames.
+
+    A vector in a randomly turned frame keeps a third of its square where it is parallel to the joint's axis.
+    """
+    d = needs.degrees_of_freedom
+    bodies = d if serial else 1
+    q, _, qdd = (np.sqrt(np.mean(each**2, axis=0)) for each in equations.states)
+    slides = np.array([joint == "prismatic" for joint in needs.joints])
+    rotated = np.tile([1 / 3, 2 / 3], (d, 1))
+    slid = np.stack([np.full(d, 2 / 3), 1 / (3 * np.where(q > 0, q, 1.0) ** 2)], axis=1)
+    pairs = np.where(slides[:, None], slid, rotated)
+    rates = unit / np.where(qdd > 0, qdd, 1.0)
+    ones, none = np.ones(bodies), np.zeros(bodies)
+    scales = KernelScales(rates / rates.mean(), ones, pairs, *((ones, pairs) if needs.gravity else (None, None)))
+    few = States(*(each[:: max(1, len(each) // FEW)] for each in equations.states))
+
+    def size(scales: KernelScales) -> float:
+        """Mean variance of torques in units of those that were measured; 1 where nothing moves."""
+        variance = np.diagonal(compiled_covariance(needs.joints, serial)(scales, few)).reshape(-1, d)
+        return float(np.mean(variance / unit**2)) or 1.0
+
+    without = scales._replace(weight=none if needs.gravity else None)
+    scales = scales._replace(inertia=ones * 0.5 / size(without))
+    if needs.gravity:
+        scales = scales._replace(weight=ones / size(scales._replace(inertia=none)))
+    return jax.tree.map(np.log, scales)
+
+
+@functools.lru_cache(maxsize=4)
+def compiled_covariance(joints: tuple[JointKind, ...], serial: bool) -> Callable[..., Any]:
+    """(scales, states) -> `own_covariance`."""
+    return jax.jit(
+        lambda scales, states: own_covariance(joints, serial, scales, states),
+        compiler_options=quick_compilation(),
+    )

@@ -1,0 +1,213 @@
+"""Covariances of the torques that the energies of `models.trigonometric_kernel` take, between states.
+
+With v the velocity of a body, a random linear function of the rates, and T = vᵀ A v, A random and symmetric,
+
+    tau_i = 2 (P_iᵀ A dv/dt + Q_iᵀ A v),   P_i = dv/dqd_i,   Q_i = d/dt P_i - dv/dq_i
+
+so that covariances of torques are products of two inner products each, <P_i, P_j'> <dv/dt, dv'/dt> and seven more.
+One pass along the joints gives all of them, since each of P, Q, v and dv/dt of a body is linear in those of the one
+before.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
+
+from dln_jax.models.trigonometric_kernel import KernelScales, lift_factor, turn_factor
+from dln_jax.types import JointKind
+
+PAIRS = 500
+"""Of states that are worked on at a time, in cache."""
+
+
+class States(NamedTuple):
+    """[N, d] each; or with axes of pairs after the joints'."""
+
+    q: Any
+    qd: Any
+    qdd: Any
+
+
+class Products(NamedTuple):
+    """Inner products of (P_1 .. P_d, v) and (Q_1 .. Q_d, dv/dt), [d + 1, d + 1, R, M] each; primes are second."""
+
+    first: Array
+    """<P, P'>."""
+    mixed: Array
+    """<P, Q'>."""
+    mirrored: Array
+    """<Q, P'>."""
+    second: Array
+    """<Q, Q'>."""
+
+
+def torque_covariance(
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States, others: States
+) -> Float[Array, "Nd Md"]:
+    """cov(tau(state), tau(other)) of N and M states, the joints of a state next to each other; (N m)²."""
+    N, d = np.shape(states.q)
+    states, others = _on_device(states), _on_device(others)
+    columns = _joints_first(States(*(each[None] for each in others)))
+
+    def block(rows: Array) -> Array:
+        return _block(joints, serial, scales, _joints_first(States(*(each[rows][:, None] for each in states))), columns)
+
+    return _by_rows(block, N, len(others.q)).transpose(0, 2, 1, 3).reshape(N * d, -1)
+
+
+def own_covariance(
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States
+) -> Float[Array, "Nd Nd"]:
+    """The `torque_covariance` of states among each other, at half the work.
+
+    Each state is paired with the N/2 that follow it, the first ones after the last; other pairs are these, exchanged.
+    """
+    N, d = np.shape(states.q)
+    states = _on_device(states)
+    following = (np.arange(N)[:, None] + np.arange(N // 2 + 1)) % N
+
+    def block(rows: Array) -> Array:
+        x, y = (States(*(each[at] for each in states)) for at in (rows[:, None], jnp.asarray(following)[rows]))
+        return _block(joints, serial, scales, _joints_first(x), _joints_first(y))
+
+    pairs = _by_rows(block, N, N // 2 + 1)
+    row, column = np.indices((N, N))
+    ahead = (column - row) % N
+    follows = ahead <= N // 2
+    found = pairs[np.where(follows, row, column), np.where(follows, ahead, (row - column) % N)]
+    found = jnp.where(follows[..., None, None], found, found.swapaxes(2, 3))
+    return found.transpose(0, 2, 1, 3).reshape(N * d, N * d)
+
+
+def _on_device(states: States) -> States:
+    return States(*map(jnp.asarray, states))
+
+
+def _joints_first(states: States) -> States:
+    return States(*(jnp.moveaxis(each, 2, 0) for each in states))
+
+
+def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array, "N K d d"]:
+    """Pairs of N states with `width` others each, from a function of the indices of some rows.
+
+    Derivatives compute again what blocks of rows went through, which is more than fits into caches.
+    """
+    rows = max(1, min(N, PAIRS // width))
+    places = np.arange(-(-N // rows) * rows) % N
+    found = lax.map(jax.checkpoint(block), jnp.asarray(places.reshape(-1, rows)))
+    return found.transpose(0, 3, 4, 1, 2).reshape(len(places), width, *found.shape[1:3])[:N]
+
+
+def _block(
+    joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
+) -> Float[Array, "d d R K"]:
+    """Of states x [d, R, 1] with y [d, 1, K] or [d, R, K]; pairs are the last axes, so that loops are long."""
+    d = len(joints)
+    pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
+    turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)
+    has_potential = scales.weight is not None and scales.lifts is not None
+    lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
+    unit = jnp.eye(d + 1, dtype=pairs.dtype)[:d]
+    # Only the last body has an energy where all rates enter before the first joint.
+    of_body = (lambda each: each) if serial else (lambda each: jnp.zeros(d, each.dtype).at[-1].set(each[0]))
+
+    def entered(products: Products, joint: Any, rate: Array) -> Products:
+        at, (_, u, a), (_, w, b) = joint
+        e, last = at[:, None, None], jnp.zeros(d + 1, at.dtype).at[-1].set(1.0)[:, None, None]
+        P, P_other, Q, Q_other = e + last * u, e + last * w, last * a, last * b
+        pairs = ((P, P_other), (P, Q_other), (Q, P_other), (Q, Q_other))
+        return Products(
+            *(each + rate * left[:, None] * right[None] for each, (left, right) in zip(products, pairs, strict=True))
+        )
+
+    def link(carry: tuple, at: tuple) -> tuple[tuple, None]:
+        products, heights, total = carry
+        joint, rate, turn, inertia, lift, weight = at
+        products = _turned(products, turn, joint)
+        if serial:
+            products = entered(products, joint, rate)
+        total = total + inertia * _kinetic(products)
+        if lift is not None:
+            heights = _lifted(heights, lift, joint[0])
+            total = total + weight * heights[:d, :d]
+        return (products, heights, total), None
+
+    nothing = jnp.zeros((d + 1, d + 1, *pairs.shape), pairs.dtype)
+    products = Products(nothing, nothing, nothing, nothing)
+    joint_axes = (unit, x, y)
+    if not serial:
+        for each in range(d):
+            one = jax.tree.map(lambda leaf, each=each: leaf[each], joint_axes)
+            products = entered(products, one, scales.rates[each])
+    heights = nothing.at[d, d].set(1.0) if has_potential else None
+    weight = of_body(scales.weight) if has_potential else None
+    links = (joint_axes, scales.rates, turns, of_body(scales.inertia), lifts, weight)
+    (_, _, total), _ = lax.scan(jax.checkpoint(link), (products, heights, nothing[:d, :d]), links)
+    return total
+
+
+def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Array, x: Array, y: Array) -> Any:
+    each = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
+    # Slopes of a prismatic joint do not vary along both axes.
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *each)
+
+
+def _turned(products: Products, c: Any, joint: Any) -> Products:
+    """Through a joint: v becomes C v, and with it P; Q becomes C Q + dC/dq (qd P - e vᵀ), e the joint's place."""
+    at, (_, u, _), (_, w, _) = joint
+    e = at[:, None, None]
+
+    def rows(X: Array) -> Array:
+        return u * X - e[:, None] * X[-1]
+
+    def columns(X: Array) -> Array:
+        return w * X - X[:, -1, None] * e
+
+    first, mixed, mirrored, second = products
+    turned = columns(first)
+    return Products(
+        c.value * first,
+        c.value * mixed + c.by_y * turned,
+        c.value * mirrored + c.by_x * rows(first),
+        c.value * second + c.by_x * rows(mixed) + c.by_y * columns(mirrored) + c.by_both * rows(turned),
+    )
+
+
+def _kinetic(products: Products) -> Array:
+    """cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, M]."""
+    PP, PQ, QP, QQ = products
+    inner, column, row, corner = _parts(PP), _parts(PQ), _parts(QP), _parts(QQ)
+    # Each product of blocks has its counterpart with v and dv/dt exchanged.
+    return 2 * (
+        inner.block * corner.end + column.right * row.below
+        + column.block * row.end + inner.right * corner.below
+        + row.block * column.end + corner.right * inner.below
+        + corner.block * inner.end + row.right * column.below
+    )  # fmt: skip
+
+
+class _Parts(NamedTuple):
+    block: Array
+    right: Array
+    below: Array
+    end: Array
+
+
+def _parts(X: Array) -> _Parts:
+    return _Parts(X[:-1, :-1], X[:-1, -1:], X[-1:, :-1], X[-1, -1])
+
+
+def _lifted(heights: Array, h: Any, at: Array) -> Array:
+    """Inner products of (dz/dq_1 .. dz/dq_d, z), z a product of functions of the joints so far."""
+    e = at[:, None, None]
+    return (
+        h.value * heights
+        + h.by_x * e[:, None] * heights[-1]
+        + h.by_y * heights[:, -1, None] * e
+        + h.by_both * e[:, None] * e * heights[-1, -1]
+    )

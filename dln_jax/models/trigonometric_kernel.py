@@ -1,0 +1,248 @@
+"""Lagrangian of a Gaussian process over trigonometric energies: as many numbers as equations, whatever the joints.
+
+The basis of `models.trigonometric` has 5^d functions for an arm of d joints that is not planar. Here they are never
+formed. T and V are Gaussian processes, independent of one another, and the model is their mean given torques:
+
+    L(q, qd) = sum over samples n, joints i of weights[n, i] cov(L(q, qd), tau_i(q_n, qd_n, qdd_n))
+
+Covariances are those of a chain of bodies whose frames and inertias are drawn at random. The velocity of body l comes
+from that of the one before, through joint l, and T_l is quadratic in it:
+
+    k_l(x, x') = c_l(q_l, q_l') k_(l-1)(x, x') + rates_l qd_l qd_l',   cov(T, T') = sum over l of inertia_l k_l²
+    cov(V, V') = sum over l of weight_l h_1(q_1, q_1') .. h_l(q_l, q_l')
+
+with c_l(q, q') = a_l + b_l cos(q - q') for a revolute joint and a_l + b_l q q' for a prismatic one, h_l alike (squared
+for a prismatic one, so that it holds springs). V is thus of degree 1 in the cosine and sine of each angle and T of
+degree 2, and neither more nor less depends on a joint than in a chain of rigid bodies: T not on the first. Where
+bodies do not follow one another (`serial=False`), all rates enter before the first joint, and there is one body, the
+last: every entry of M is then any function of that degree in every joint.
+
+Torques of a Lagrangian process as a linear problem of N d equations: Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO
+2024 (arXiv 2310.06585), whose kernel is a sum over links of products in all joints up to the link.
+`learning.kernel.fit_kernel` finds the parameters.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jax.typing import DTypeLike
+
+from dln_jax.mechanics import lagrangian
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.models.model import Model
+from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
+
+CHUNK = 128
+"""Samples that are worked on at a time."""
+
+
+class KernelScales(NamedTuple):
+    """What the covariances of d joints depend on, all positive; K is d, or 1 where bodies do not follow one another."""
+
+    rates: Array
+    """Of a joint's rate in the velocities of bodies [d]; the unit is shared with `inertia`."""
+    inertia: Array
+    """Of the kinetic energy of each body [K]."""
+    turns: Array
+    """a and b of c [d, 2]; b is per m² for a prismatic joint."""
+    weight: Array | None
+    """Of the potential of each body [K], in J²; `None` without gravity."""
+    lifts: Array | None
+    """a and b of h [d, 2]."""
+
+
+class KernelParameters(NamedTuple):
+    """Of n samples and d joints."""
+
+    q: Array
+    """[n, d], of the samples."""
+    qd: Array
+    """[n, d]."""
+    qdd: Array
+    """[n, d]."""
+    weights: Array
+    """[n, d], of their torques; 1/(N m) or 1/N."""
+    scales: KernelScales
+    friction: Array | None
+    """Viscous friction of each coordinate [d], in N m s or N s/m."""
+
+
+class Factor(NamedTuple):
+    """c(x, y), and its slopes; arrays that broadcast."""
+
+    value: Array
+    by_x: Array
+    by_y: Array
+    by_both: Array
+
+
+class Shared(NamedTuple):
+    """Inner products with the velocity of one body, [n] each: what it has in common with those of the samples."""
+
+    velocity: Array
+    """With the sample's velocity v."""
+    acceleration: Array
+    """With dv/dt."""
+    momentum: Array
+    """With sum_i w_i dv/dqd_i, w the sample's weights."""
+    force: Array
+    """With sum_i w_i (d/dt dv/dqd_i - dv/dq_i)."""
+
+
+def make_trigonometric_kernel(
+    needs: Needs, *, samples: int = 600, serial: bool = True, dtype: DTypeLike = jnp.float64
+) -> Model:
+    """The (init, energies) pair; `init` draws samples and weights at random, which is no model of anything.
+
+    One inverse model takes some n d operations, and one mass matrix n d³.
+
+    Args:
+        needs: kinds of joints, gravity, and viscous friction of each coordinate.
+        samples: n, of the data, whose torques make the energy; the fit takes n³ d³ operations.
+        serial: each joint carries the next, as in an arm without branches; otherwise nothing is assumed of the order.
+        dtype: of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
+
+    Raises:
+        InputError: no samples.
+    """
+    if samples < 1:
+        raise InputError(f"samples is {samples}; expected a positive whole number")
+    d = needs.degrees_of_freedom
+    bodies = d if serial else 1
+
+    def init(key: Array) -> KernelParameters:
+        q, qd, qdd, weights = jax.random.normal(key, (4, samples, d), dtype)
+        pair = jnp.asarray([[1 / 3, 2 / 3]] * d, dtype)
+        scales = KernelScales(
+            rates=jnp.ones(d, dtype),
+            inertia=jnp.ones(bodies, dtype),
+            turns=pair,
+            weight=jnp.ones(bodies, dtype) if needs.gravity else None,
+            lifts=pair if needs.gravity else None,
+        )
+        return KernelParameters(q, qd, qdd, weights, scales, jnp.zeros(d, dtype) if needs.friction else None)
+
+    return Model(init, lambda parameters: _closed_form(parameters, needs.joints, serial))
+
+
+def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
+    """c of a joint."""
+    a, b = pair
+    if joint == "prismatic":
+        return Factor(a + b * x * y, b * y, b * x, b * jnp.ones_like(x * y))
+    cosine = b * (jnp.cos(x) * jnp.cos(y) + jnp.sin(x) * jnp.sin(y))
+    sine = b * (jnp.sin(x) * jnp.cos(y) - jnp.cos(x) * jnp.sin(y))
+    return Factor(a + cosine, -sine, sine, cosine)
+
+
+def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
+    """h of a joint."""
+    c = turn_factor(joint, pair, x, y)
+    if joint == "revolute":
+        return c
+    return Factor(c.value**2, 2 * c.value * c.by_x, 2 * c.value * c.by_y, 2 * (c.by_x * c.by_y + c.value * c.by_both))
+
+
+def _closed_form(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> ClosedForm:
+    scales, friction = parameters.scales, parameters.friction
+
+    def kinetic(q: Vector, qd: Vector) -> Scalar:
+        def of(some: KernelParameters) -> Scalar:
+            bodies = _shared(some, joints, serial, q, qd)
+            each = [jnp.sum(s.momentum * s.acceleration + s.velocity * s.force) for s in bodies]
+            return 2 * jnp.stack(each) @ scales.inertia
+
+        return _summed(of, parameters)
+
+    def mass_matrix(q: Vector) -> Array:
+        def half(some: KernelParameters) -> Array:
+            bodies = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
+            each = [s.momentum @ s.acceleration.T + s.velocity @ s.force.T for s in bodies]
+            return jnp.einsum("kij,k->ij", jnp.stack(each), scales.inertia)
+
+        M = _summed(half, parameters)
+        return 2 * (M + M.T)
+
+    potential = _potential(parameters, joints, serial)
+    return ClosedForm(
+        mass_matrix=mass_matrix,
+        coriolis=lambda q, qd: lagrangian.inverse_dynamics(kinetic, q, qd, jnp.zeros_like(qd)),
+        potential=potential,
+        gravity=None if potential is None else jax.grad(potential),
+        dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
+        friction=None if friction is None else lambda q, qd: friction * qd,
+    )
+
+
+def _shared(
+    parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector
+) -> list[Shared]:
+    """Of each body with an inertia; linear in qd."""
+    scales = parameters.scales
+    columns = (parameters.qd.T, parameters.qdd.T, parameters.weights.T)
+    none = jnp.zeros_like(columns[0][0])
+
+    def entered(s: Shared, joint: int) -> Shared:
+        rate, acceleration, weight = (scales.rates[joint] * qd[joint] * each[joint] for each in columns)
+        return Shared(s.velocity + rate, s.acceleration + acceleration, s.momentum + weight, s.force)
+
+    shared, bodies = Shared(none, none, none, none), []
+    for joint in range(0 if serial else len(joints)):
+        shared = entered(shared, joint)
+    for joint, kind in enumerate(joints):
+        c = turn_factor(kind, scales.turns[joint], q[joint], parameters.q[:, joint])
+        moved, weight = parameters.qd[:, joint], parameters.weights[:, joint]
+        shared = Shared(
+            c.value * shared.velocity,
+            c.value * shared.acceleration + c.by_y * moved * shared.velocity,
+            c.value * shared.momentum,
+            c.value * shared.force + c.by_y * (moved * shared.momentum - weight * shared.velocity),
+        )
+        if serial:
+            shared = entered(shared, joint)
+            bodies.append(shared)
+    return bodies or [shared]
+
+
+def _potential(
+    parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool
+) -> Callable[[Vector], Scalar] | None:
+    weight, lifts = parameters.scales.weight, parameters.scales.lifts
+    if weight is None or lifts is None:
+        return None
+
+    def of(some: KernelParameters, q: Vector) -> Scalar:
+        height, force = jnp.ones_like(some.q[:, 0]), jnp.zeros_like(some.q[:, 0])
+        bodies = []
+        for joint, kind in enumerate(joints):
+            h = lift_factor(kind, lifts[joint], q[joint], some.q[:, joint])
+            force = h.value * force + h.by_y * some.weights[:, joint] * height
+            height = h.value * height
+            bodies.append(jnp.sum(force))
+        return jnp.stack(bodies if serial else bodies[-1:]) @ weight
+
+    return lambda q: _summed(lambda some: of(some, q), parameters)
+
+
+def _summed(function: Callable[[KernelParameters], Array], parameters: KernelParameters) -> Array:
+    """A sum over samples, of so many at a time that a batch of states fits into memory with its derivatives."""
+    samples = (parameters.q, parameters.qd, parameters.qdd, parameters.weights)
+    n, d = parameters.q.shape
+    if n <= CHUNK:
+        return function(parameters)
+    # What fills up the last chunk has no weight.
+    pieces = [jnp.pad(each, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for each in samples]
+
+    def of(q: Array, qd: Array, qdd: Array, weights: Array) -> Array:
+        return function(parameters._replace(q=q, qd=qd, qdd=qdd, weights=weights))
+
+    @jax.checkpoint
+    def add(total: Array, piece: list[Array]) -> tuple[Array, None]:
+        return total + of(*piece), None
+
+    like = jax.eval_shape(of, *(each[0] for each in pieces))
+    total, _ = lax.scan(add, jnp.zeros(like.shape, like.dtype), pieces)
+    return total
