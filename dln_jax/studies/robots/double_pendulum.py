@@ -18,14 +18,13 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, valid_times
 from dln_jax.studies.report import Row
 from dln_jax.studies.robots.double_pendulum_fits import (
-    CANDIDATES,
     CUTOFF,
     RATE,
     WINDOW,
-    Candidate,
     Fitted,
     Logs,
     choose_scale,
+    fit_both,
     fit_low_passed,
     fit_motions,
     fit_torques,
@@ -40,9 +39,7 @@ HORIZON, EVERY = 2.2, 0.5
 """s: predicted stretches, and from one start to the next."""
 HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
 """Recordings of each split."""
-VALIDATED = 3
-"""Every so manyth of the others chooses."""
-WAYS = ("least-squares", "low-passed", "motions", "both")
+WAYS = ("least-squares", "chosen-scale", "low-passed", "motions", "both")
 QUANTITIES = {
     "torque_nmse": ("1", False),
     "torque_nmse_low_passed": ("1", False),
@@ -79,28 +76,15 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
     index = {label: place for place, label in enumerate(logs.fine.label)}
     test = [index[label] for label in held_out]
     rest = logs.of(each for each in np.unique(logs.fine.trajectory) if each not in test)
-    fits = (fit_torques(rest), fit_low_passed(rest)[0], fit_motions(rest), fit_both(rest))
+    scale = choose_scale(rest)
+    fits = (
+        fit_torques(rest),
+        fit_torques(rest, scale),
+        fit_low_passed(rest, scale)[0],
+        fit_motions(rest, scale),
+        fit_both(rest, scale),
+    )
     return {way: judged(found, logs.of(test), logs) for way, found in zip(WAYS, fits, strict=True)}
-
-
-def fit_both(logs: Logs) -> Fitted:
-    """Motions and torques by the candidate that `chosen` finds; torques alone where none is as good at them."""
-    scale = choose_scale(logs)
-    candidate = chosen(logs, scale)
-    return fit_torques(logs, scale) if candidate is None else fit_motions(logs, candidate, scale)
-
-
-def chosen(logs: Logs, scale: float) -> Candidate | None:
-    """The candidate of longest predictions among those whose torques are as good as those of the usual least squares.
-
-    Both are numbers of every `VALIDATED`th recording, which is fitted without.
-    """
-    recordings = np.unique(logs.fine.trajectory)
-    train, out = logs.of(np.setdiff1d(recordings, recordings[::VALIDATED])), logs.of(recordings[::VALIDATED])
-    usual = judged(fit_torques(train), out, logs)
-    found = {candidate: judged(fit_motions(train, candidate, scale), out, logs) for candidate in CANDIDATES}
-    good = [candidate for candidate, each in found.items() if each["torque_nmse"] <= usual["torque_nmse"]]
-    return max(good, key=lambda candidate: found[candidate]["vpt_mean_seconds"], default=None)
 
 
 def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:

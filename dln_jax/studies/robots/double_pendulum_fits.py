@@ -1,17 +1,15 @@
-"""Ways to fit a double pendulum with motors, and what is chosen on validation recordings.
+"""Ways to fit a double pendulum with motors, by recordings that are not those it is judged by.
 
     least-squares   torques of filtered motions, as engineers do it; q and tau filtered alike
-    low-passed      the same, but what is filtered is the regressor of less filtered motions, and tau with it
+    chosen-scale    the same, with the velocity scale of dry friction that explains each recording best from the others
+    low-passed      what is filtered is the regressor of less filtered motions, and tau with it
     motions         the windows of `learning.measured_motions`, through an integrator with the torques, which are off
                     by as much as the low-passed equations are
-    both            motions and torques in one objective (`learning.torques_beside_motions`)
+    both            motions and torques in one objective (`learning.torques_beside_motions`), with friction by load
 
-Filtered coordinates give accelerations that are too small; dry friction is no function of them at all. Low-passing both
-sides of the equation, or not to differentiate at all, leaves that bias out: motions are predicted for longer, and
-torques of filtered motions, whose bias least squares take part in, are not predicted as well. What is fitted to both
-has a velocity scale of dry friction, a share of the torques, and friction by load or not, of which the last two are
-the ones that predict validation motions for longest, among those whose validation torques are as good as those of
-least squares. All recordings that one is judged by are held out of that choice.
+All but the first have the chosen scale. Recorded torques explain slow accelerations well and those above 3 Hz badly:
+forces act that were not recorded. Least squares of torques are drawn to small inertias by them, which are best for
+torques and bad for predictions; to match motions is the reverse.
 """
 
 import functools
@@ -30,6 +28,7 @@ from dln_jax.data.splits import select
 from dln_jax.learning import measured_motions
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.linear import design
 from dln_jax.learning.measured_motions import Noise, cut_measured_windows
 from dln_jax.learning.torques_beside_motions import cut_torque_windows, with_torques
@@ -45,13 +44,15 @@ and 25; and of what is fitted."""
 WINDOW = 11
 """Samples of a window and of a prediction's fitted start: 0.1 s."""
 NOISE = 2e-3
-"""rad, of q: that, and what the torque's unknown of a window leaves of forces that nobody measured."""
+"""rad, of q: more than its own, for what one unknown torque of a window leaves of other forces."""
 STEPS = 8
 """Of Gauss-Newton."""
 USUAL_SCALE = 0.1
 """rad/s, of dry friction."""
 SCALES = (0.05, 0.1, 0.2, 0.5, 1.0)
 """That are tried."""
+SHARE = 3.0
+"""Of torques beside motions, in units of what either is off; one for all splits, and not chosen by them."""
 
 
 class Logs(NamedTuple):
@@ -73,18 +74,6 @@ class Fitted(NamedTuple):
 
     model: Model
     parameters: Parameters
-
-
-class Candidate(NamedTuple):
-    """What is open of a fit to motions and torques."""
-
-    share: float
-    """Of torques."""
-    laws: tuple[FrictionLaw, ...] = ()
-    """Besides viscous and dry friction."""
-
-
-CANDIDATES = tuple(Candidate(share, laws) for laws in ((), ("load",)) for share in (1.0, 3.0))
 
 
 @functools.lru_cache(maxsize=16)
@@ -125,21 +114,37 @@ def fit_low_passed(logs: Logs, scale: float = USUAL_SCALE) -> tuple[Fitted, tupl
     return Fitted(model, _parameters(model, x)), tuple(sizes.tolist())
 
 
-def fit_motions(logs: Logs, candidate: Candidate | None = None, scale: float = USUAL_SCALE) -> Fitted:
-    """Motions, and torques too where a candidate has a share of them; one recording selects the iteration."""
+def fit_motions(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
+    """Motions alone; one recording selects the iteration."""
     start, off = fit_low_passed(logs, scale)
+    parts = _parted(logs)
+    return _trained(start, _motions(start, parts, off))
+
+
+def fit_both(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
+    """Motions and torques, with friction by load; one recording selects the iteration."""
+    rigid, off = fit_low_passed(logs, scale)
+    model = ten_parameters(scale, ("load",))
+    start = Fitted(model, model.init(jax.random.key(0)) | {"model": rigid.parameters})
+    parts = _parted(logs)
+    torques = [cut_torque_windows(part.coarse, WINDOW) for part in parts]
+    return _trained(start, with_torques(_motions(start, parts, off), model, *torques, noise=off, share=SHARE))
+
+
+def _parted(logs: Logs) -> tuple[Logs, Logs]:
+    """All but the middle recording, and that one."""
     present = np.unique(logs.fine.trajectory)
     chosen = present[len(present) // 2]
-    parts = [logs.of(present[present != chosen]), logs.of([chosen])]
-    if candidate is not None and candidate.laws:
-        model = ten_parameters(scale, candidate.laws)
-        start = Fitted(model, model.init(jax.random.key(0)) | {"model": start.parameters})
+    return logs.of(present[present != chosen]), logs.of([chosen])
+
+
+def _motions(start: Fitted, parts: tuple[Logs, Logs], off: tuple[float, ...]) -> Problem:
     windows = [cut_measured_windows(part.fine, WINDOW) for part in parts]
-    task = measured_motions.problem(start.model, start.parameters, *windows, noise=Noise(NOISE, tau=off))
-    if candidate is not None:
-        torques = [cut_torque_windows(part.coarse, WINDOW) for part in parts]
-        task = with_torques(task, start.model, *torques, noise=off, share=candidate.share)
-    return Fitted(start.model, fit(task, GaussNewton(STEPS, steps_per_dispatch=STEPS // 2)).parameters)
+    return measured_motions.problem(*start, *windows, noise=Noise(NOISE, tau=off))
+
+
+def _trained(start: Fitted, task: Problem) -> Fitted:
+    return start._replace(parameters=fit(task, GaussNewton(STEPS, steps_per_dispatch=STEPS // 2)).parameters)
 
 
 def _equations(model: Model, logs: Logs, *, cutoff: float | None = None) -> dict[int, tuple[np.ndarray, np.ndarray]]:
