@@ -65,7 +65,7 @@ def smooth_locally(
         raise InputError(f"degree is {degree}; expected at least 2, for an acceleration")
     if points is not None and points < least:
         raise InputError(f"points is {points}; expected at least {least} for polynomials of degree {degree}")
-    parts = [each for each in stretches(data, gap=gap) if len(each) >= max(least, points or 0)]
+    parts = [each for each in stretches(data.t, data.trajectory, gap=gap) if len(each) >= max(least, points or 0)]
     if not parts:
         raise InputError(f"no stretch without a gap has {max(least, points or 0)} samples; record longer motions")
     shortest = min(map(len, parts))

@@ -1,28 +1,33 @@
 """Stretches of a trajectory without a gap, a time step much longer than the others, and windows within them."""
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
 GAP = 1.5
-"""Times the median time step: a longer step is a gap."""
+"""Times the median time step of its trajectory: a longer step is a gap."""
 
 
-def stretches(data: Trajectories, *, gap: float = GAP) -> list[np.ndarray]:
-    """Indices of the samples of each stretch without a gap, in order.
+def stretches(
+    t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
+) -> list[Int[np.ndarray, " n"]]:
+    """Indices of the samples of each stretch of one trajectory without a step above `gap` times its median step.
 
     Raises:
-        InputError: a gap that is not longer than the median time step.
+        InputError: a gap that is not longer than the median step, or no trajectory with two samples.
     """
     if not gap > 1:
         raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
-    same = np.diff(data.trajectory) == 0
-    steps = np.diff(data.t)
-    if not same.any():
-        raise InputError("no trajectory has two samples; windows need motions: record some")
-    broken = ~same | (steps > gap * np.median(steps[same]))
-    return np.split(np.arange(len(data.t)), np.flatnonzero(broken) + 1)
+    if not (np.diff(trajectory) == 0).any():
+        raise InputError("no trajectory has two samples; these are no motions: record some")
+    found = []
+    for samples in np.split(np.arange(len(t)), np.flatnonzero(np.diff(trajectory)) + 1):
+        steps = np.diff(t[samples])
+        longest = gap * np.median(steps) if len(steps) else np.inf
+        found.extend(np.split(samples, np.flatnonzero(steps > longest) + 1))
+    return found
 
 
 def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +43,7 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
         raise InputError(f"length is {length}; expected a window of at least 2 samples")
     pieces = [
         stretch[first : first + length]
-        for stretch in stretches(data, gap=gap)
+        for stretch in stretches(data.t, data.trajectory, gap=gap)
         for first in range(0, len(stretch) - 1, length - 1)
     ]
     if not pieces:

@@ -5,6 +5,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dln_jax.data.checks import Examination
+from dln_jax.data.checks.surrogate import Surrogate
+from dln_jax.data.checks.tree import OnTree
 from dln_jax.data.encoders import Smoothed
 from dln_jax.figures import style
 
@@ -42,7 +44,7 @@ def log_figure(examined: Examination) -> Figure:
         axes[0, 0].set_axis_off()
         axes[0, 1].set_axis_off()
     if regression is not None and smoothed is not None:
-        _delays(axes[0, 2], examined)
+        _delays(axes[0, 2], regression, on_tree, smoothed.rate)
     else:
         _steps(axes[0, 2], examined)
     for place, axis in enumerate(axes[1:].flat):
@@ -97,12 +99,9 @@ def _mark(axis: Axes, cutoff: float) -> None:
         )  # fmt: skip
 
 
-def _delays(axis: Axes, examined: Examination) -> None:
-    regression, smoothed = examined.regression, examined.smoothed
-    assert regression is not None and smoothed is not None
-    step = 1e3 / smoothed.rate
+def _delays(axis: Axes, regression: Surrogate, on_tree: OnTree | None, rate: float) -> None:
+    step = 1e3 / rate
     axis.plot(step * regression.delays, regression.delay_error, color=style.BLUE, linewidth=1.2, label="regression")
-    on_tree = examined.on_tree
     if on_tree is not None and on_tree.delays is not None and len(on_tree.delays.tried) > 1:
         axis.plot(step * on_tree.delays.tried, on_tree.delays.error, color=style.GREEN, linewidth=1.2, label="robot")
     axis.set_yscale("log")

@@ -26,8 +26,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.encoders.sampling import EVEN, stretches
+from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import stretches
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics

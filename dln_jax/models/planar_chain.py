@@ -117,19 +117,16 @@ def make_planar_chain(
             height = weight @ jnp.cos(phi)
             return -height if sideways is None else -height - sideways @ jnp.sin(phi)
 
-        friction = None if viscous is None else joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale)
-
-        def dissipation(q: Vector, qd: Vector) -> Scalar:
-            assert friction is not None
-            return friction(q, relative @ qd)
-
+        dissipation = None
+        if viscous is not None:
+            dissipation = joint_dissipation(viscous, coulomb, velocity_scale=velocity_scale, joint_map=relative)
         return ClosedForm(
             mass_matrix=mass_matrix,
             coriolis=coriolis,
             potential=None if weight is None else potential,
             gravity=None if weight is None else jax.grad(potential),
-            dissipation=None if friction is None else dissipation,
-            friction=None if friction is None else jax.grad(dissipation, argnums=1),
+            dissipation=dissipation,
+            friction=None if dissipation is None else jax.grad(dissipation, argnums=1),
         )
 
     return Model(init, energies)

@@ -7,7 +7,8 @@ import numpy as np
 
 from dln_jax.command_line.running import command_folder, write_config
 from dln_jax.data.robot_files import write_robot
-from dln_jax.figures.identification import friction_curves, torque_by_joint
+from dln_jax.figures.friction import friction_curves
+from dln_jax.figures.identification import torque_by_joint
 from dln_jax.files import write_bytes, write_figure, write_json
 from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
@@ -129,7 +130,11 @@ def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept
         still = np.zeros_like(rates)
         curves = predict(parameters_of(found.theta, case.known), still, rates, still).friction
         left = test.tau - (kept.torque - kept.friction)
-        write_figure(folder / "friction.png", friction_curves(test.qd, left, rates, curves, names, units))
+        figure = friction_curves(
+            {"identified": (rates, curves)}, names=names, measured=(test.qd, left),
+            rate_unit=["rad/s" if unit == "N m" else "m/s" for unit in units], force_unit=units,
+        )  # fmt: skip
+        write_figure(folder / "friction.png", figure)
 
 
 def write_file(folder: Path, given: Options, case: Case, found: Identification) -> list[str]:

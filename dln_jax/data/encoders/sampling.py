@@ -1,14 +1,13 @@
-"""Samples in time: stretches without a gap, their rate, and the same stretch at equal steps."""
+"""Samples in time: their rate and gaps, and a stretch at equal steps."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from dln_jax.data.stretches import GAP
 from dln_jax.types import InputError
 
-GAP = 1.5
-"""Times the median time step of its trajectory: a longer step is a gap."""
 BRIDGED = 3.5
 """Times the median time step: gaps up to it are interpolated, longer ones cut a trajectory."""
 EVEN = 1e-3
@@ -48,24 +47,6 @@ def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Tim
         longest=float(max(each.max() for each in steps)),
         rates=1 / typical,
     )
-
-
-def stretches(
-    t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
-) -> list[Int[np.ndarray, " n"]]:
-    """Indices of the samples of each stretch of one trajectory without a step above `gap` times its median step.
-
-    Raises:
-        InputError: a gap that is not longer than the median step.
-    """
-    if not gap > 1:
-        raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
-    found = []
-    for samples in _parts(np.arange(len(t)), trajectory):
-        steps = np.diff(t[samples])
-        longest = gap * np.median(steps) if len(steps) else np.inf
-        found.extend(np.split(samples, np.flatnonzero(steps > longest) + 1))
-    return found
 
 
 def even(

@@ -22,6 +22,7 @@ from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
 from dln_jax.data.encoders.noise import noise_of
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import stretches
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 4.0
@@ -95,8 +96,8 @@ def smooth(
         # Differences of times are rounded.
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
-    pieces = sampling.stretches(data.t, data.trajectory, gap=bridged)
-    gaps = len(sampling.stretches(data.t, data.trajectory)) - len(pieces)
+    pieces = stretches(data.t, data.trajectory, gap=bridged)
+    gaps = len(stretches(data.t, data.trajectory)) - len(pieces)
     uniform = _Uniform.of(data, pieces, rate)
     noise_q, noise_tau = (noise_of(values, uniform.part) for values in (uniform.q, uniform.tau))
     choice = None

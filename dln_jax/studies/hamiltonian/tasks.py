@@ -212,7 +212,7 @@ def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
 
 def to_predict(test: Trajectories) -> MeasuredWindows:
     """Stretches without a gap, as long as the shortest of several windows."""
-    parts = [each for each in stretches(test) if len(each) > WINDOW[MEASURED]]
+    parts = [each for each in stretches(test.t, test.trajectory) if len(each) > WINDOW[MEASURED]]
     if not parts:
         raise InputError(f"no test motion has {WINDOW[MEASURED] + 1} samples without a gap; record longer ones")
     index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
@@ -234,6 +234,10 @@ def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
 
 def pieces(data: Trajectories, length: int) -> Trajectories:
     """Stretches without a gap, cut to the length of two windows, as trajectories of their own: some to validate by."""
-    parts = [each[at : at + 2 * length] for each in stretches(data) for at in range(0, len(each), 2 * length)]
+    parts = [
+        each[at : at + 2 * length]
+        for each in stretches(data.t, data.trajectory)
+        for at in range(0, len(each), 2 * length)
+    ]
     index = np.arange(len(parts))
     return data._replace(trajectory=np.repeat(index, [len(part) for part in parts]), label=index.astype(str))

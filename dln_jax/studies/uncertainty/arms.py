@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories, from_arrays
@@ -91,39 +90,3 @@ def motions(
     tau = tau + noise * np.linspace(1, 0.3, d) * random.normal(size=tau.shape)
     trajectory = np.repeat(np.arange(count), len(t))
     return from_arrays({"t": np.tile(t, count), "q": q, "qd": qd, "qdd": qdd, "tau": tau, "trajectory": trajectory})
-
-
-def filtered(
-    t: Float[np.ndarray, " n"],
-    q: Float[np.ndarray, "n d"],
-    tau: Float[np.ndarray, "n d"],
-    *,
-    cutoff: float,
-    rate: float,
-    seconds: float,
-) -> dict[str, np.ndarray]:
-    """One recording without delay, rates by differences of what is filtered, in blocks that count as trajectories.
-
-    Args:
-        t: increasing.
-        q: measured.
-        tau: measured, filtered alike.
-        cutoff: of a Butterworth low-pass of fourth order, run both ways, Hz.
-        rate: of the samples that are kept, Hz.
-        seconds: of a block; half a second at both ends of the recording is left out.
-    """
-    from scipy.signal import butter, sosfiltfilt
-
-    step = float(np.median(np.diff(t)))
-    even = np.arange(t[0], t[-1], step)
-    low_pass = butter(4, cutoff, fs=1 / step, output="sos")
-    q, tau = (
-        sosfiltfilt(low_pass, np.stack([np.interp(even, t, column) for column in each.T], axis=1), axis=0)
-        for each in (q, tau)
-    )
-    qd = np.gradient(q, step, axis=0)
-    qdd = np.gradient(qd, step, axis=0)
-    inside = np.flatnonzero((even > even[0] + 0.5) & (even < even[-1] - 0.5))[:: max(1, round(1 / rate / step))]
-    block = ((even[inside] - even[inside[0]]) // seconds).astype(int)
-    arrays = {"t": even, "q": q, "qd": qd, "qdd": qdd, "tau": tau}
-    return {**{key: array[inside] for key, array in arrays.items()}, "trajectory": block}

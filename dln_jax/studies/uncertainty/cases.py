@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.data.schema import Trajectories, from_arrays
-from dln_jax.data.splits import partition_labels, select
+from dln_jax.data.encoders import smooth
+from dln_jax.data.joints import with_joints
+from dln_jax.data.schema import Trajectories, load
+from dln_jax.data.splits import in_blocks, partition_labels, select
 from dln_jax.data.splits import split as split_by_labels
 from dln_jax.datasets.generators import characters, uniform
 from dln_jax.learning import dynamics as problems
@@ -30,11 +32,13 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
-from dln_jax.studies.uncertainty.arms import UR10, VELOCITY_SCALE, arm, filtered, motions, plant
+from dln_jax.studies.uncertainty.arms import UR10, VELOCITY_SCALE, arm, motions, plant
 
 LOWEST, HIGHEST = 0.90, 0.98
 """Of the coverage to reach."""
 NEGLIGIBLE = 1e-12
+TRIM, BLOCK = 0.5, 2.0
+"""s: left out at both ends of a recording, and of a block that counts as a trajectory."""
 
 
 class HeldOut(NamedTuple):
@@ -151,34 +155,26 @@ def recording(name: str, model: Model, data: Trajectories, *, splits: int) -> Fi
 
 def ur10(path: Path) -> tuple[Model, Trajectories]:
     """The recording of an UR10 in blocks of 2 s, filtered at 8 Hz, and the rigid tree of its frames."""
-    with np.load(path, allow_pickle=False) as file:
-        names = [str(each) for each in file["joint_names"]]
-        order = [names.index(f"{each}_joint") for each in _UR10_JOINTS]
-        arrays = filtered(file["t"], file["q"][:, order], file["tau"][:, order], cutoff=8.0, rate=60.0, seconds=2.0)
+    data = with_joints(load(path), tuple(f"{each}_joint" for each in _UR10_JOINTS))
+    data = smooth(data, 8.0, decimate=2, trim=TRIM).data
+    data = in_blocks(data, round((data.t[-1] - data.t[0]) / BLOCK))
     link = inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
     tree = serial(*dh_frames(UR10), [link] * 6, armature=np.ones(6))
-    return make_rigid_tree(tree, friction=True, velocity_scale=0.02), from_arrays(arrays)
+    return make_rigid_tree(tree, friction=True, velocity_scale=0.02), data
 
 
 _UR10_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 def double_pendulum(path: Path) -> tuple[Model, Trajectories]:
-    """Recordings of a double pendulum, filtered at 15 Hz, in blocks of 2 s, and its rigid tree in a vertical plane."""
-    parts = []
-    with np.load(path, allow_pickle=False) as file:
-        whole = {key: file[key] for key in ("t", "q", "tau", "trajectory")}
-    for index in np.unique(whole["trajectory"]):
-        t, q, tau = (whole[key][whole["trajectory"] == index] for key in ("t", "q", "tau"))
-        parts.append(filtered(t, q, tau, cutoff=15.0, rate=60.0, seconds=1e9))
-        parts[-1]["trajectory"] += index
-    arrays = {key: np.concatenate([each[key] for each in parts]) for key in parts[0]}
+    """Recordings of a double pendulum, filtered at 15 Hz, and its rigid tree in a vertical plane."""
     link = inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
     tree: Tree = serial(
         np.stack([np.eye(3)] * 2), np.array([[0, 0, 0], [0.3, 0, 0]]), [link] * 2, armature=np.ones(2) * 1e-2,
         gravity=np.array([9.81, 0, 0]),
     )  # fmt: skip
-    return make_rigid_tree(tree, friction=True, velocity_scale=0.1), from_arrays(arrays)
+    model = make_rigid_tree(tree, friction=True, velocity_scale=0.1)
+    return model, smooth(load(path), 15.0, decimate=8, trim=TRIM).data
 
 
 def _linear(

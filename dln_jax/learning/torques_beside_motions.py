@@ -1,0 +1,92 @@
+"""Measured motions and the torques of the same samples, in one objective.
+
+    loss = mean over windows of |r_w|² + share * mean over samples of sum_j ((tau_hat_j - tau_j) / noise_j)²
+
+with r_w of `learning.measured_motions` and tau_hat = tau_hat(q, qd, qdd) of filtered motions. Matched motions give the
+parameters that predict; but where forces act that nobody measured, accelerations that follow from them enter the
+torques of filtered motions, and the parameters that explain those best are others. The share says what is wanted.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.data.magnitudes import on_device
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import GAP, window_indices
+from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import InputError, Scalar, require_positive
+
+
+class TorqueWindows(NamedTuple):
+    """The samples of W windows; the shorter ones repeat their last sample, with weight zero."""
+
+    q: np.ndarray
+    """[W, T, d], and so on."""
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+    weight: np.ndarray
+    """1 for a sample, 0 for a repeated one [W, T]."""
+
+
+def cut_torque_windows(data: Trajectories, length: int, *, gap: float = GAP) -> TorqueWindows:
+    """The windows that `cut_measured_windows` cuts of data with the same times; arguments and errors as there."""
+    indices, weight = window_indices(data, length, gap=gap)
+    return TorqueWindows(*(getattr(data, key)[indices] for key in ("q", "qd", "qdd", "tau")), weight)
+
+
+def with_torques(
+    task: Problem,
+    model: Model,
+    windows: TorqueWindows,
+    validation: TorqueWindows,
+    *,
+    noise: tuple[float, ...],
+    share: float,
+) -> Problem:
+    """The fit of measured motions, with torques beside them; selected is what is best for both on validation windows.
+
+    Args:
+        task: that of `measured_motions.problem`.
+        model: the same.
+        windows: to fit, as many as there are motions.
+        validation: to select by.
+        noise: of the torque of each joint [d], or what a fit of torques alone is off by, N m or N.
+        share: of the torques in the loss.
+
+    Raises:
+        InputError: another number of windows, or a noise or share that is not positive.
+    """
+    require_positive(share=share)
+    for deviation in noise:
+        require_positive(noise=deviation)
+    if (motions := len(task.arrays[0])) != len(windows.q):
+        raise InputError(f"there are {len(windows.q)} windows of torques, {motions} of motions; cut both alike")
+    fitted, held_out = (
+        tuple(on_device(key, array, jnp.float64) for key, array in each._asdict().items())
+        for each in (windows, validation)
+    )
+    split = len(task.arrays)
+    motion_residual = task.residual
+    if motion_residual is None:
+        raise InputError("the problem has no residual; give that of measured_motions.problem")
+
+    def torque_error(parameters: Parameters, q: Array, qd: Array, qdd: Array, tau: Array, weight: Array) -> Array:
+        off = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(q, qd, qdd) - tau
+        return jnp.ravel(jnp.sqrt(share * weight / jnp.sum(weight))[:, None] * off / jnp.asarray(noise))
+
+    def residual(parameters: Parameters, *window: Array) -> Array:
+        motion, torque = motion_residual(parameters, *window[:split]), torque_error(parameters, *window[split:])
+        return jnp.concatenate([jnp.ravel(motion), torque])
+
+    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+        torques = mean_square(lambda *window: torque_error(parameters, *window), held_out)
+        return unmonitored(task.score(parameters)[0] + torques)
+
+    return task._replace(residual=residual, arrays=(*task.arrays, *fitted), score=score)
