@@ -22,6 +22,7 @@ from dln_jax.control.tracking import (
     limited,
     trusted,
 )
+from dln_jax.control.trajectories import Plan, Problem, first_plan, improve, optimise, receding
 
 __all__ = [
     "Controller",
@@ -30,6 +31,8 @@ __all__ = [
     "Laboratory",
     "Linearisation",
     "Parts",
+    "Plan",
+    "Problem",
     "Reference",
     "Region",
     "Regulator",
@@ -41,14 +44,18 @@ __all__ = [
     "error",
     "feed_forward",
     "field_of",
+    "first_plan",
     "gravity_compensation",
     "holding_controls",
+    "improve",
     "limited",
     "linearise",
     "lqr",
+    "optimise",
     "partial_linearisation",
     "parts_of",
     "passive_energy",
+    "receding",
     "region_of_attraction",
     "regulated",
     "sampled_lqr",
