@@ -25,6 +25,7 @@ FLOORS = {
     "learning": 5,
     "metrics": 6,
     "deploy": 6,
+    "control": 4,
     "excitation": 6,
     "identification": 6,
     "figures": 7,

@@ -7,11 +7,14 @@ from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.registry import SCENES, scene_named
+from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
 from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
+from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
 
 __all__ = [
     "SCENES",
+    "Links",
     "Scene",
     "actuation_matrix",
     "cart_pole",
@@ -23,6 +26,8 @@ __all__ = [
     "mass_spring",
     "n_body",
     "pendulum",
+    "rotary_pendulum",
     "scene_named",
     "two_link_arm",
+    "two_link_pendulum",
 ]

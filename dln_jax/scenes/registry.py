@@ -8,8 +8,10 @@ from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.scenes.pendulum import pendulum
+from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.scenes.two_link_pendulum import two_link_pendulum
 from dln_jax.types import InputError
 
 SCENES: dict[str, Callable[[], Scene]] = {
@@ -18,6 +20,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "pendulum": pendulum,
     "double-pendulum": double_pendulum,
     "cart-pole": cart_pole,
+    "rotary-pendulum": rotary_pendulum,
+    "acrobot": lambda: two_link_pendulum("elbow"),
+    "pendubot": lambda: two_link_pendulum("shoulder"),
     "mass-spring": mass_spring,
     "henon-heiles": henon_heiles,
     "two-body": lambda: n_body(2),

@@ -1,8 +1,8 @@
-"""A recorded arm whose file is known, blocks of time held out: ours, with a network or not, and Pinocchio's regressor.
+"""A recorded arm, blocks held out: the tree of its file, with a network or not, a learned one, and Pinocchio's fit.
 
 The log is cut into ten blocks; two neighbours at a time are held out, and every other sample is predicted by a model
 that has not seen its block. Errors are over the variance of the whole log, so that a block in which a joint rests does
-not count for more. Laws of friction and the network are chosen by blocks of what is fitted.
+not count for more. Laws of friction, the network and the learned frames are chosen by blocks of what is fitted.
 """
 
 import functools
@@ -21,12 +21,14 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import in_blocks, select
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.friction import FrictionFit, fit_friction
+from dln_jax.learning.kinematics import fit_tree
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import Tree
+from dln_jax.models.serial_tree import tree_of
 from dln_jax.studies.case import Findings
 from dln_jax.studies.report import Row, expect
 from dln_jax.studies.robots.rivals import regression
-from dln_jax.types import FrictionLaw
+from dln_jax.types import FrictionLaw, Needs
 
 BLOCKS = 10
 CUTOFF, DECIMATE = 5.0, 2
@@ -39,6 +41,8 @@ LAWS: tuple[tuple[FrictionLaw, ...], ...] = (
 """That are chosen from."""
 USUAL_SCALE = 0.01
 """rad/s, of the rival's dry friction, which it does not fit."""
+LEARNED_SCALES = (0.01, 0.1)
+"""rad/s, of the dry friction of a learned tree while its frames are found; chosen from."""
 CHOOSING = 4
 """Every so manyth block of those that are fitted chooses."""
 
@@ -79,10 +83,20 @@ def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:
         "chosen-friction": predictor(*_parts(full)),
         "with-residual": predictor(with_network.model, with_network.parameters),
     }
+    found["learned-tree"] = predictor(*_parts(fit_friction(learned(tree.needs, train, validation), data, laws)))
     rival = regression(tree, data, velocity_scale=USUAL_SCALE)
     if rival is not None:
         found["pinocchio"] = lambda held: rival.torque(held.q, held.qd, held.qdd)
     return found
+
+
+def learned(needs: Needs, train: Trajectories, validation: Trajectories) -> Tree:
+    """A tree whose frames come from these motions alone."""
+    wanted = needs._replace(friction=True)
+    fits = [fit_tree(wanted, train, validation, velocity_scale=scale) for scale in LEARNED_SCALES]
+    best = min(fits, key=lambda fit: fit.validation_error)
+    tree = tree_of(best.parameters, wanted)
+    return tree._replace(rotations=np.asarray(tree.rotations), positions=np.asarray(tree.positions))
 
 
 def predictor(model: Any, parameters: Any) -> Predict:

@@ -1,0 +1,69 @@
+"""From an energy to a controller, known or learned: tracking, regulators, swing-up, and the closed loop around them."""
+
+from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
+from dln_jax.control.closed_loop import Controller, Laboratory, Run, simulate, stateless, with_differences
+from dln_jax.control.energy_shaping import (
+    EnergyGains,
+    Parts,
+    energy_shaping,
+    partial_linearisation,
+    parts_of,
+    passive_energy,
+)
+from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
+from dln_jax.control.state_space import Linearisation, field_of, holding_controls, linearise
+from dln_jax.control.tracking import (
+    Gains,
+    Reference,
+    Tracker,
+    computed_torque,
+    feed_forward,
+    gravity_compensation,
+    limited,
+    trusted,
+)
+from dln_jax.control.trajectories import Plan, Problem, first_plan, improve, optimise, receding
+
+__all__ = [
+    "Controller",
+    "EnergyGains",
+    "Gains",
+    "Laboratory",
+    "Linearisation",
+    "Parts",
+    "Plan",
+    "Problem",
+    "Reference",
+    "Region",
+    "Regulator",
+    "Run",
+    "SampledRegulators",
+    "Tracker",
+    "computed_torque",
+    "energy_shaping",
+    "error",
+    "feed_forward",
+    "field_of",
+    "first_plan",
+    "gravity_compensation",
+    "holding_controls",
+    "improve",
+    "limited",
+    "linearise",
+    "lqr",
+    "optimise",
+    "partial_linearisation",
+    "parts_of",
+    "passive_energy",
+    "receding",
+    "region_of_attraction",
+    "regulated",
+    "sampled_lqr",
+    "simulate",
+    "stateless",
+    "switched",
+    "time_varying_lqr",
+    "trusted",
+    "value",
+    "with_differences",
+]

@@ -1,0 +1,157 @@
+"""The loop of a plant in continuous time and a controller at its samples, with what a laboratory does to both.
+
+At each sample the controller is given the measured coordinates and answers with controls; these are limited, come late
+by whole samples, have noise added, and are held until the next while the plant is integrated by the classical
+Runge-Kutta method. `vmap` over starts and keys gives many runs in one program.
+
+A control that is not finite stays so, and so does everything after it: a failure is never hidden.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.state_space import Field
+from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
+from dln_jax.types import InputError, require_positive
+
+
+class Controller(NamedTuple):
+    """A law with a memory, such as a filter, an observer or a plan; pure."""
+
+    start: Any
+    """Memory before the first sample, any tree of arrays."""
+    act: Callable[[Any, Array, Array], tuple[Any, Array]]
+    """(memory, t, measured y) -> (memory, u [m])."""
+
+
+class Laboratory(NamedTuple):
+    """What stands between a controller and a plant; by default nothing."""
+
+    least: Any = -jnp.inf
+    """Limits of the controls [m], or one for all."""
+    most: Any = jnp.inf
+    encoder_step: Any = 0.0
+    """Of the coordinates q, rad or m, which are rounded to it; 0 rounds nothing."""
+    encoder_noise: Any = 0.0
+    """Standard deviation that is added to q before, rad or m."""
+    control_noise: Any = 0.0
+    """Standard deviation that is added to the controls after their limits."""
+    delay: int = 0
+    """Samples for which a control is on its way."""
+    sees_rates: bool = True
+    """Whether the controller is given qd too, free of noise; else y = q."""
+
+
+class Run(NamedTuple):
+    """A run of N samples."""
+
+    t: Float[Array, "N+1"]
+    x: Float[Array, "N+1 n"]
+    """True states, the first and those at the end of each sample."""
+    u: Float[Array, "N m"]
+    """What drove the plant."""
+    y: Float[Array, "N p"]
+    """What the controller was given."""
+
+
+def stateless(law: Callable[[Array], Array]) -> Controller:
+    """A controller without a memory: y -> u."""
+    return Controller((), lambda memory, t, y: (memory, law(y)))
+
+
+def with_differences(law: Callable[[Array], Array], d: int, *, rate: float, cutoff: float) -> Controller:
+    """A law of (q, qd) where q alone is measured: rates by differences and a low-pass of first order.
+
+    Args:
+        law: (q, qd) in one vector [2 d] -> u.
+        d: coordinates.
+        rate: of the samples, Hz.
+        cutoff: of the low-pass, Hz.
+
+    Raises:
+        InputError: a rate or a cut-off that is not positive.
+    """
+    require_positive(rate=rate, cutoff=cutoff)
+    share = -jnp.expm1(-2 * jnp.pi * cutoff / rate)
+
+    def act(memory: tuple[Array, Array, Array], t: Array, y: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        before, qd, seen = memory
+        # Of the first sample there is no difference.
+        qd = jnp.where(seen, qd + share * ((y - before) * rate - qd), 0.0)
+        return (y, qd, jnp.ones_like(seen)), law(jnp.concatenate([y, qd]))
+
+    return Controller((jnp.zeros(d), jnp.zeros(d), jnp.zeros((), bool)), act)
+
+
+def simulate(
+    field: Field,
+    controller: Controller,
+    x: Any,
+    *,
+    seconds: float,
+    rate: float,
+    controls: int,
+    laboratory: Laboratory = Laboratory(),  # noqa: B008
+    key: Array | None = None,
+    substeps: int = 1,
+) -> Run:
+    """A run of the closed loop from a state, traceable and differentiable.
+
+    Args:
+        field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
+        controller: asked once a sample.
+        x: the start [2 d].
+        seconds: of the run.
+        rate: of the samples, Hz.
+        controls: m.
+        laboratory: limits, noise, delay.
+        key: of the noise; needed where there is any.
+        substeps: of the integrator in a sample.
+
+    Raises:
+        InputError: settings out of range, or noise without a key.
+    """
+    require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
+    lab = laboratory
+    if lab.delay < 0 or lab.delay != int(lab.delay):
+        raise InputError(f"delay is {lab.delay}; expected a whole number of samples, 0 or more")
+    noisy = any(not isinstance(each, int | float) or each != 0 for each in (lab.encoder_noise, lab.control_noise))
+    if noisy and key is None:
+        raise InputError("the laboratory has noise; give a key of jax.random, a new one for each run")
+    key = jax.random.key(0) if key is None else key
+    samples, dt = round(seconds * rate), 1.0 / rate
+    x = jnp.asarray(x, float)
+    d = x.shape[0] // 2
+    waiting = jnp.zeros((lab.delay, controls), x.dtype)
+
+    def sample(carry: tuple, number: Array) -> tuple[tuple, tuple[Array, Array, Array]]:
+        x, memory, waiting = carry
+        of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
+        q = x[:d]
+        if noisy:
+            q = q + lab.encoder_noise * jax.random.normal(of_encoder, (d,), x.dtype)
+        y = jnp.concatenate([rounded(q, lab.encoder_step), x[d:]] if lab.sees_rates else [rounded(q, lab.encoder_step)])
+        memory, wanted = controller.act(memory, number * dt, y)
+        queue = jnp.concatenate([waiting, jnp.clip(wanted, lab.least, lab.most)[None]])
+        u, waiting = queue[0], queue[1:]
+        if noisy:
+            u = u + lab.control_noise * jax.random.normal(of_control, (controls,), x.dtype)
+        step = runge_kutta(CLASSICAL, lambda t, state: field(state, u))
+        for _ in range(substeps):
+            x = step(0.0, x, dt / substeps)
+        return (x, memory, waiting), (x, u, y)
+
+    start = (x, controller.start, waiting)
+    _, (later, u, y) = jax.lax.scan(sample, start, jnp.arange(samples))
+    return Run(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
+
+
+def rounded(q: Array, step: Any) -> Array:
+    """The reading of an encoder of this step."""
+    step = jnp.asarray(step)
+    return jnp.where(step > 0, step * jnp.round(q / jnp.where(step > 0, step, 1.0)), q)

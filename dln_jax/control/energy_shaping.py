@@ -1,0 +1,110 @@
+"""Swing-up by energy, for systems with passive joints (Spong 1995, "The swing up control problem for the acrobot").
+
+Collocated partial feedback linearisation gives the active joints any acceleration a; the passive rows of the equations
+of motion, which no motor touches, give the other accelerations. With h = c + g + friction,
+
+    qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
+
+The passive part, with the active joints held, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active joints
+does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.types import InputError, Scalar, Vector
+
+
+class EnergyGains(NamedTuple):
+    """Of the accelerations of the active joints."""
+
+    energy: float
+    """1/(kg m² J s) for revolute joints: from M_ap qd_p and the energy's error to an acceleration."""
+    proportional: float
+    """1/s²."""
+    derivative: float
+    """1/s."""
+
+
+class Parts(NamedTuple):
+    """Which coordinates are driven and which are not."""
+
+    active: tuple[int, ...]
+    passive: tuple[int, ...]
+
+
+def parts_of(actuation: Any) -> Parts:
+    """From the matrix [d, u] in tau = B u, each of whose motors drives one coordinate.
+
+    Raises:
+        InputError: motors that drive several coordinates, or no passive one.
+    """
+    B = np.asarray(actuation, float)
+    driven = (B != 0).sum(axis=1)
+    active = tuple(np.flatnonzero(driven).tolist())
+    if B.ndim != 2 or (driven > 1).any() or ((B != 0).sum(axis=0) != 1).any() or len(active) == len(B):
+        raise InputError(
+            f"actuation is {B.tolist()}; expected motors that drive one coordinate each, and some coordinate without"
+        )
+    return Parts(active, tuple(np.setdiff1d(np.arange(len(B)), active).tolist()))
+
+
+def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Vector, Array], Array]:
+    """(q, qd, accelerations of the active joints) -> their forces, exact where M_pp is regular."""
+    active, passive = map(np.array, parts)
+
+    def forces(q: Vector, qd: Vector, a: Array) -> Array:
+        M = plant.mass_matrix(q)
+        h = plant.inverse_dynamics(q, qd, jnp.zeros_like(qd))
+        coupling = M[np.ix_(active, passive)]
+        others = -jnp.linalg.solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
+        return M[np.ix_(active, active)] @ a + coupling @ others + h[active]
+
+    return forces
+
+
+def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
+    """(q, qd) -> energy of the passive part with the active joints held at the goal, J, less that at the goal."""
+    active, passive = map(np.array, parts)
+    goal = jnp.asarray(goal, float)
+
+    def energy(q: Vector, qd: Vector) -> Scalar:
+        held = q.at[active].set(goal[active])
+        moving = jnp.zeros_like(qd).at[passive].set(qd[passive])
+        return plant.energy(held, moving) - plant.energy(goal, jnp.zeros_like(qd))
+
+    return energy
+
+
+def energy_shaping(
+    plant: Dynamics | PlainDynamics, parts: Parts, goal: Sequence[float] | Array, gains: EnergyGains
+) -> Callable[[Vector, Vector], Array]:
+    """(q, qd) -> forces of the active joints that bring the passive ones to the energy of the goal, and theirs home.
+
+    Args:
+        plant: a model with energies, known or learned; friction that it has is compensated at the active joints.
+        parts: which joints are driven.
+        goal: posture [d].
+        gains: of the accelerations.
+
+    Raises:
+        InputError: a model without energies.
+    """
+    if not isinstance(plant, Dynamics):
+        raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
+    active, passive = map(np.array, parts)
+    forces, energy = partial_linearisation(plant, parts), passive_energy(plant, parts, goal)
+    home = jnp.asarray(goal, float)[active]
+
+    def law(q: Vector, qd: Vector) -> Array:
+        coupling = plant.mass_matrix(q)[np.ix_(active, passive)]
+        pumping = gains.energy * energy(q, qd) * (coupling @ qd[passive])
+        a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
+        return forces(q, qd, a)
+
+    return law

@@ -1,0 +1,90 @@
+"""Mechanical systems in state space, x = (q, qd): their field, and its linearisation at a state."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.types import InputError, Vector
+
+Field = Callable[[Array, Array], Array]
+"""(x [n], u [m]) -> dx/dt [n]."""
+
+
+class Linearisation(NamedTuple):
+    """d(x - x0)/dt = A (x - x0) + B (u - u0) about a point where dx/dt = 0."""
+
+    A: Float[Array, "n n"]
+    B: Float[Array, "n m"]
+    x: Vector
+    u: Vector
+
+
+def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
+    """The field of a mechanical system, on x = (q, qd) [2 d] and the controls u [m].
+
+    Args:
+        plant: such as `mechanics.equations.dynamics` gives.
+        actuation: matrix [d, m] in tau = actuation u; by default each coordinate has its own motor.
+    """
+
+    def field(x: Array, u: Array) -> Array:
+        q, qd = jnp.split(x, 2)
+        tau = u if actuation is None else jnp.asarray(actuation) @ u
+        return jnp.concatenate([qd, plant.forward_dynamics(q, qd, tau)])
+
+    return field
+
+
+def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linearisation:
+    """The linearisation at an equilibrium, by forward-mode derivatives.
+
+    Args:
+        field: (x, u) -> dx/dt.
+        x: state [n] at rest.
+        u: controls [m] that hold it.
+        tolerance: of |dx/dt| at (x, u), in the units of the field.
+
+    Raises:
+        InputError: (x, u) is no equilibrium.
+    """
+    x, u = jnp.asarray(x, float), jnp.asarray(u, float)
+    rest = field(x, u)
+    if not bool(jnp.max(jnp.abs(rest)) <= tolerance):
+        raise InputError(
+            f"the goal is no equilibrium: dx/dt is {float(jnp.max(jnp.abs(rest))):.3g} there, above {tolerance:g}; "
+            "give a state at rest and the controls that hold it"
+        )
+    A, B = jax.jacfwd(field, argnums=(0, 1))(x, u)
+    return Linearisation(A, B, x, u)
+
+
+def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, tolerance: float = 1e-6) -> Array:
+    """Controls [m] at which the plant stays in the posture q.
+
+    Args:
+        plant: whose gravity is held.
+        q: posture [d].
+        actuation: as for `field_of`.
+        tolerance: N m or N, of what the motors leave.
+
+    Raises:
+        InputError: no controls hold it.
+    """
+    rest = jnp.zeros_like(jnp.asarray(q, float))
+    weight = plant.inverse_dynamics(jnp.asarray(q, float), rest, rest)
+    if actuation is None:
+        return weight
+    B = jnp.asarray(actuation, float)
+    u = jnp.linalg.lstsq(B, weight)[0]
+    left = float(jnp.max(jnp.abs(B @ u - weight)))
+    if not left <= tolerance:
+        raise InputError(
+            f"no controls hold the posture: {left:.3g} N m or N is left over at a coordinate without a motor; "
+            "give an equilibrium"
+        )
+    return u

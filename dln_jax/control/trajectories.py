@@ -1,0 +1,196 @@
+"""Trajectories of least cost with limited controls, by iterative linear-quadratic regulators, and their use as MPC.
+
+    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
+
+An iteration expands f to first and the costs to second order about the plan (Gauss-Newton: Li and Todorov 2004), solves
+for u_k = ū_k + k_k + K_k (x_k - x̄_k) backwards, with the limits as a small quadratic program in each step (Tassa,
+Mansard and Todorov 2014), and takes the best of several step lengths at once. A damping of the controls' Hessian grows
+where no step is better, and shrinks where one is. Everything is traced: a plan is a tree of arrays.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+
+from dln_jax.types import InputError, Scalar, require_positive
+
+STEP_LENGTHS = 0.5 ** np.arange(10)
+LEAST_DAMPING, MOST_DAMPING, FIRST_DAMPING = 1e-9, 1e9, 1e-3
+"""Of the controls' Hessian, relative to the mean of its diagonal."""
+PROJECTED_STEPS = 8
+"""Of Newton's method in the quadratic program of a step."""
+
+
+class Problem(NamedTuple):
+    """What is to be minimised."""
+
+    step: Callable[[Array, Array], Array]
+    """(x [n], u [m]) -> x' [n], such as an integrator's."""
+    cost: Callable[[Array, Array], Scalar]
+    """(x, u) -> of one step."""
+    final_cost: Callable[[Array], Scalar]
+    """x -> of the last state."""
+    least: Any = -jnp.inf
+    """Limits of the controls, [m] or one for all."""
+    most: Any = jnp.inf
+
+
+class Plan(NamedTuple):
+    """N steps from a state."""
+
+    u: Float[Array, "N m"]
+    x: Float[Array, "N+1 n"]
+    K: Float[Array, "N m n"]
+    """u_k + K_k (x - x_k) is the plan's control at a state beside it."""
+    cost: Float[Array, ""]
+    damping: Float[Array, ""]
+    better: Bool[Array, ""]
+    """Whether the last iteration found a lower cost."""
+
+
+def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
+    """The plan of given controls [N, m] from a state [n]; `InputError` for other shapes."""
+    x, u = jnp.asarray(x, float), jnp.asarray(u, float)
+    if x.ndim != 1 or u.ndim != 2 or not len(u):
+        raise InputError(f"x has shape {x.shape}, u {u.shape}; expected a state [n] and controls [N, m]")
+    # Without gains it does not matter which states the controls are planned about.
+    about, K = jnp.tile(x, (len(u) + 1, 1)), jnp.zeros((*u.shape, x.shape[0]), x.dtype)
+    damping = jnp.asarray(FIRST_DAMPING, x.dtype)
+    plan = Plan(u, about, K, jnp.zeros((), x.dtype), damping, jnp.asarray(True))
+    states, u, cost = _follow(problem, x, plan)
+    return plan._replace(u=u, x=states, cost=cost)
+
+
+def improve(problem: Problem, plan: Plan) -> Plan:
+    """One iteration; the cost never rises."""
+    k, K = _backward(problem, plan)
+    lengths = jnp.asarray(STEP_LENGTHS, plan.u.dtype)
+    x, u, costs = jax.vmap(lambda length: _follow(problem, plan.x[0], plan._replace(u=plan.u + length * k, K=K)))(
+        lengths
+    )
+    # A cost that is no number is none that is lower.
+    best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
+    better = costs[best] < plan.cost
+    found = Plan(u[best], x[best], K, costs[best], jnp.maximum(plan.damping / 10, LEAST_DAMPING), better)
+    kept = plan._replace(K=K, damping=jnp.minimum(plan.damping * 10, MOST_DAMPING), better=better)
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, kept)
+
+
+def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
+    """Iterations from given controls until the cost falls by less than a share of it, or no step is better at all.
+
+    Args:
+        problem: to solve.
+        x: the start [n].
+        u: first controls [N, m].
+        iterations: at most.
+        tolerance: relative change of the cost.
+    """
+    require_positive(iterations=iterations, tolerance=tolerance)
+    plan = first_plan(problem, x, u)
+
+    def going(carry: tuple[Array, Plan, Array]) -> Array:
+        number, plan, fell = carry
+        hopeless = jnp.logical_not(plan.better) & (plan.damping >= MOST_DAMPING)
+        small = plan.better & (fell <= tolerance * jnp.abs(plan.cost))
+        return (number < iterations) & ~hopeless & ~(small & (number > 0))
+
+    def iterate(carry: tuple[Array, Plan, Array]) -> tuple[Array, Plan, Array]:
+        number, plan, _ = carry
+        found = improve(problem, plan)
+        return number + 1, found, plan.cost - found.cost
+
+    start = (jnp.asarray(0), plan, jnp.asarray(jnp.inf, plan.u.dtype))
+    return jax.lax.while_loop(going, iterate, start)[1]
+
+
+def receding(problem: Problem, *, iterations: int = 1) -> Callable[[Array, Plan], tuple[Array, Plan]]:
+    """Model-predictive control: (state, plan) -> (control, plan), the plan moved on by one step and improved.
+
+    Start with `first_plan` or `optimise`, whose first control is for its first state.
+
+    Args:
+        problem: over the horizon.
+        iterations: a call, always as many.
+    """
+    require_positive(iterations=iterations)
+
+    def act(x: Array, plan: Plan) -> tuple[Array, Plan]:
+        # Feedback about the old plan makes good what the state is off, which alone may be unstable.
+        states, u, cost = _follow(problem, x, plan)
+        now = plan._replace(x=states, u=u, cost=cost)
+        for _ in range(iterations):
+            now = improve(problem, now)
+        moved = jnp.concatenate([now.u[1:], now.u[-1:]])
+        gains = jnp.concatenate([now.K[1:], now.K[-1:]])
+        last = problem.step(now.x[-1], now.u[-1])
+        return now.u[0], now._replace(u=moved, K=gains, x=jnp.concatenate([now.x[1:], last[None]]))
+
+    return act
+
+
+def _follow(problem: Problem, x: Array, plan: Plan) -> tuple[Array, Array, Array]:
+    """States, controls and cost from a state by the plan and its gains."""
+
+    def step(x: Array, now: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
+        planned, u, K = now
+        u = jnp.clip(u + K @ (x - planned), problem.least, problem.most)
+        return problem.step(x, u), (x, u, problem.cost(x, u))
+
+    last, (states, u, costs) = jax.lax.scan(step, x, (plan.x[:-1], plan.u, plan.K))
+    return jnp.concatenate([states, last[None]]), u, jnp.sum(costs) + problem.final_cost(last)
+
+
+def _backward(problem: Problem, plan: Plan) -> tuple[Array, Array]:
+    """k [N, m] and K [N, m, n]."""
+    n = plan.x.shape[1]
+
+    def of_both(function: Callable[..., Any]) -> Callable[[Array], Any]:
+        return lambda xu: function(xu[:n], xu[n:])
+
+    both = jnp.concatenate([plan.x[:-1], plan.u], axis=1)
+    slopes = jax.vmap(jax.jacfwd(of_both(problem.step)))(both)
+    gradients = jax.vmap(jax.grad(of_both(problem.cost)))(both)
+    curvatures = jax.vmap(jax.hessian(of_both(problem.cost)))(both)
+    low, high = (jnp.broadcast_to(jnp.asarray(each, plan.u.dtype), plan.u.shape) - plan.u for each in problem[3:])
+
+    def back(value: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        g, H = value
+        slope, gradient, curvature, low, high = now
+        q, Q = gradient + slope.T @ g, curvature + slope.T @ H @ slope
+        qx, qu, Qxx, Qux, Quu = q[:n], q[n:], Q[:n, :n], Q[n:, :n], Q[n:, n:]
+        size = jnp.mean(jnp.abs(jnp.diagonal(Quu)))
+        k, K = _limited_quadratic(Quu + plan.damping * size * jnp.eye(len(qu)), qu, Qux, low, high)
+        g = qx + K.T @ Quu @ k + K.T @ qu + Qux.T @ k
+        H = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
+        return (g, (H + H.T) / 2), (k, K)
+
+    end = jax.grad(problem.final_cost)(plan.x[-1]), jax.hessian(problem.final_cost)(plan.x[-1])
+    _, (k, K) = jax.lax.scan(back, end, (slopes, gradients, curvatures, low, high), reverse=True)
+    return k, K
+
+
+def _limited_quadratic(Q: Array, q: Array, cross: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """k that minimises ½ kᵀ Q k + qᵀ k within limits, by projected Newton steps, and the gains of what is free."""
+
+    def pinned(k: Array) -> Array:
+        slope = Q @ k + q
+        return ((k <= low) & (slope > 0)) | ((k >= high) & (slope < 0))
+
+    def free_part(fixed: Array) -> Array:
+        free = ~fixed
+        return jnp.where(free[:, None] & free, Q, jnp.eye(len(q), dtype=Q.dtype))
+
+    def newton(k: Array, _: Any) -> tuple[Array, None]:
+        fixed = pinned(k)
+        change = jnp.linalg.solve(free_part(fixed), jnp.where(fixed, 0.0, Q @ k + q))
+        return jnp.clip(k - change, low, high), None
+
+    k, _ = jax.lax.scan(newton, jnp.clip(jnp.zeros_like(q), low, high), length=1 if len(q) == 1 else PROJECTED_STEPS)
+    fixed = pinned(k)
+    return k, -jnp.linalg.solve(free_part(fixed), jnp.where(fixed[:, None], 0.0, cross))

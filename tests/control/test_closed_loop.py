@@ -1,0 +1,76 @@
+"""The loop does to measurements and controls what the laboratory says, and hides no failure."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import Controller, Laboratory, simulate, stateless, with_differences
+from dln_jax.types import InputError
+
+FIELD = lambda x, u: jnp.concatenate([x[1:], u])  # noqa: E731  a mass of 1 kg
+SETTINGS = {"seconds": 0.2, "rate": 100.0, "controls": 1}
+COUNTING = Controller(jnp.zeros(()), lambda number, t, y: (number + 1, number[None] + 1))
+
+
+def test_controls_are_held_and_integrated_exactly():
+    run = simulate(FIELD, COUNTING, [0.0, 0.0], **SETTINGS)
+    np.testing.assert_allclose(run.u[:, 0], np.arange(1, 21))
+    np.testing.assert_allclose(run.x[1:, 1], 0.01 * np.cumsum(np.arange(1, 21)), rtol=1e-12)
+    np.testing.assert_allclose(run.t, 0.01 * np.arange(21))
+
+
+def test_limits_and_delay():
+    run = simulate(FIELD, COUNTING, [0.0, 0.0], laboratory=Laboratory(most=5.0, delay=3), **SETTINGS)
+    np.testing.assert_array_equal(run.u[:, 0], np.minimum(np.maximum(np.arange(20) - 2, 0), 5))
+
+
+def test_encoders_round_and_rates_come_from_differences():
+    seen = with_differences(lambda x: x[1:], 1, rate=100.0, cutoff=1e6)
+    lab = Laboratory(encoder_step=1e-3, sees_rates=False)
+    coasting = simulate(lambda x, u: jnp.array([x[1], 0.0]), seen, [0.0, 0.37], laboratory=lab, **SETTINGS)
+    assert coasting.y.shape == (20, 1)
+    np.testing.assert_allclose(coasting.y / 1e-3, np.round(coasting.y / 1e-3), atol=1e-9)
+    assert coasting.u[0, 0] == 0 and np.abs(coasting.u[1:, 0] - 0.37).max() <= 0.1 + 1e-9
+
+
+def test_noise_has_its_size_and_its_seed():
+    lab = Laboratory(encoder_noise=0.1, control_noise=0.5)
+    still = stateless(lambda y: jnp.zeros(1))
+    run = lambda seed: simulate(  # noqa: E731
+        lambda x, u: jnp.zeros(2),
+        still,
+        [0.0, 0.0],
+        laboratory=lab,
+        key=jax.random.key(seed),
+        seconds=40.0,
+        rate=100.0,
+        controls=1,
+    )
+    first = run(0)
+    assert first.y[:, 0].std() == pytest.approx(0.1, rel=0.05) and first.u.std() == pytest.approx(0.5, rel=0.05)
+    np.testing.assert_array_equal(first.u, run(0).u)
+    assert not np.array_equal(first.u, run(1).u)
+    with pytest.raises(InputError, match="give a key"):
+        simulate(FIELD, still, [0.0, 0.0], laboratory=lab, **SETTINGS)
+
+
+def test_a_failure_stays_one():
+    broken = Controller(jnp.zeros(()), lambda n, t, y: (n + 1, jnp.where(n == 5, jnp.nan, 0.0)[None]))
+    run = simulate(FIELD, broken, [0.0, 0.0], laboratory=Laboratory(-1.0, 1.0), **SETTINGS)
+    assert np.isfinite(run.x[:6]).all() and not np.isfinite(run.x[6:]).any()
+
+
+def test_many_runs_are_one_program():
+    law = stateless(lambda y: -4 * y[:1] - 2 * y[1:])
+    starts = np.random.default_rng(0).normal(size=(3, 2))
+    together = jax.jit(jax.vmap(lambda x: simulate(FIELD, law, x, **SETTINGS).x))(starts)
+    np.testing.assert_allclose(together[2], simulate(FIELD, law, starts[2], **SETTINGS).x, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"), [({"rate": 0.0}, "rate is 0.0"), ({"laboratory": Laboratory(delay=-1)}, "delay is -1")]
+)
+def test_settings_out_of_range_are_one_line(settings, message):
+    with pytest.raises(InputError, match=message):
+        simulate(FIELD, COUNTING, [0.0, 0.0], **{**SETTINGS, **settings})

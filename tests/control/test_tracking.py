@@ -1,0 +1,73 @@
+"""Trackers of an exact model obey the linear equation of their gains; one that does not know falls back."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import (
+    Gains,
+    Reference,
+    computed_torque,
+    feed_forward,
+    gravity_compensation,
+    limited,
+    trusted,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import CLASSICAL, rollout, runge_kutta, second_order
+from dln_jax.scenes.two_link_arm import two_link_arm
+
+ARM = dynamics(two_link_arm().energies)
+P, D = np.array([36.0, 16.0]), np.array([12.0, 8.0])
+
+
+def reference(t):
+    return Reference(
+        *(each * jnp.array([0.7, -0.4]) for each in (jnp.sin(2 * t), 2 * jnp.cos(2 * t), -4 * jnp.sin(2 * t)))
+    )
+
+
+def errors(law, t, off):
+    """Of coordinates along the closed loop, from a start that is off by so much."""
+    field = second_order(lambda t, q, qd: ARM.forward_dynamics(q, qd, law(q, qd, reference(t))))
+    start = reference(0.0)
+    q, _ = rollout(runge_kutta(CLASSICAL, field), (start.q + off, start.qd), t)
+    return q - jax.vmap(lambda t: reference(t).q)(t)
+
+
+def test_computed_torque_makes_errors_decay_linearly():
+    # Both joints are critically damped: e = (1 + w t) exp(-w t) e0.
+    t, off = jnp.linspace(0, 1, 401), np.array([0.3, -0.2])
+    w = np.sqrt(P)
+    expected = off * (1 + w * t[:, None]) * np.exp(-w * t[:, None])
+    np.testing.assert_allclose(errors(computed_torque(ARM, Gains(P, D)), t, off), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("make", [feed_forward, computed_torque])
+def test_an_exact_model_stays_on_the_reference(make):
+    t = jnp.linspace(0, 1, 401)
+    assert np.abs(errors(make(ARM, Gains(np.diag(P), np.diag(D))), t, 0.0)).max() < 1e-8
+
+
+def test_gravity_is_held_at_rest():
+    q = jnp.array([0.4, -1.1])
+    rest = jnp.zeros(2)
+    tau = gravity_compensation(ARM, Gains(P, D))(q, rest, Reference(q, rest, rest))
+    np.testing.assert_allclose(ARM.forward_dynamics(q, rest, tau), 0.0, atol=1e-12)
+
+
+def test_an_indefinite_or_unknown_state_falls_back():
+    bad = ARM._replace(mass_matrix=lambda q, qd=None: -jnp.eye(2))
+    q, wanted = jnp.array([0.4, -1.1]), reference(0.3)
+    first, other = computed_torque(ARM, Gains(P, D)), feed_forward(ARM, Gains(P, D))
+    for plant, outside, expected in ((ARM, False, first), (ARM, True, other), (bad, False, other)):
+        law = jax.jit(trusted(plant, first, other, outside=lambda q, qd, qdd, flag=outside: jnp.asarray(flag)))
+        tau, usable = law(q, wanted.qd, wanted)
+        np.testing.assert_allclose(tau, expected(q, wanted.qd, wanted), rtol=1e-12)
+        assert bool(usable) == (expected is first)
+
+
+def test_limits_leave_what_is_no_number():
+    found = limited(jnp.array([5.0, -5.0, jnp.nan]), -1.0, 2.0)
+    np.testing.assert_array_equal(found, [2.0, -1.0, np.nan])

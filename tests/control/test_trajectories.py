@@ -1,0 +1,83 @@
+"""Optimal trajectories against Riccati's recursion, against the conditions of an optimum, and on a cart-pole."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import Problem, field_of, first_plan, improve, optimise, receding, time_varying_lqr
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.types import InputError
+
+RANDOM = np.random.default_rng(0)
+F, G = np.eye(3) + 0.2 * RANDOM.normal(size=(3, 3)), RANDOM.normal(size=(3, 2))
+START = np.array([1.0, -2.0, 0.5])
+LINEAR = Problem(
+    lambda x, u: jnp.asarray(F) @ x + jnp.asarray(G) @ u, lambda x, u: x @ x + 0.5 * u @ u, lambda x: 2 * x @ x
+)
+N = 8
+
+
+def test_a_linear_problem_takes_one_step_to_the_recursion():
+    plan = improve(LINEAR, first_plan(LINEAR, START, np.zeros((N, 2)))._replace(damping=jnp.asarray(0.0)))
+    # l = x Q x, without the half.
+    known = time_varying_lqr(np.tile(F, (N, 1, 1)), np.tile(G, (N, 1, 1)), np.eye(3), 0.5 * np.eye(2), 2 * np.eye(3))
+    np.testing.assert_allclose(plan.K, -known.K, atol=1e-10)
+    assert float(plan.cost) == pytest.approx(START @ np.asarray(known.S[0]) @ START, rel=1e-12)
+
+
+def total(problem, x, u):
+    cost = 0.0
+    for each in u:
+        cost += problem.cost(x, each)
+        x = problem.step(x, each)
+    return cost + problem.final_cost(x)
+
+
+@pytest.mark.parametrize("most", [0.3, 0.8])
+def test_limits_hold_and_the_rest_is_stationary(most):
+    problem = LINEAR._replace(least=-most, most=most)
+    plan = optimise(problem, START, np.zeros((N, 2)), tolerance=1e-14)
+    slope = np.asarray(jax.grad(functools.partial(total, problem, START))(plan.u))
+    u = np.asarray(plan.u)
+    assert np.abs(u).max() <= most and (np.abs(u) == most).any() and (np.abs(u) < most).any()
+    np.testing.assert_allclose(slope[np.abs(u) < most], 0.0, atol=1e-6)
+    assert (slope[u == most] < 0).all() and (slope[u == -most] > 0).all()
+
+
+def cart_pole_problem(dt):
+    scene = cart_pole()
+    field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
+    return Problem(
+        lambda x, u: runge_kutta(CLASSICAL, lambda t, state: field(state, u))(0.0, x, dt),
+        lambda x, u: dt * (x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2) + 0.01 * u[0] ** 2),
+        lambda x: 50 * (x[0] ** 2 + 2 * (1 - jnp.cos(x[1])) + 0.1 * (x[2] ** 2 + x[3] ** 2)),
+        -10.0,
+        10.0,
+    )
+
+
+DOWN = np.array([0.0, np.pi, 0.0, 0.0])
+
+
+def test_a_cart_pole_swings_up_within_its_limits_and_receding_plans_hold_it():
+    problem = cart_pole_problem(0.04)
+    u = 0.5 * np.sin(np.linspace(0, 6, 75))[:, None]
+    plan = jax.jit(lambda u: optimise(problem, DOWN, u))(u)
+    off = np.abs(np.arctan2(np.sin(plan.x[-1, 1]), np.cos(plan.x[-1, 1])))
+    assert off < 0.05 and np.abs(plan.u).max() <= 10.0
+    act = jax.jit(receding(problem))
+    x = jnp.asarray(DOWN)
+    for _ in range(75):
+        u, plan = act(x, plan)
+        x = problem.step(x + 1e-3 * RANDOM.normal(size=4), u)
+    assert np.abs(np.arctan2(np.sin(x[1]), np.cos(x[1]))) < 0.05 and np.abs(x[0]) < 0.2
+
+
+def test_other_shapes_are_one_line():
+    with pytest.raises(InputError, match="controls \\[N, m\\]"):
+        first_plan(LINEAR, START, np.zeros(3))
