@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from dln_jax.figures import style
 
 SPREAD = 0.5
-"""Of a joint's place that its marks share."""
+"""Of a place on the axis that its marks share."""
 
 
 def errors_by_joint(errors: Mapping[str, Sequence[float]], names: Sequence[str] = ()) -> Figure:
@@ -40,9 +40,10 @@ def errors_by_arm(errors: Mapping[str, Sequence[float]]) -> Figure:
     places = list(dict.fromkeys(name.rsplit("/", 1)[0] for name in errors))
     methods = list(dict.fromkeys(name.rsplit("/", 1)[1] for name in errors))
     figure, [[axis]] = style.figure(height=0.9 + 0.28 * len(places))
-    for method, shade, mark in zip(methods, style.CYCLE, style.MARKERS, strict=False):
+    shifts = SPREAD * (np.arange(len(methods)) / max(len(methods) - 1, 1) - 0.5)
+    for shift, method, shade, mark in zip(shifts, methods, style.CYCLE, style.MARKERS, strict=False):
         shown = [place for place in places if f"{place}/{method}" in errors]
-        heights = [places.index(place) for place in shown]
+        heights = [places.index(place) + shift for place in shown]
         medians, worst = np.array([errors[f"{place}/{method}"] for place in shown]).T
         axis.hlines(heights, medians, worst, color=shade, linewidth=1.2)
         axis.plot(medians, heights, mark, color=shade, markersize=5, label=method.replace("-", " "))
