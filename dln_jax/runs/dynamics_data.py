@@ -24,7 +24,6 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 
-
 SETTLED = ("split", "friction")
 """Checks of a log that the ladder answers itself."""
 
