@@ -38,7 +38,7 @@ class TorqueWindows(NamedTuple):
 def cut_torque_windows(data: Trajectories, length: int, *, gap: float = GAP) -> TorqueWindows:
     """The windows that `cut_measured_windows` cuts of data with the same times; arguments and errors as there."""
     indices, weight = window_indices(data, length, gap=gap)
-    return TorqueWindows(*(getattr(data, key)[indices] for key in ("q", "qd", "qdd", "tau")), weight)
+    return TorqueWindows(data.q[indices], data.qd[indices], data.qdd[indices], data.tau[indices], weight)
 
 
 def with_torques(

@@ -27,6 +27,7 @@ from dln_jax.studies.robots.double_pendulum_fits import (
     fit_both,
     fit_low_passed,
     fit_motions,
+    fit_stacked,
     fit_torques,
     low_passed,
 )
@@ -39,7 +40,7 @@ HORIZON, EVERY = 2.2, 0.5
 """s: predicted stretches, and from one start to the next."""
 HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
 """Recordings of each split."""
-WAYS = ("least-squares", "chosen-scale", "low-passed", "motions", "both")
+WAYS = ("least-squares", "chosen-scale", "low-passed", "stacked", "motions", "both")
 QUANTITIES = {
     "torque_nmse": ("1", False),
     "torque_nmse_low_passed": ("1", False),
@@ -81,6 +82,7 @@ def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
         fit_torques(rest),
         fit_torques(rest, scale),
         fit_low_passed(rest, scale)[0],
+        fit_stacked(rest, scale),
         fit_motions(rest, scale),
         fit_both(rest, scale),
     )

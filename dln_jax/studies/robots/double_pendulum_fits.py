@@ -3,6 +3,7 @@
     least-squares   torques of filtered motions, as engineers do it; q and tau filtered alike
     chosen-scale    the same, with the velocity scale of dry friction that explains each recording best from the others
     low-passed      what is filtered is the regressor of less filtered motions, and tau with it
+    stacked         the equations of both, which count alike
     motions         the windows of `learning.measured_motions`, through an integrator with the torques, which are off
                     by as much as the low-passed equations are
     both            motions and torques in one objective (`learning.torques_beside_motions`), with friction by load
@@ -112,6 +113,13 @@ def fit_low_passed(logs: Logs, scale: float = USUAL_SCALE) -> tuple[Fitted, tupl
     off = np.concatenate([A @ x - b for A, b in equations.values()]).reshape(-1, 2)
     sizes = logs.coarse.tau.std(axis=0) * np.sqrt(np.mean(off**2, axis=0))
     return Fitted(model, _parameters(model, x)), tuple(sizes.tolist())
+
+
+def fit_stacked(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:
+    """Least squares of filtered motions and of low-passed equations at once, which count alike."""
+    model = ten_parameters(scale)
+    equations = [*_equations(model, logs).values(), *_equations(model, logs, cutoff=CUTOFF).values()]
+    return Fitted(model, _parameters(model, _solved(equations)))
 
 
 def fit_motions(logs: Logs, scale: float = USUAL_SCALE) -> Fitted:

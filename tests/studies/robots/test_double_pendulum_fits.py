@@ -40,7 +40,7 @@ def logs():
 def test_torques_tell_all_parameters_and_the_velocity_scale(logs):
     assert fits.choose_scale(logs) == SCALE
     low_passed, off = fits.fit_low_passed(logs, SCALE)
-    for found in (fits.fit_torques(logs, SCALE), low_passed):
+    for found in (fits.fit_torques(logs, SCALE), low_passed, fits.fit_stacked(logs, SCALE)):
         for name in ("moments", "armature", "weight", "viscous", "coulomb"):
             np.testing.assert_allclose(getattr(found.parameters, name), getattr(TRUE, name), rtol=1e-8)
     assert max(off) < 1e-9
