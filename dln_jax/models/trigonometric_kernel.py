@@ -24,7 +24,7 @@ Torques of a Lagrangian process as a linear problem of N d equations: Giacomuzzo
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,31 +44,31 @@ CHUNK = 128
 class KernelScales(NamedTuple):
     """What the covariances of d joints depend on, all positive; K is d, or 1 where bodies do not follow one another."""
 
-    rates: Array
+    rates: Any
     """Of a joint's rate in the velocities of bodies [d]; the unit is shared with `inertia`."""
-    inertia: Array
+    inertia: Any
     """Of the kinetic energy of each body [K]."""
-    turns: Array
+    turns: Any
     """a and b of c [d, 2]; b is per m² for a prismatic joint."""
-    weight: Array | None
+    weight: Any
     """Of the potential of each body [K], in J²; `None` without gravity."""
-    lifts: Array | None
+    lifts: Any
     """a and b of h [d, 2]."""
 
 
 class KernelParameters(NamedTuple):
     """Of n samples and d joints."""
 
-    q: Array
+    q: Any
     """[n, d], of the samples."""
-    qd: Array
+    qd: Any
     """[n, d]."""
-    qdd: Array
+    qdd: Any
     """[n, d]."""
-    weights: Array
+    weights: Any
     """[n, d], of their torques; 1/(N m) or 1/N."""
     scales: KernelScales
-    friction: Array | None
+    friction: Any
     """Viscous friction of each coordinate [d], in N m s or N s/m."""
 
 
@@ -162,8 +162,10 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
         def half(some: KernelParameters) -> Array:
             s = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
             weighted = scales.inertia[:, None] * s.acceleration, scales.inertia[:, None] * s.force
-            pairs = zip((s.momentum, s.velocity), weighted, strict=True)
-            return sum(jnp.einsum("ikn,jkn->ij", left, right) for left, right in pairs)
+            momentum, velocity = (
+                jnp.einsum("ikn,jkn->ij", *pair) for pair in zip((s.momentum, s.velocity), weighted, strict=True)
+            )
+            return momentum + velocity
 
         M = _summed(half, parameters)
         return 2 * (M + M.T)
@@ -199,17 +201,16 @@ def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
             c * s.force + by_y * (moved * s.momentum - weight * s.velocity),
         )
 
-    def link(s: Shared, at: tuple) -> tuple[Shared, Shared | None]:
+    def link(s: Shared, at: tuple) -> tuple[Shared, Shared]:
         new, *rest = at
         s = turned(s, *rest)
-        if not serial:
-            return s, None
-        s = jax.tree.map(jnp.add, s, new)
+        if serial:
+            s = Shared(*(each + more for each, more in zip(s, new, strict=True)))
         return s, s
 
     start = jax.tree.map(lambda each: jnp.zeros_like(each[0]) if serial else jnp.sum(each, axis=0), entered)
     last, bodies = lax.scan(link, start, (entered, value, slope, moved, weights))
-    return bodies if serial else jax.tree.map(lambda each: each[None], last)
+    return bodies if serial else Shared(*(each[None] for each in last))
 
 
 def _potential(
