@@ -151,7 +151,7 @@ def _block(
     return total
 
 
-def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Array, x: Array, y: Array) -> Any:
+def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array) -> Any:
     each = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
     # Slopes of a prismatic joint do not vary along both axes.
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *each)

@@ -22,8 +22,9 @@ Torques of a Lagrangian process as a linear problem of N d equations: Giacomuzzo
 `learning.kernel.fit_kernel` finds the parameters.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,8 @@ from jax import Array, lax
 from jax.typing import DTypeLike
 
 from dln_jax.mechanics import lagrangian
-from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import minus_potential
+from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
@@ -42,31 +44,31 @@ CHUNK = 128
 class KernelScales(NamedTuple):
     """What the covariances of d joints depend on, all positive; K is d, or 1 where bodies do not follow one another."""
 
-    rates: Array
+    rates: Any
     """Of a joint's rate in the velocities of bodies [d]; the unit is shared with `inertia`."""
-    inertia: Array
+    inertia: Any
     """Of the kinetic energy of each body [K]."""
-    turns: Array
+    turns: Any
     """a and b of c [d, 2]; b is per m² for a prismatic joint."""
-    weight: Array | None
+    weight: Any
     """Of the potential of each body [K], in J²; `None` without gravity."""
-    lifts: Array | None
+    lifts: Any
     """a and b of h [d, 2]."""
 
 
 class KernelParameters(NamedTuple):
     """Of n samples and d joints."""
 
-    q: Array
+    q: Any
     """[n, d], of the samples."""
-    qd: Array
+    qd: Any
     """[n, d]."""
-    qdd: Array
+    qdd: Any
     """[n, d]."""
-    weights: Array
+    weights: Any
     """[n, d], of their torques; 1/(N m) or 1/N."""
     scales: KernelScales
-    friction: Array | None
+    friction: Any
     """Viscous friction of each coordinate [d], in N m s or N s/m."""
 
 
@@ -80,7 +82,7 @@ class Factor(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """Inner products with the velocity of one body, [n] each: what it has in common with those of the samples."""
+    """Inner products with the velocity of a body, [n] each: what it has in common with those of the samples."""
 
     velocity: Array
     """With the sample's velocity v."""
@@ -125,7 +127,7 @@ def make_trigonometric_kernel(
         )
         return KernelParameters(q, qd, qdd, weights, scales, jnp.zeros(d, dtype) if needs.friction else None)
 
-    return Model(init, lambda parameters: _closed_form(parameters, needs.joints, serial))
+    return Model(init, lambda parameters: _system(parameters, needs.joints, serial))
 
 
 def turn_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
@@ -146,65 +148,69 @@ def lift_factor(joint: JointKind, pair: Array, x: Array, y: Array) -> Factor:
     return Factor(c.value**2, 2 * c.value * c.by_x, 2 * c.value * c.by_y, 2 * (c.by_x * c.by_y + c.value * c.by_both))
 
 
-def _closed_form(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> ClosedForm:
+def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool) -> RecursiveSystem:
     scales, friction = parameters.scales, parameters.friction
 
     def kinetic(q: Vector, qd: Vector) -> Scalar:
         def of(some: KernelParameters) -> Scalar:
-            bodies = _shared(some, joints, serial, q, qd)
-            each = [jnp.sum(s.momentum * s.acceleration + s.velocity * s.force) for s in bodies]
-            return 2 * jnp.stack(each) @ scales.inertia
+            s = _shared(some, joints, serial, q, qd)
+            return 2 * jnp.sum(scales.inertia @ (s.momentum * s.acceleration + s.velocity * s.force))
 
         return _summed(of, parameters)
 
     def mass_matrix(q: Vector) -> Array:
         def half(some: KernelParameters) -> Array:
-            bodies = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
-            each = [s.momentum @ s.acceleration.T + s.velocity @ s.force.T for s in bodies]
-            return jnp.einsum("kij,k->ij", jnp.stack(each), scales.inertia)
+            s = jax.vmap(lambda qd: _shared(some, joints, serial, q, qd))(jnp.eye(len(joints), dtype=q.dtype))
+            weighted = scales.inertia[:, None] * s.acceleration, scales.inertia[:, None] * s.force
+            momentum, velocity = (
+                jnp.einsum("ikn,jkn->ij", *pair) for pair in zip((s.momentum, s.velocity), weighted, strict=True)
+            )
+            return momentum + velocity
 
         M = _summed(half, parameters)
         return 2 * (M + M.T)
 
     potential = _potential(parameters, joints, serial)
-    return ClosedForm(
+    return RecursiveSystem(
         mass_matrix=mass_matrix,
-        coriolis=lambda q, qd: lagrangian.inverse_dynamics(kinetic, q, qd, jnp.zeros_like(qd)),
+        # Without M, which would take d times as long.
+        forces=functools.partial(
+            lagrangian.inverse_dynamics, lambda q, qd: minus_potential(kinetic(q, qd), potential, q)
+        ),
         potential=potential,
-        gravity=None if potential is None else jax.grad(potential),
         dissipation=None if friction is None else lambda q, qd: 0.5 * jnp.sum(friction * qd**2),
         friction=None if friction is None else lambda q, qd: friction * qd,
     )
 
 
-def _shared(
-    parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector
-) -> list[Shared]:
-    """Of each body with an inertia; linear in qd."""
+def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector) -> Shared:
+    """Of each of K bodies with an inertia, [K, n] each; linear in qd."""
     scales = parameters.scales
-    columns = (parameters.qd.T, parameters.qdd.T, parameters.weights.T)
-    none = jnp.zeros_like(columns[0][0])
+    moved, accelerated, weights = (each.T for each in (parameters.qd, parameters.qdd, parameters.weights))
+    rates = (scales.rates * qd)[:, None]
+    entered = Shared(rates * moved, rates * accelerated, rates * weights, jnp.zeros_like(moved))
+    turns = [turn_factor(kind, scales.turns[k], q[k], parameters.q[:, k]) for k, kind in enumerate(joints)]
+    value = jnp.stack([each.value for each in turns])
+    slope = jnp.stack([jnp.broadcast_to(each.by_y, each.value.shape) for each in turns])
 
-    def entered(s: Shared, joint: int) -> Shared:
-        rate, acceleration, weight = (scales.rates[joint] * qd[joint] * each[joint] for each in columns)
-        return Shared(s.velocity + rate, s.acceleration + acceleration, s.momentum + weight, s.force)
-
-    shared, bodies = Shared(none, none, none, none), []
-    for joint in range(0 if serial else len(joints)):
-        shared = entered(shared, joint)
-    for joint, kind in enumerate(joints):
-        c = turn_factor(kind, scales.turns[joint], q[joint], parameters.q[:, joint])
-        moved, weight = parameters.qd[:, joint], parameters.weights[:, joint]
-        shared = Shared(
-            c.value * shared.velocity,
-            c.value * shared.acceleration + c.by_y * moved * shared.velocity,
-            c.value * shared.momentum,
-            c.value * shared.force + c.by_y * (moved * shared.momentum - weight * shared.velocity),
+    def turned(s: Shared, c: Array, by_y: Array, moved: Array, weight: Array) -> Shared:
+        return Shared(
+            c * s.velocity,
+            c * s.acceleration + by_y * moved * s.velocity,
+            c * s.momentum,
+            c * s.force + by_y * (moved * s.momentum - weight * s.velocity),
         )
+
+    def link(s: Shared, at: tuple) -> tuple[Shared, Shared]:
+        new, *rest = at
+        s = turned(s, *rest)
         if serial:
-            shared = entered(shared, joint)
-            bodies.append(shared)
-    return bodies or [shared]
+            s = Shared(*(each + more for each, more in zip(s, new, strict=True)))
+        return s, s
+
+    start = jax.tree.map(lambda each: jnp.zeros_like(each[0]) if serial else jnp.sum(each, axis=0), entered)
+    last, bodies = lax.scan(link, start, (entered, value, slope, moved, weights))
+    return bodies if serial else Shared(*(each[None] for each in last))
 
 
 def _potential(

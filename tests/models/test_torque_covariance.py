@@ -58,12 +58,12 @@ def test_covariance_is_that_of_explicit_features_and_of_the_energies(joints, ser
     columns = jax.jit(jax.vmap(jax.jacrev(torque), (None, 0, 0, 0)))(jnp.zeros(size), *map(jnp.asarray, states))
     columns = columns.reshape(-1, size)
     covariance = own_covariance(joints, serial, parameters.scales, states)
-    np.testing.assert_allclose(covariance, columns @ columns.T, rtol=0, atol=1e-12 * abs(covariance).max())
+    np.testing.assert_allclose(covariance, columns @ columns.T, rtol=0, atol=1e-12 * float(abs(covariance).max()))
 
     others = States(parameters.q, parameters.qd, parameters.qdd)
     predicted = torque_covariance(joints, serial, parameters.scales, states, others) @ parameters.weights.ravel()
     tau = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))(*states)
-    np.testing.assert_allclose(tau.ravel(), predicted, rtol=0, atol=1e-12 * abs(predicted).max())
+    np.testing.assert_allclose(tau.ravel(), predicted, rtol=0, atol=1e-12 * float(abs(predicted).max()))
 
 
 def test_torques_of_a_chain_do_not_depend_on_what_physics_leaves_out():

@@ -11,12 +11,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.datasets.robot_arms import lip_trajectories
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
-from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.rigid_tree import make_rigid_tree
@@ -37,8 +37,8 @@ VELOCITY_SCALE = 1e-3
 """1/s or m/s, of the models' dry friction; that of the arms changes sign at once."""
 TESTS = tuple(range(101, 121))
 """Seeds of the test motions."""
-TEST_EVERY = 10
-"""Samples of test motions of which a kernel, which is slow, has one: 10 a second."""
+TEST_EVERY = 50
+"""Samples of test motions of which a kernel, which is slow, has one: two a second."""
 TARGET = 1e-3
 """Mean nMSE to reach at seven joints from 500 samples."""
 PUBLISHED = {"panda-6": 0.03, "panda-7": 0.1}
@@ -47,7 +47,7 @@ FRICTION: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
 
 
 STATES = 5_001
-"""Whose torques are computed at a time: those of a motion."""
+"""Whose torques are computed at a time."""
 
 
 class Outcome(NamedTuple):
@@ -113,7 +113,7 @@ def kernel(arm: Arm, *, friction: bool, every: int = 10, serial: bool = True, te
 
 
 def unseen_errors(
-    arm: Arm, system: RecursiveSystem | ClosedForm, *, friction: bool, tests: Sequence[int], every: int = 1
+    arm: Arm, system: RecursiveSystem, *, friction: bool, tests: Sequence[int], every: int = 1
 ) -> Float[np.ndarray, "T d"]:
     """nMSE by test motion and joint, against torques without noise; of the motions' samples `every` so many."""
     test = lip_trajectories(arm, tests, friction=friction, noise=0.0, every=every)
@@ -122,8 +122,8 @@ def unseen_errors(
     return np.array([errors[motion].mean(axis=0) / test.tau[motion].var(axis=0) for motion in motions])
 
 
-def _torques(system: RecursiveSystem | ClosedForm, data: Trajectories) -> Float[np.ndarray, "N d"]:
-    inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics))
+def _torques(system: RecursiveSystem, data: Trajectories) -> Float[np.ndarray, "N d"]:
+    inverse = jax.jit(jax.vmap(dynamics(system).inverse_dynamics), compiler_options=quick_compilation())
     states = (data.q, data.qd, data.qdd)
     # A kernel takes memory for each state.
     pieces = [slice(first, first + STATES) for first in range(0, len(data.q), STATES)]
