@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees import Tree
-from dln_jax.types import InputError
 
 INSTALL = "pip install 'dln-jax[reference]'"
 
@@ -32,19 +31,17 @@ def pinocchio() -> Any:
 
 
 def pinocchio_model(pin: Any, tree: Tree) -> Any:
-    """The same tree, of joints about z, without armature.
-
-    Raises:
-        InputError: joints about other axes.
-    """
-    if not np.array_equal(tree.axes, np.tile([0.0, 0.0, 1.0], (tree.degrees_of_freedom, 1))):
-        raise InputError("the tree has joints about other axes than z; expected those of Denavit-Hartenberg rows")
+    """The same tree, without armature."""
     model = pin.Model()
     model.gravity.linear = np.asarray(tree.gravity)
-    kinds = {"revolute": pin.JointModelRZ, "prismatic": pin.JointModelPZ}
+    # Joints about z have a faster model of their own.
+    along_z = {"revolute": pin.JointModelRZ, "prismatic": pin.JointModelPZ}
+    others = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
     for link, parent in enumerate(tree.parents):
         place = pin.SE3(np.asarray(tree.rotations[link]), np.asarray(tree.positions[link]))
-        added = model.addJoint(parent + 1, kinds[tree.joints[link]](), place, f"joint_{link}")
+        kind, axis = tree.joints[link], np.asarray(tree.axes[link], float)
+        joint = along_z[kind]() if np.array_equal(axis, [0, 0, 1]) else others[kind](axis)
+        added = model.addJoint(parent + 1, joint, place, f"joint_{link}")
         m, hx, hy, hz, xx, xy, xz, yy, yz, zz = np.asarray(tree.inertias[link])
         # Pinocchio's order of the same ten numbers.
         inertia = pin.Inertia.FromDynamicParameters(np.array([m, hx, hy, hz, xx, xy, yy, xz, yz, zz]))
