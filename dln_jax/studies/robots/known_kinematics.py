@@ -162,7 +162,7 @@ def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
     """Medians over motions and seeds, and ours over that with the true parameters."""
     rows = [Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(each)), "mrad") for name, each in tracked.items()]
     words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
-    for name in ("ours", "ours-robust"):
+    for name in (name for name in tracked if name.startswith("ours")):
         ratio = np.median(np.divide(tracked[name], tracked["true-parameters"]))
         rows.append(expect(f"arm/tracking/{name}", "over_true_parameters", words, float(ratio), TRACKING))
     return rows

@@ -1,22 +1,6 @@
 """What the report of uncertainties draws and reads is what it says, and its cases give their rows."""
 
-import numpy as np
-import pytest
-
-from dln_jax.studies.uncertainty import arms, cases
-
-
-def test_a_filtered_recording_is_the_motion_without_its_noise():
-    random, t = np.random.default_rng(0), np.arange(0, 7, 0.004)
-    clean = np.sin(np.outer(t, [1.0, 2.0]))
-    found = arms.filtered(
-        t, clean + 1e-4 * random.normal(size=clean.shape), 3 * clean, cutoff=8.0, rate=50.0, seconds=2.0
-    )
-    assert set(np.unique(found["trajectory"])) == {0, 1, 2}
-    assert np.diff(found["t"]).mean() == pytest.approx(0.02)
-    exact = -np.array([1.0, 4.0]) * np.sin(np.outer(found["t"], [1.0, 2.0]))
-    assert np.sqrt(np.mean((found["qdd"] - exact) ** 2)) < 0.1
-    np.testing.assert_allclose(found["tau"], 3 * np.sin(np.outer(found["t"], [1.0, 2.0])), atol=1e-3)
+from dln_jax.studies.uncertainty import cases
 
 
 def test_a_simulated_arm_is_covered_and_its_far_motions_are_flagged():
