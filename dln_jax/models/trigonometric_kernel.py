@@ -37,8 +37,8 @@ from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
-CHUNK = 128
-"""Samples that are worked on at a time."""
+CHUNK = 24
+"""Samples that are worked on at a time: so few that C for seven joints keeps to its stack."""
 
 
 class KernelScales(NamedTuple):
