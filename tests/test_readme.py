@@ -7,8 +7,6 @@ import importlib
 import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple, get_type_hints
 
@@ -16,7 +14,8 @@ import numpy as np
 import pytest
 import tyro
 from calls import command
-from conftest import CACHE
+from conftest import CACHE, LEAST_SECONDS
+from interpreters import Program, interpreters
 
 from dln_jax.data import schema
 from dln_jax.datasets import generators
@@ -85,7 +84,9 @@ def workplace(tmp_path_factory):
 
 def run(words):
     script, arguments = script_and_arguments(words)
-    command(script, *arguments, *shlex.split(SMALL[words[2].removeprefix("scripts.")]))
+    # A page reads the uncertainty of the first run.
+    brief = ["--no-uncertainty"] if words != FIRST and words[2] == FIRST[2] else []
+    command(script, *arguments, *shlex.split(SMALL[words[2].removeprefix("scripts.")]), *brief)
 
 
 def test_the_readme_is_short():
@@ -118,14 +119,19 @@ def test_a_command_in_the_text_parses(text):
                 assert set(named) <= {*known, "None"}, name
 
 
+@pytest.fixture(scope="module")
+def run_fresh():
+    told = {"JAX_COMPILATION_CACHE_DIR": os.environ[CACHE], "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": LEAST_SECONDS}
+    with interpreters({**os.environ, **told}) as run_programs:
+        yield run_programs
+
+
 @pytest.mark.parametrize("block", blocks("python"), ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}")
-def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(block, workplace):
+def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(block, workplace, run_fresh, tmp_path):
     if "import casadi" in block.text:
         pytest.importorskip("casadi")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": os.environ[CACHE]}
-    result = subprocess.run(
-        [sys.executable, "-c", block.text], env=environment, cwd=workplace, capture_output=True, text=True, timeout=300
-    )
+    (tmp_path / "block.py").write_text(block.text)
+    (result,) = run_fresh(tmp_path, Program(tmp_path / "block.py", folder=workplace, environment=dict(os.environ)))
     assert result.returncode == 0, result.stderr
     assert re.search(r"\d\.\d", result.stdout) and not re.search("nan|inf", result.stdout), result.stdout
 

@@ -46,7 +46,7 @@ def workplace(tmp_path_factory):
     states = [
         np.sum(x, axis=1).T for x in (a * np.sin(w * t + p), a * w * np.cos(w * t + p), -a * w * w * np.sin(w * t + p))
     ]
-    tau = jax.vmap(dynamics(tree_system(true, friction)).inverse_dynamics)(*states)
+    tau = jax.jit(jax.vmap(dynamics(tree_system(true, friction)).inverse_dynamics))(*states)
     tau = np.asarray(tau) + 0.05 * random.normal(size=(len(t), 2))
     swapped = {key: x[:, ::-1] for key, x in zip(("q", "qd", "qdd", "tau"), (*states, tau), strict=True)}
     names = np.array(["elbow", "shoulder"])

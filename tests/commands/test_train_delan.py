@@ -23,6 +23,7 @@ from dln_jax.zoo.run import load
 ROOT = Path(__file__).parents[2]
 NETWORK = ("--width", "4", "--depth", "1", "--precision", "f64")
 TINY = ("--optimizer", "adam", "--steps", "40", "--batch", "64", "--no-low-latency", *NETWORK)
+BRIEF = ("--no-figures", "--no-low-latency", "--no-uncertainty")
 FILES = {
     ".lock",
     "config.json",
@@ -110,6 +111,7 @@ def test_a_killed_run_resumes_to_the_same_parameters(workplace):
         "32",
         "--no-figures",
         "--no-low-latency",
+        "--no-uncertainty",
         "--scene",
         "pendulum",
     )
@@ -143,7 +145,7 @@ def test_a_file_of_ones_own_with_prismatic_joints_and_only_positions(workplace, 
         trajectory=data.trajectory,
     )
     needs = '{"joints": ["prismatic", "revolute"], "friction": true}'
-    command(train_delan, "--data", "mine.npz", *TINY, "--needs", needs, "--precision", "f64", "--out", "mine")
+    command(train_delan, "--data", "mine.npz", *TINY, "--needs", needs, "--no-uncertainty", "--out", "mine")
     out = capsys.readouterr().out
     assert "not in the data: qd, qdd" in out and "prismatic-revolute with gravity and friction (--needs)" in out
     metrics = json.loads((workplace / "mine" / "metrics.json").read_text())
@@ -153,7 +155,7 @@ def test_a_file_of_ones_own_with_prismatic_joints_and_only_positions(workplace, 
 
 
 def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
-    settings = (*TINY, "--scene", "pendulum", "--learning-rate", "1e30", "--no-figures")
+    settings = (*TINY, "--scene", "pendulum", "--learning-rate", "1e30", "--no-figures", "--no-uncertainty")
     line = refused(capsys, train_delan, *settings, "--out", "exploded")
     assert re.search(r"after step \d+", line) and "lower --learning-rate" in line
     tau = load("exploded").dynamics.inverse_dynamics(*np.ones((3, 1)))
@@ -162,13 +164,13 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
 
 @pytest.mark.parametrize("optimizer", ["adam", "gauss-newton"])
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys, optimizer):
-    options = ("--optimizer", optimizer, "--width", "3", "--depth", "1", "--no-figures", "--scene", "pendulum")
+    options = ("--optimizer", optimizer, "--width", "3", "--depth", "1", *BRIEF, "--scene", "pendulum")
     folder = workplace / f"late-{optimizer}"
     command(train_delan, *options, "--steps", "400", "--seconds", "1e-6", "--out", folder)
     assert "out of time at step" in capsys.readouterr().out
     early = json.loads((folder / "metrics.json").read_text())
     assert 0 < early["best_step"] == early["steps"] < 400
-    command(train_delan, "--out", folder, "--resume", "--no-figures", "--seconds", "2e-6")
+    command(train_delan, "--out", folder, "--resume", *BRIEF, "--seconds", "2e-6")
     later = json.loads((folder / "metrics.json").read_text())
     assert later["steps"] == 2 * early["steps"]
     assert json.loads((folder / "config.json").read_text())["seconds"] == 2e-6

@@ -28,6 +28,7 @@ from dln_jax.zoo.descriptions import build, describe_for
 from dln_jax.zoo.run import load
 
 QUICK = ("--data", "swing.npz", "--width", "3", "--depth", "1", "--steps", "6", "--no-figures", "--no-low-latency")
+BRIEF = (*QUICK[-2:], "--no-uncertainty")
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert "gauss-newton needs f64" in refused(
         capsys, train_delan, *QUICK, "--optimizer", "gauss-newton", "--precision", "f32", "--out", "no"
     )
-    command(train_delan, *QUICK, "--width", "2000", "--steps", "1", "--out", "wide")
+    command(train_delan, *QUICK, "--width", "2000", "--steps", "1", "--no-uncertainty", "--out", "wide")
     assert "adam (" in capsys.readouterr().out
 
 
@@ -143,12 +144,12 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2, 3))
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
-    command(train_delan, "--data", "swing.npz", "--steps", "8", *QUICK[-2:], "--target", "1e6", "--out", "easy")
+    command(train_delan, "--data", "swing.npz", "--steps", "8", *BRIEF, "--target", "1e6", "--out", "easy")
     easy = json.loads((workplace / "easy" / "candidates.json").read_text())["candidates"]
     assert {(each["width"], each["networks"]) for each in easy} == {(2, 1), (2, 2)}
     assert min(each["parameters"] for each in easy) == 2 * 2 + 2 + 2 * 2 + 2 + 1
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2,))
-    command(train_delan, "--data", "swing.npz", "--steps", "2", *QUICK[-2:], "--target", "1e-30", "--out", "hard")
+    command(train_delan, "--data", "swing.npz", "--steps", "2", *BRIEF, "--target", "1e-30", "--out", "hard")
     assert "no candidate meets 1e-30; kept is the most accurate" in capsys.readouterr().out
     candidates = json.loads((workplace / "hard" / "candidates.json").read_text())["candidates"]
     best = min(candidates, key=lambda each: each["validation_error"])

@@ -28,7 +28,7 @@ def workplace(tmp_path_factory):
     scene = pendulum()
     plant = with_friction(scene.closed_form, joint_dissipation([0.2], [0.4], velocity_scale=0.05))
     data = generators.uniform(scene, samples=120, rate_bound=1.0, acceleration_bound=5.0)
-    tau = np.asarray(jax.vmap(dynamics(plant).inverse_dynamics)(data.q, data.qd, data.qdd))
+    tau = np.asarray(jax.jit(jax.vmap(dynamics(plant).inverse_dynamics))(data.q, data.qd, data.qdd))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         schema.save("swing.npz", data._replace(tau=tau))
@@ -58,7 +58,8 @@ def test_every_kind_trains_with_friction(workplace, script, model, optimizer):
     needs = {**NEEDS, "joint_friction": ["viscous", "coulomb", "stribeck", "load"]}
     given = (*QUICK, *SMALL, "--needs", json.dumps(needs), "--model", model, "--optimizer", optimizer)
     out = f"{model}-{optimizer}"
-    command(script, *given, "--out", out)
+    # What is uncertain depends on friction as it does on other parameters: one kind is enough.
+    command(script, *given, *(() if model == "structured-delan" else ("--no-uncertainty",)), "--out", out)
     run = load(workplace / out)
     assert set(run.parameters["friction"].shape) == {"stribeck_velocity", "load"}
     started = -3.0

@@ -223,7 +223,7 @@ def test_free_swings_keep_or_lose_energy(friction):
     data = generators.free_swing(scene, trajectories=2, steps=200)
     np.testing.assert_array_equal(data.tau, 0.0)
     kinetic = 0.5 * np.sum(data.qd * data.p, axis=1)
-    potential = jax.vmap(scene.potential)(data.q)
+    potential = jax.jit(jax.vmap(scene.potential))(data.q)
     energy = (kinetic + potential).reshape(2, 200)
     if friction:
         assert (np.diff(energy, axis=1) < 0).all()

@@ -1,5 +1,6 @@
 """Samples of functions: the published noise, exact grids, refusals, units, and the residuals that read them."""
 
+import functools
 import pickle
 
 import jax
@@ -35,8 +36,12 @@ def arrays(**changes):
 
 def exact(function, x):
     """Value, gradient and Hessian of a scalar function by autodiff."""
-    parts = [jax.vmap(each)(x) for each in (function, jax.grad(function), jax.hessian(function))]
-    return FunctionSamples(x, *(np.asarray(part)[:, None] for part in parts))
+    return FunctionSamples(x, *(np.asarray(part)[:, None] for part in derivatives_of(function)(x)))
+
+
+@functools.cache
+def derivatives_of(function):
+    return jax.jit(jax.vmap(lambda x: (function(x), jax.grad(function)(x), jax.hessian(function)(x))))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -54,13 +59,14 @@ def test_generators_have_the_published_noise_on_everything(name):
     generate, _, function = CASES[name]
     noisy, clean = generate(), generate(noise=0.0)
     assert noisy.x.shape == (25_600, {"sine": 1, "cosine_sine": 2}[name])
-    for key, ours, truth in zip(FunctionSamples._fields, noisy, exact(function, clean.x), strict=True):
+    true = exact(function, clean.x)
+    for key, ours, truth in zip(FunctionSamples._fields, noisy, true, strict=True):
         error = ours - truth
         np.testing.assert_allclose(error.std(), 1e-3, rtol=0.02, err_msg=key)
         np.testing.assert_allclose(error.mean(), 0, atol=2e-5, err_msg=key)
     # The noise on x is not that on the value: residuals of the truth at the stored x have both.
     residuals = noisy.dy - exact(function, noisy.x).dy
-    expected = 1e-6 + 1e-6 * np.mean(np.sum(exact(function, clean.x).d2y ** 2, axis=-1))
+    expected = 1e-6 + 1e-6 * np.mean(np.sum(true.d2y**2, axis=-1))
     np.testing.assert_allclose(np.mean(residuals**2), expected, rtol=0.03)
     np.testing.assert_array_equal(noisy.d2y, np.swapaxes(noisy.d2y, -1, -2))
 

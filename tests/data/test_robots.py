@@ -75,6 +75,7 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
     data = mujoco.MjData(model)
     motion = dynamics(tree_system(robot.tree), degrees_of_freedom=model.nv)
     inverse, forward = jax.jit(motion.inverse_dynamics), jax.jit(motion.forward_dynamics)
+    frames = jax.jit(lambda q: world_frames(robot.tree, q))
     random = np.random.default_rng(0)
     for _ in range(5):
         data.qpos, data.qvel, data.qacc = random.normal(size=(3, model.nv))
@@ -86,7 +87,7 @@ def test_forces_are_those_of_mujoco(name, tmp_path):
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(forward(data.qpos, data.qvel, tau), data.qacc, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(forward(data.qpos, data.qvel, tau), wanted, rtol=1e-9, atol=1e-9)
-        origins = world_frames(robot.tree, jax.numpy.asarray(data.qpos))[1]
+        origins = np.asarray(frames(data.qpos)[1])
         turning = np.array(robot.tree.joints) == "revolute"  # MuJoCo's anchor of a slide stays behind
         np.testing.assert_allclose(origins[turning], data.xanchor[turning], atol=1e-12)
 
@@ -98,7 +99,7 @@ def test_forces_are_those_of_pinocchio(tmp_path):
     order = [model.joints[model.getJointId(name)].idx_q for name in robot.tree.names]
     state = np.random.default_rng(0).normal(size=(3, model.nv))
     tau = pinocchio.rnea(model, model.createData(), *state)[order]
-    ours = dynamics(tree_system(robot.tree)).inverse_dynamics(*state[:, order])
+    ours = jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*state[:, order])
     np.testing.assert_allclose(ours, tau, rtol=1e-10, atol=1e-10)
 
 
@@ -165,7 +166,7 @@ def test_a_file_that_is_not_there_is_refused(tmp_path):
 
 def forces(robot):
     state = np.random.default_rng(1).normal(size=(3, robot.tree.degrees_of_freedom))
-    return dynamics(tree_system(robot.tree)).inverse_dynamics(*state)
+    return jax.jit(dynamics(tree_system(robot.tree)).inverse_dynamics)(*state)
 
 
 def test_a_joint_that_is_held_is_fixed(tmp_path):
@@ -200,8 +201,8 @@ def test_joints_are_held_where_it_is_asked_for(name, tmp_path):
     for joint, position in hold.items():
         q[free.tree.names.index(joint)] = position
     q[place], qd[place], qdd[place] = np.random.default_rng(0).normal(size=(3, len(place)))
-    every = dynamics(tree_system(free.tree)).inverse_dynamics(q, qd, qdd)
-    fewer = dynamics(tree_system(held.tree)).inverse_dynamics(q[place], qd[place], qdd[place])
+    every = jax.jit(dynamics(tree_system(free.tree)).inverse_dynamics)(q, qd, qdd)
+    fewer = jax.jit(dynamics(tree_system(held.tree)).inverse_dynamics)(q[place], qd[place], qdd[place])
     np.testing.assert_allclose(fewer, every[place], rtol=1e-12, atol=1e-12)
 
 

@@ -1,5 +1,7 @@
 """The loop of all trainings on problems with known answers: its stops, its stages, its continuation bit for bit."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,30 +139,40 @@ def broken_and_continued(given, optimiser, folder, dispatches):
 
 SEVERAL = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.3 * leaf, -leaf]), BUMPS)
 NEWTON = GaussNewton(8, coarse_steps=5, coarse_samples=20, steps_per_dispatch=2)
-RESUMED = {
-    "adam": (line(), Adam(steps=300, batch=16, steps_per_dispatch=50), 3),
+TRAINED = {
+    "adam": (line(), Adam(steps=300, batch=16, steps_per_dispatch=50)),
     "adam, seeds": (
         line(parameters=((0.0, 0.0), (1.0, 2.0)), seed=jnp.arange(2)),
         Adam(90, 16, steps_per_dispatch=30),
-        2,
     ),
-    "newton, some samples": (bumps(BUMPS), NEWTON, 2),
-    "newton, between the stages": (bumps(BUMPS), NEWTON, 3),
-    "newton, all samples": (bumps(BUMPS), NEWTON, 5),
-    "newton, seeds": (bumps(SEVERAL, jnp.arange(3)), NEWTON, 4),
+    "newton": (bumps(BUMPS), NEWTON),
+    "newton, seeds": (bumps(SEVERAL, jnp.arange(3)), NEWTON),
 }
 
 
-@pytest.mark.parametrize("name", RESUMED)
-def test_a_continued_run_equals_an_unbroken_one_bit_for_bit(tmp_path, name):
-    given, optimiser, dispatches = RESUMED[name]
-    unbroken = fit(given, optimiser)
-    continued = broken_and_continued(given, optimiser, tmp_path, dispatches)
-    assert continued.stop == unbroken.stop and len(continued.history) == len(unbroken.history) > dispatches
-    for one, other in zip(continued.history, unbroken.history, strict=True):
+@functools.cache
+def unbroken(name):
+    return fit(*TRAINED[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "dispatches"),
+    [
+        ("adam", 3),
+        ("adam, seeds", 2),
+        pytest.param("newton", 2, id="newton, some samples"),
+        pytest.param("newton", 3, id="newton, between the stages"),
+        pytest.param("newton", 5, id="newton, all samples"),
+        ("newton, seeds", 4),
+    ],
+)
+def test_a_continued_run_equals_an_unbroken_one_bit_for_bit(tmp_path, name, dispatches):
+    whole, continued = unbroken(name), broken_and_continued(*TRAINED[name], tmp_path, dispatches)
+    assert continued.stop == whole.stop and len(continued.history) == len(whole.history) > dispatches
+    for one, other in zip(continued.history, whole.history, strict=True):
         np.testing.assert_equal(one._replace(seconds=0.0), other._replace(seconds=0.0))
-    np.testing.assert_array_equal(continued.best_step, unbroken.best_step)
-    for one, other in zip(jax.tree.leaves(continued.parameters), jax.tree.leaves(unbroken.parameters), strict=True):
+    np.testing.assert_array_equal(continued.best_step, whole.best_step)
+    for one, other in zip(jax.tree.leaves(continued.parameters), jax.tree.leaves(whole.parameters), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -181,7 +193,7 @@ def test_a_run_of_other_settings_or_data_is_not_continued(tmp_path):
 
 
 def test_seeds_in_one_program_equal_single_runs():
-    together = fit(bumps(SEVERAL, jnp.arange(3)), NEWTON)
+    together = unbroken("newton, seeds")
     assert [at.stage for at in together.history] == 3 * [newton.SOME] + 4 * [newton.ALL]
     assert [at.step for at in together.history] == [2, 4, 5, 7, 9, 11, 13]
     for seed in range(3):

@@ -60,7 +60,7 @@ def test_the_deviation_is_that_of_refits_to_other_noise(fitted):
     noise = random.normal(size=(3000, 200, 2)) * found.training_noise
     solve = np.linalg.pinv(weights[:, None] * Phi, rcond=1e-10) * weights
     errors = np.einsum("nip,pm,rm->rni", phi, solve, noise.reshape(3000, -1))
-    std = jax.vmap(predictive(ARM, parameters, found.uncertainty.factor))(test.q, test.qd, test.qdd)
+    std = jax.jit(jax.vmap(predictive(ARM, parameters, found.uncertainty.factor)))(test.q, test.qd, test.qdd)
     # Of 3,000 refits a standard deviation is known to 1.3 %.
     np.testing.assert_allclose(std, errors.std(axis=0), rtol=0.06)
     closed = np.sqrt((phi @ solve) ** 2 @ np.tile(found.training_noise**2, 200))
@@ -72,8 +72,8 @@ def test_the_deviation_is_that_of_refits_to_other_noise(fitted):
 def test_bands_cover_what_they_promise(fitted):
     parameters, found = fitted
     factor, noise, inflation, _ = found.uncertainty
-    std = jax.vmap(predictive(ARM, parameters, factor, noise, inflation))
-    motion = jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics)
+    std = jax.jit(jax.vmap(predictive(ARM, parameters, factor, noise, inflation)))
+    motion = jax.jit(jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics))
     shares = []
     for seed in range(10, 14):
         test = drawn(seed, samples=500)
@@ -97,7 +97,7 @@ def test_a_direction_that_data_never_showed_is_told_even_where_the_deviation_is_
     known = estimate(ARM, parameters, train, validation, ridge=0.0, negligible=1e-12).uncertainty
     still = [np.array([0.5, 0.4]), np.array([0.3, 0.0]), np.array([-0.2, 0.0])]
     moving = [still[0], np.array([0.3, 1e-4]), still[2]]
-    of_state = scores(ARM, parameters, known)
+    of_state = jax.jit(scores(ARM, parameters, known))
     assert max(map(float, of_state(*still))) < 1
     found = of_state(*moving)
     assert found.distance < 1 and found.parameters < 1 < found.undetermined
@@ -117,12 +117,12 @@ def test_a_network_is_uncertain_where_it_has_seen_nothing():
     found = estimate(model, truth, *sets[:2])
     assert found.uncertainty.domain.undetermined.shape[1] == 0
     factor, noise, inflation, _ = found.uncertainty
-    std = jax.vmap(predictive(model, truth, factor, noise, inflation))
+    std = jax.jit(jax.vmap(predictive(model, truth, factor, noise, inflation)))
     near, far = sets[2], drawn(7, samples=50, reach=3.0)
     predicted = torque(near.q, near.qd, near.qdd)
     assert 0.9 < coverage(predicted - near.tau, std(near.q, near.qd, near.qdd), levels=(0.95,)).shares.mean() < 0.99
     assert np.median(std(far.q, far.qd, far.qdd)) > 2 * np.median(std(near.q, near.qd, near.qdd))
-    flag = jax.vmap(outside(model, truth, found.uncertainty))
+    flag = jax.jit(jax.vmap(outside(model, truth, found.uncertainty)))
     assert np.mean(flag(far.q, far.qd, far.qdd)) > 0.95 and np.mean(flag(near.q, near.qd, near.qdd)) < 0.05
 
 

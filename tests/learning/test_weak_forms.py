@@ -1,5 +1,6 @@
 """The weak form of the equations of motion: exact without accelerations, and steadier than them under noise."""
 
+import functools
 from typing import Any
 
 import jax
@@ -30,6 +31,11 @@ def arm():
     return trees.serial(*trees.dh_frames(rows), links, armature=np.array([0.05, 0.02]))
 
 
+@jax.jit
+def torques_of_bodies(q, qd, qdd):
+    return jax.vmap(functools.partial(trees.newton_euler, arm()))(q, qd, qdd)
+
+
 def log(seed, *, noise_q=0.0, noise_tau=0.0):
     """Arrays of motions of the arm, with exact rates and torques."""
     random = np.random.default_rng(seed)
@@ -41,8 +47,7 @@ def log(seed, *, noise_q=0.0, noise_tau=0.0):
         np.moveaxis(first @ sine + second @ cosine, 1, 2).reshape(-1, 2)
         for first, second in ((a, b), (-b * w, a * w), (-a * w**2, -b * w**2))
     )
-    tree = arm()
-    tau = np.asarray(jax.vmap(lambda *state: trees.newton_euler(tree, *state))(q, qd, qdd))
+    tau = np.asarray(torques_of_bodies(q, qd, qdd))
     tau = tau + 0.2 * qd + DRY * np.tanh(qd / SCALE)
     arrays = {
         "t": np.tile(t, RUNS),
@@ -73,9 +78,14 @@ def error(parameters):
 def test_momentum_and_rest_are_the_torque():
     plant = dynamics(two_link_arm().energies)
     q, qd, qdd = jnp.array([0.3, -0.7]), jnp.array([1.2, 0.4]), jnp.array([-2.0, 3.0])
-    _, change = jax.jvp(lambda *state: momentum_and_rest(plant, *state)[0], (q, qd), (qd, qdd))
-    rest = momentum_and_rest(plant, q, qd)[1]
-    assert np.asarray(change + rest) == pytest.approx(np.asarray(plant.inverse_dynamics(q, qd, qdd)), rel=1e-12)
+
+    @jax.jit
+    def sum_and_torque(q, qd, qdd):
+        _, change, rest = jax.jvp(functools.partial(momentum_and_rest, plant), (q, qd), (qd, qdd), has_aux=True)
+        return change + rest, plant.inverse_dynamics(q, qd, qdd)
+
+    found, torque = map(np.asarray, sum_and_torque(q, qd, qdd))
+    assert found == pytest.approx(torque, rel=1e-12)
 
 
 def test_power_changes_the_energy_or_is_lost():

@@ -49,7 +49,7 @@ def checks(d):
 
 
 @settings(max_examples=60, deadline=None)
-@given(d=st.integers(1, 6), seed=st.integers(0, 2**16))
+@given(d=st.sampled_from([1, 2, 3, 6]), seed=st.integers(0, 2**16))
 def test_physics_holds_for_random_parameters(d, seed):
     state = np.random.default_rng(seed).normal(size=(3, d))
     mass, *residuals = checks(d)(seed, *state)
@@ -89,8 +89,8 @@ def test_absent_terms_cost_nothing():
 def test_prismatic_joints_take_no_trigonometry():
     def text(**kinds):
         model = small(2, **kinds)
-        q = jnp.zeros(2)
-        return str(jax.make_jaxpr(dynamics(model.energies(model.init(jax.random.key(0)))).mass_matrix)(q))
+        parameters = jax.tree.map(lambda leaf: np.zeros(leaf.shape), jax.eval_shape(model.init, jax.random.key(0)))
+        return str(jax.make_jaxpr(dynamics(model.energies(parameters)).mass_matrix)(jnp.zeros(2)))
 
     assert " cos" in text() and " sin" in text()
     assert " cos" not in text(prismatic=True) and " sin" not in text(prismatic=True)
@@ -99,12 +99,14 @@ def test_prismatic_joints_take_no_trigonometry():
 
 
 def test_a_full_turn_changes_nothing():
-    system = dynamics(small(2).energies(small(2).init(jax.random.key(1))))
-    q, qd, qdd = jnp.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]])
-    turned = q + 2 * jnp.pi * jnp.array([1.0, -3.0])
-    np.testing.assert_allclose(
-        system.inverse_dynamics(q, qd, qdd), system.inverse_dynamics(turned, qd, qdd), rtol=1e-11
-    )
+    model = small(2)
+    q, qd, qdd = np.array([[0.4, 1.0], [1.0, -1.0], [0.5, 2.0]])
+
+    @jax.jit
+    def torque(q):
+        return dynamics(model.energies(model.init(jax.random.key(1)))).inverse_dynamics(q, qd, qdd)
+
+    np.testing.assert_allclose(torque(q), torque(q + 2 * np.pi * np.array([1.0, -3.0])), rtol=1e-11)
 
 
 def test_the_forward_model_is_a_diffrax_vector_field():
@@ -126,6 +128,6 @@ def test_the_forward_model_is_a_diffrax_vector_field():
         saveat=diffrax.SaveAt(ts=jnp.linspace(0, 2, 9)),
         stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
     )
-    energies = jax.vmap(system.energy)(*solution.ys)
+    energies = jax.jit(jax.vmap(system.energy))(*solution.ys)
     assert np.abs(energies - energies[0]).max() < 1e-8
     assert np.abs(solution.ys[0][-1] - start[0]).max() > 1e-2

@@ -51,7 +51,7 @@ def test_every_kind_has_the_friction_that_its_needs_name(kind):
     q, qd, qdd = STATE
     one_network = kind in ("black-box-hnn", "separable-hnn")  # whose velocities may have no momentum
     if one_network:
-        qd, free = flow(without).rates(q, qdd)
+        qd, free = jax.jit(flow(without).rates)(q, qdd)
     J = np.array(ABSOLUTE)
     coefficients, shape = friction_of(
         parameters["friction"], FrictionShape(velocity_scale=0.05), linear=kind == "trigonometric"
@@ -59,15 +59,17 @@ def test_every_kind_has_the_friction_that_its_needs_name(kind):
     force = jax.grad(joint_dissipation(**coefficients._asdict(), **shape._asdict()), argnums=1)(jnp.zeros(2), J @ qd)
     share = 1 / (1 + np.exp(-parameters["friction"].shape.get("load", -np.inf))) * np.tanh(J @ qd / 0.05)
     if one_network:
-        np.testing.assert_allclose(flow(found).rates(q, qdd)[0], qd)
+        velocity, change = jax.jit(flow(found).rates)(q, qdd)
+        np.testing.assert_allclose(velocity, qd)
         link = -force / (1 - np.sign(force) * share)
-        np.testing.assert_allclose(flow(found).rates(q, qdd)[1], free + J.T @ link, rtol=1e-9)
+        np.testing.assert_allclose(change, free + J.T @ link, rtol=1e-9)
         return
-    link = np.linalg.solve(J.T, dynamics(without).inverse_dynamics(q, qd, qdd))
-    tau = dynamics(found).inverse_dynamics(q, qd, qdd)
+    link = np.linalg.solve(J.T, jax.jit(dynamics(without).inverse_dynamics)(q, qd, qdd))
+    tau = jax.jit(dynamics(found).inverse_dynamics)(q, qd, qdd)
     np.testing.assert_allclose(tau, J.T @ (link + abs(link) * share + force), rtol=1e-9)
     if kind != "feed-forward":
-        np.testing.assert_allclose(dynamics(found).forward_dynamics(q, qd, tau), qdd, rtol=1e-7, atol=1e-7)
+        forward = jax.jit(dynamics(found).forward_dynamics)
+        np.testing.assert_allclose(forward(q, qd, tau), qdd, rtol=1e-7, atol=1e-7)
 
 
 def test_a_phase_network_loses_momentum_by_friction():

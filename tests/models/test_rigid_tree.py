@@ -1,5 +1,7 @@
 """The parameters of a rigid tree with known frames are found by one linear fit, and predict unseen motions."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +21,16 @@ ARM = serial(*FRAMES, LINKS, armature=[0.1, 0.2, 0.05])
 FRICTION = {"viscous": [0.2, 0.1, 0.3], "coulomb": [0.5, 0.3, 0.1], "offset": [0.1, 0.0, -0.2]}
 
 
+@functools.cache
+def torque_of(friction):
+    dissipation = joint_dissipation(*FRICTION.values()) if friction else None
+    return jax.jit(jax.vmap(dynamics(tree_system(ARM, dissipation)).inverse_dynamics))
+
+
 def data(seed, noise, *, friction, samples=300):
     random = np.random.default_rng(seed)
     state = random.normal(size=(3, samples, 3))
-    dissipation = joint_dissipation(*FRICTION.values()) if friction else None
-    tau = jax.jit(jax.vmap(dynamics(tree_system(ARM, dissipation)).inverse_dynamics))(*state)
+    tau = torque_of(friction)(*state)
     arrays = dict(zip(("q", "qd", "qdd"), state, strict=True))
     trajectory = np.arange(samples)
     return from_arrays(
@@ -36,11 +43,11 @@ def test_a_fit_is_exact_and_knows_what_it_cannot_know(friction):
     model = make_rigid_tree(ARM, friction=friction)
     train, test = (data(seed, 0.0, friction=friction) for seed in range(2))
     fit = fit_linear(model, train, negligible=1e-12)
-    columns = jax.vmap(lambda *state: linearised(model, fit.parameters, *state)[0])(train.q, train.qd, train.qdd)
-    columns = np.asarray(columns).reshape(-1, 33 + 9 * friction)
+    rows = jax.jit(jax.vmap(lambda *state: linearised(model, fit.parameters, *state)[0]))
+    columns = np.asarray(rows(train.q, train.qd, train.qdd)).reshape(-1, 33 + 9 * friction)
     assert fit.rank == np.linalg.matrix_rank(columns, rtol=1e-10) == 16 + 9 * friction
     assert fit.parameter_count == 33 + 9 * friction and fit.condition < 10
-    predicted = jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics)(test.q, test.qd, test.qdd)
+    predicted = jax.jit(jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics))(test.q, test.qd, test.qdd)
     assert np.abs(predicted - test.tau).max() < 1e-10 * np.abs(test.tau).max()
     if friction:
         for name, values in FRICTION.items():
@@ -51,7 +58,7 @@ def test_noise_is_averaged():
     model, noise = make_rigid_tree(ARM), 0.1
     fit = fit_linear(model, data(0, noise, friction=False), negligible=1e-12)
     test = data(1, 0.0, friction=False)
-    predicted = jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics)(test.q, test.qd, test.qdd)
+    predicted = jax.jit(jax.vmap(dynamics(model.energies(fit.parameters)).inverse_dynamics))(test.q, test.qd, test.qdd)
     # Of 900 equations the fit takes one for each parameter that it determines.
     expected = noise * np.sqrt(fit.rank / 900)
     assert 0.5 * expected < np.sqrt(np.mean((predicted - test.tau) ** 2)) < 2 * expected
@@ -76,7 +83,7 @@ def test_coefficients_of_other_laws_are_found_with_the_inertias(law):
     model = make_rigid_tree(ARM, friction=(law,), **scale)
     started = model.init(jax.random.key(0))
     assert [name for name in names if getattr(started, name) is not None] == list(names) and started.viscous is None
-    tau = jax.vmap(dynamics(model.energies(started._replace(**true))).inverse_dynamics)
+    tau = jax.jit(jax.vmap(dynamics(model.energies(started._replace(**true))).inverse_dynamics))
     free = data(0, 0.0, friction=False)
     fit = fit_linear(model, free._replace(tau=np.asarray(tau(free.q, free.qd, free.qdd))), negligible=1e-12)
     assert fit.rank == 16 + 3 * len(names) and fit.torque_mse < 1e-20

@@ -44,7 +44,7 @@ def test_it_comes_back_with_the_run(folder, undetermined):
     stored = known(undetermined)
     save_uncertainty(folder, stored, ridge=1e-8)
     run = load(folder)
-    std, flag = predictive(MODEL, PARAMETERS, *stored[:3]), outside(MODEL, PARAMETERS, stored)
+    std, flag = map(jax.jit, (predictive(MODEL, PARAMETERS, *stored[:3]), outside(MODEL, PARAMETERS, stored)))
     for state in STATES[:3]:
         np.testing.assert_allclose(run.torque_std(*state), std(*state), rtol=1e-12)
         assert run.outside(*state.tolist()) == flag(*state)

@@ -51,7 +51,7 @@ def clean():
     t, q, qd, qdd = motions(seed=1)
     tree = arm().tree
     flat = [x.reshape(-1, 3) for x in (q, qd, qdd)]
-    tau = np.asarray(jax.vmap(lambda *state: trees.newton_euler(tree, *state))(*flat))
+    tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(*flat))
     tau = tau + flat[1] * [0.4, 0.4, 0.1] + np.tanh(flat[1] / 0.02) * [0.8, 0.8, 0.15]
     random = np.random.default_rng(2)
     return {
@@ -152,7 +152,7 @@ def test_nothing_is_found_in_other_clean_logs(seed):
             "trajectory": np.repeat(np.arange(RUNS), SAMPLES),
         }
     )
-    tau = jax.vmap(dynamics(scene.closed_form).inverse_dynamics)(data.q, data.qd, data.qdd)
+    tau = jax.jit(jax.vmap(dynamics(scene.closed_form).inverse_dynamics))(data.q, data.qd, data.qdd)
     assert quick(data._replace(tau=np.asarray(tau), estimated=(), needs=scene.needs)) == []
 
 

@@ -83,7 +83,8 @@ def states_of(system, d, controls):
     states = {name: random.uniform(-1, 1, (3, d)) for name in ("q", "qd", "qdd", "tau", "p")}
     states["u"] = random.normal(size=(3, controls))
     if isinstance(system, Canonical):  # velocities that have momenta
-        states["qd"] = jax.vmap(lambda q, p: flow(system).rates(q, p)[0])(states["q"], 0.5 * states["p"])
+        rates = jax.jit(jax.vmap(lambda q, p: flow(system).rates(q, p)[0]))
+        states["qd"] = rates(states["q"], 0.5 * states["p"])
     return {**states, "x": np.concatenate([states["q"], states["qd"]], axis=1), "dt": np.full(3, DT)}
 
 

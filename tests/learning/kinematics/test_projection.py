@@ -22,8 +22,13 @@ def problem():
     frames = random_frames(3, random)
     state = random.normal(size=(3, 40, 3))
     linear = random.normal(size=STRUCTURE.linear_count)
-    Phi = jax.vmap(functools.partial(design, STRUCTURE, frames))(*state)
-    return Frames(*map(jnp.asarray, frames)), Samples(*state, np.asarray(Phi) @ linear), linear
+    frames = Frames(*map(jnp.asarray, frames))
+    return frames, Samples(*state, np.asarray(columns(frames, *state)) @ linear), linear
+
+
+@jax.jit
+def columns(frames, q, qd, qdd):
+    return jax.vmap(functools.partial(design, STRUCTURE, frames))(q, qd, qdd)
 
 
 def projected(step, further=None):
@@ -43,7 +48,7 @@ def test_the_design_has_all_that_a_tree_shows():
     frames, samples, _ = problem()
     tree = make_tree(STRUCTURE.parents, KINDS, *frames, np.tile([0, 0, 1], (3, 1)), np.ones((3, 10)))
     tau = np.asarray(jax.jit(jax.vmap(functools.partial(newton_euler, tree)))(*samples[:3]))
-    Phi = np.asarray(jax.vmap(functools.partial(design, STRUCTURE, frames))(*samples[:3]))
+    Phi = np.asarray(columns(frames, *samples[:3]))
     flat = Phi.reshape(-1, Phi.shape[-1])
     # Whatever bodies hang on it, the minimal columns explain their torques.
     solution, *_ = np.linalg.lstsq(flat, tau.ravel(), rcond=1e-12)

@@ -1,5 +1,7 @@
 """Friction by load: its formula, that its inverse is exact, and what each record makes of it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +34,7 @@ def inverse_factor(q):
 
 
 known = dynamics(ARM.closed_form)
+torque_of_the_arm = jax.jit(known.inverse_dynamics)
 RECORDS = {
     "natural": NaturalSystem(factor, ARM.potential),
     "closed-form": ARM.closed_form,
@@ -49,13 +52,13 @@ def test_torque_is_the_formula_and_forward_undoes_it(name, joint_map):
     q, qd, qdd = STATE
     map_ = np.eye(2) if joint_map is None else joint_map
     rates = map_ @ qd
-    link = np.linalg.solve(map_.T, known.inverse_dynamics(q, qd, qdd))
+    link = np.linalg.solve(map_.T, torque_of_the_arm(q, qd, qdd))
     at_joints = (
         link + SHARE * abs(link) * np.tanh(rates / V) + [0.2, 0.1] * rates + [0.5, 0.3] * np.tanh(rates / V) + 0.05
     )
-    tau = system.inverse_dynamics(q, qd, qdd)
+    tau = jax.jit(system.inverse_dynamics)(q, qd, qdd)
     np.testing.assert_allclose(tau, map_.T @ at_joints, rtol=1e-11)
-    np.testing.assert_allclose(system.forward_dynamics(q, qd, tau), qdd, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(system.forward_dynamics)(q, qd, tau), qdd, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["natural", "closed-form", "hamiltonian"])
@@ -63,17 +66,15 @@ def test_jacobians_are_differences(name):
     system = with_friction(RECORDS[name], D, Load(SHARE, V))
     q, qd, qdd = map(jnp.asarray, STATE)
     motion = dynamics(system)
-    tau, h = motion.inverse_dynamics(q, qd, qdd), 1e-6
-    found, by = jacobians.forward_dynamics_jacobians(system, q, qd, tau)
+    tau, h = jax.jit(motion.inverse_dynamics)(q, qd, qdd), 1e-6
+    forward = jax.jit(motion.forward_dynamics)
+    found, by = jax.jit(functools.partial(jacobians.forward_dynamics_jacobians, system))(q, qd, tau)
     np.testing.assert_allclose(found, qdd, rtol=1e-9)
     at = [q, qd, tau]
     for place in range(3):
         columns = []
         for unit in np.eye(2):
-            ends = [
-                motion.forward_dynamics(*(x + side * h * unit * (k == place) for k, x in enumerate(at)))
-                for side in (1, -1)
-            ]
+            ends = [forward(*(x + side * h * unit * (k == place) for k, x in enumerate(at))) for side in (1, -1)]
             columns.append((ends[0] - ends[1]) / (2 * h))
         np.testing.assert_allclose(by[place], np.stack(columns, axis=1), rtol=1e-5, atol=1e-5)
 
@@ -94,12 +95,16 @@ def test_free_motion_loses_what_friction_takes(name, load):
     p = ARM.mass_matrix(q) @ qd
     free = RECORDS["natural"]
     system = PhaseRates(flow(free).rates) if name == "rates" else RECORDS[name]
-    velocity, change = flow(with_friction(system, D, load)).rates(q, p)
+    velocity, change = jax.jit(flow(with_friction(system, D, load)).rates)(q, p)
     np.testing.assert_allclose(velocity, qd, rtol=1e-10)
-    lost = known.forward_dynamics(q, qd, jnp.zeros(2)) - dynamics(with_friction(free, D, load)).forward_dynamics(
-        q, qd, jnp.zeros(2)
-    )
-    np.testing.assert_allclose(flow(free).rates(q, p)[1] - change, ARM.mass_matrix(q) @ lost, rtol=1e-9)
+    slowed = dynamics(with_friction(free, D, load))
+
+    @jax.jit
+    def lost(q, qd):
+        zero = jnp.zeros(2)
+        return ARM.mass_matrix(q) @ (known.forward_dynamics(q, qd, zero) - slowed.forward_dynamics(q, qd, zero))
+
+    np.testing.assert_allclose(jax.jit(flow(free).rates)(q, p)[1] - change, lost(q, qd), rtol=1e-9)
 
 
 def test_without_friction_a_system_is_as_it_was():
