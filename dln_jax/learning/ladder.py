@@ -66,6 +66,8 @@ class Climb(NamedTuple):
     """The rungs that were tried or passed over, in order."""
 
     chosen: Step
+    fitted: Fitted
+    """The chosen model."""
     steps: tuple[Step, ...]
     ended: str
     """Why no further rung was tried; empty where all were."""
@@ -108,10 +110,15 @@ def climb(
             ended = _ended(step, None if noise is None else (noise / scale) ** 2)
         steps.append(step)
         report(step)
-    trials = [Trial(step, None, step.errors.mean(axis=1)) for step in steps if step.errors is not None]
+    trials = [
+        Trial(step, step.fitted, step.errors.mean(axis=1))
+        for step in steps
+        if step.errors is not None and step.fitted is not None
+    ]
     if not trials or not np.isfinite(min(trial.validation for trial in trials)):
         raise InputError("no model could be fitted: " + "; ".join(f"{step.name}: {step.reason}" for step in steps))
-    return Climb(smallest_enough(trials).candidate, tuple(steps), ended)
+    best = smallest_enough(trials)
+    return Climb(best.candidate, best.outcome, tuple(steps), ended)
 
 
 def torque_errors(

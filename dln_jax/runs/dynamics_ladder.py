@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.robots import Robot
 from dln_jax.data.splits import every
 from dln_jax.files import write_json
 from dln_jax.identification.identify import identify, parameters_of
@@ -67,8 +68,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path) -> tuple[Task
     )
     print_ladder(found)
     write_json(folder / "ladder.json", as_json(found))
-    assert found.chosen.fitted is not None
-    return found.chosen.fitted.outcome
+    return found.fitted.outcome
 
 
 def report(step: Step) -> None:
@@ -122,7 +122,8 @@ def _rungs(given: Options, recorded: Recorded, folder: Path) -> list[Rung]:
     def by_name(name: str) -> Callable[[float], Fitted]:
         return lambda left: _by_name(name, given, recorded, folder, left)
 
-    known = [] if recorded.robot is None else of_tree("rigid-tree", lambda left: _rigid_tree(given, recorded))
+    robot = recorded.robot
+    known = [] if robot is None else of_tree("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
     learned = of_tree("learned-tree", by_name("learned-tree"))
     first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
     # A small basis is fitted in a second, a tree of unknown frames in half a minute.
@@ -153,10 +154,9 @@ def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, left: 
     return Fitted(build(task.description), training.parameters, (task, training))
 
 
-def _rigid_tree(given: Options, recorded: Recorded) -> Fitted:
+def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
     """The robot's tree, identified as the command `identify` does."""
-    robot, needs = recorded.robot, recorded.needs
-    assert robot is not None
+    needs = recorded.needs
     train_set, validation, _ = recorded.sets
     began = time.perf_counter()
     stated = {"needs": needs, "tree": tree_to_json(robot.tree), "velocity_scale": needs.velocity_scale}
