@@ -60,7 +60,7 @@ def torque_bands(
         right.plot(
             found.levels, found.shares[:, joint], color=style.CYCLE[joint], linewidth=1.2, label=f"joint {joint + 1}"
         )
-    right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of held-out torques in it")
+    right.set(xlim=(0, 1), ylim=(0, 1), xlabel="level of the band", ylabel="share of torques in it")
     style.legend(right, loc="lower right")
     return figure
 
