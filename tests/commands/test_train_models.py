@@ -68,7 +68,8 @@ def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workp
     assert load(workplace / "kernel").description["samples"] == 40
     assert "is one linear problem" in refused(capsys, train_delan, *options, "--width", "3")
     assert "samples is 0" in refused(capsys, train_delan, *options, "--samples", "0")
-    assert "--samples" in refused(capsys, train_delan, "--data", "swing.npz", "--samples", "9")
+    linear = ("--data", "swing.npz", "--model", "trigonometric", "--samples", "9")
+    assert "--samples" in refused(capsys, train_delan, *linear)
 
 
 def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, capsys, monkeypatch):
