@@ -49,7 +49,7 @@ def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Cal
     return cost
 
 
-def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: float) -> Law:
+def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: Any) -> Law:
     """`near` where the cost to go is at most the level, else `far`."""
 
     def law(x: Array) -> Array:

@@ -1,0 +1,87 @@
+"""The acrobot and the pendubot of a public board (Wiebe et al. 2022, "RealAIGym"): its plant, integration and score.
+
+Ten seconds of the classical Runge-Kutta method at 500 Hz, from hanging at rest; success is a tip that is at last, and
+from then on, above nine tenths of the stretched length. Score v2 is
+
+    success (1 - 1/5 sum over criteria of tanh(pi criterion / size))
+"""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control import Controller, Laboratory, Run, field_of, simulate
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
+
+RATE, SECONDS = 500.0, 10.0
+LIMIT = 6.0
+"""N m."""
+HEIGHT = 0.9
+"""Of the stretched length, above the shoulder."""
+GOAL = np.array([np.pi, 0.0, 0.0, 0.0])
+Motor = Literal["elbow", "shoulder"]
+BEST = {"elbow": 0.655, "shoulder": None}
+"""Of the board for simulation, version 2, in August 2026, where it is known."""
+
+
+class Criteria(NamedTuple):
+    """Of a run; the smaller the better."""
+
+    time: float
+    """s, of the first sample after which the tip stays up; infinite where it does not."""
+    energy: float
+    """Sum of |dq tau|, J."""
+    torque_cost: float
+    """Integral of tau², N² m² s."""
+    smoothness: float
+    """Standard deviation of differences of neighbouring torques, N m."""
+    velocity_cost: float
+    """Integral of |qd|², rad²/s."""
+
+
+SIZES = Criteria(20.0, 60.0, 20.0, 0.1, 400.0)
+
+
+def plant(motor: Motor) -> tuple[Scene, Array]:
+    """The scene and its actuation matrix [2, 1]."""
+    scene = two_link_pendulum(motor)
+    return scene, jnp.asarray(scene.needs.actuation)
+
+
+def play(motor: Motor, controller: Controller) -> Run:
+    """The closed loop as the board runs it."""
+    scene, B = plant(motor)
+    field = field_of(dynamics(scene.energies), B)
+    lab = Laboratory(-LIMIT, LIMIT)
+    return jax.jit(
+        lambda: simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, laboratory=lab)
+    )()
+
+
+def criteria(motor: Motor, run: Run) -> Criteria:
+    """Of a run."""
+    driven = {"shoulder": 0, "elbow": 1}[motor]
+    q, qd = np.split(np.asarray(run.x), 2, axis=1)
+    u = np.asarray(run.u)[:, 0]
+    inner, outer = Links().lengths
+    up = -inner * np.cos(q[:, 0]) - outer * np.cos(q.sum(axis=1)) > HEIGHT * (inner + outer)
+    stays = len(up) - np.argmin(up[::-1]) if not up.all() else 0
+    return Criteria(
+        time=stays / RATE if up[-1] else np.inf,
+        energy=float(np.sum(np.abs(np.diff(q[:, driven]) * u))),
+        torque_cost=float(np.sum(u**2) / RATE),
+        smoothness=float(np.std(np.diff(u))),
+        velocity_cost=float(np.sum(qd**2) / RATE),
+    )
+
+
+def score(found: Criteria) -> float:
+    """Version 2, from 0 to 1; 0 without success, and for what is no number."""
+    if not np.isfinite(found).all():
+        return 0.0
+    return 1 - float(np.mean([np.tanh(np.pi * value / size) for value, size in zip(found, SIZES, strict=True)]))

@@ -1,0 +1,87 @@
+"""The cases of the report of control."""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from dln_jax.control import EnergyGains
+from dln_jax.precision import in_float64
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.control import energy_laws
+from dln_jax.studies.control.board import Motor, criteria, plant, play
+from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
+from dln_jax.studies.control.planned import Weights, follower, search
+from dln_jax.studies.report import Row, expect
+
+TURN = 2 * np.pi / 2048
+"""rad, of an encoder."""
+SWING_UPS = {
+    "cart-pole": SwingUp(
+        cart_pole(cart_mass=0.57, pole_mass=0.127, length=0.16825, friction=0.002),
+        EnergyGains(2000.0, 10.0, 4.0),
+        np.diag([10.0, 1.0, 0.1, 0.1]),
+        0.1,
+        10.0,
+        1.0,
+        (2.3e-5, TURN),
+        0.02,
+    ),
+    "rotary-pendulum": SwingUp(
+        rotary_pendulum(friction=1e-5),
+        EnergyGains(2e7, 20.0, 5.0),
+        np.diag([1.0, 1.0, 0.01, 0.01]),
+        50.0,
+        0.05,
+        0.1,
+        (TURN, TURN),
+        0.1,
+    ),
+}
+"""With the sizes of desktop plants, and their models known."""
+STARTS, SUCCESS = 1000, 0.995
+PLANNED = {"acrobot": 0.66, "pendubot": None}
+"""Score to reach; the board's best acrobot has 0.655."""
+HORIZONS = (1.5, 1.6, 1.8, 2.0)
+WEIGHTS = (Weights(), Weights(torque=0.3, velocity=0.01, slope=3e-3))
+
+
+def swing_up(name: str, quick: bool) -> Findings:
+    """Share of starts that are up after ten seconds, and when."""
+    times = success(SWING_UPS[name], 50 if quick else STARTS)
+    case, words = f"swing-up/{name}/known", f"of {len(times)} starts near hanging, in a laboratory"
+    reached = times[np.isfinite(times)]
+    rows = [expect(case, "success_share", words, np.isfinite(times).mean(), SUCCESS, at_least=True)]
+    for quantity, of in (("median", np.median), ("worst", np.max)):
+        rows.append(Row(case, f"seconds_{quantity}", float(of(reached)) if len(reached) else np.inf, "s"))
+    return Findings(rows)
+
+
+def by_plan(motor: Motor, quick: bool) -> Findings:
+    """The best score of plans over some horizons, weights and guesses."""
+    horizons, weights = ((1.6,), WEIGHTS[:1]) if quick else (HORIZONS, WEIGHTS)
+    found, plan, weighted = search(motor, horizons, weights, guesses=1 if quick else 3)
+    name = plant(motor)[0].name
+    case, bound, words = f"board/{name}/planned", PLANNED[name], "version 2 of the board's"
+    row = Row(case, "score", found, expected=words, bound=bound, at_least=True)
+    run = play(motor, follower(motor, weighted, plan))
+    return Findings([row, *rows_of_criteria(case, criteria(motor, run))])
+
+
+def by_energy(motor: Motor, quick: bool) -> Findings:
+    """The best score of laws drawn at random."""
+    return energy_laws.board(motor, 100 if quick else energy_laws.DRAWS)
+
+
+def cases(*, quick: bool = False) -> list[Case]:
+    """All, named SUBJECT/NAME, in float64."""
+    measures: dict[str, Callable[[bool], Findings]] = {
+        **{f"swing-up/{name}": functools.partial(swing_up, name) for name in SWING_UPS},
+        "board/acrobot-energy": functools.partial(by_energy, "elbow"),
+        "board/pendubot-energy": functools.partial(by_energy, "shoulder"),
+        "board/acrobot-planned": functools.partial(by_plan, "elbow"),
+        "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
+    }
+    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]
