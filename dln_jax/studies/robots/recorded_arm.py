@@ -76,8 +76,8 @@ def methods(tree: Tree, data: Trajectories) -> dict[str, Predict]:
     train, validation = select(data, np.setdiff1d(present, chosen)), select(data, chosen)
     laws = min(LAWS, key=lambda each: error(fit_friction(tree, train, each), validation))
     full = fit_friction(tree, data, laws)
-    part = fit_friction(tree, train, laws)
-    with_network = fit_residual(part.model, part.parameters, tree.needs, train, validation)
+    # The tree has seen what the network's size is chosen by, which leaves a network less to better there.
+    with_network = fit_residual(full.model, full.parameters, tree.needs, train, validation)
     found: dict[str, Predict] = {
         "usual-friction": predictor(*_parts(fit_friction(tree, data, LAWS[0]))),
         "chosen-friction": predictor(*_parts(full)),
