@@ -7,19 +7,22 @@ depends on the velocity too, and a kinetic energy, which only adds inertia, what
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics import natural
-from dln_jax.mechanics.dynamics import plus_potential
+from dln_jax.mechanics import closed_form, natural
+from dln_jax.mechanics.closed_form import ClosedForm
+from dln_jax.mechanics.dynamics import friction_force, minus_potential, plus_potential
 from dln_jax.mechanics.joint_friction import with_friction
+from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.loaded import LoadedSystem
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.recursive import RecursiveSystem
-from dln_jax.types import CholeskyFactor, Dissipation, Potential, Vector
+from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Potential, Scalar, Vector
 
 
 class Residual(NamedTuple):
@@ -33,16 +36,47 @@ class Residual(NamedTuple):
     """q -> lower triangular L [d, d]."""
 
 
-def with_residual(system: RecursiveSystem | LoadedSystem, residual: Residual) -> RecursiveSystem | LoadedSystem:
-    """The system with these energies added to its own; behind the transmission, where load counts."""
+def with_residual(system: Any, residual: Residual) -> RecursiveSystem | LagrangianSystem | LoadedSystem:
+    """The system with these energies added to its own; behind the transmission, where load counts.
+
+    Args:
+        system: a natural system as any of its records, a Lagrangian, or one of them behind transmissions.
+        residual: what is added.
+    """
     if isinstance(system, LoadedSystem):
         behind = with_residual(system.link, residual._replace(dissipation=None))
         return with_friction(system._replace(link=behind), residual.dissipation)
+    if isinstance(system, LagrangianSystem):
+        L = _sum(system.lagrangian, residual)
+        return with_friction(system._replace(lagrangian=L), residual.dissipation)
+    system = _recursive(system)
     if residual.potential is not None:
         system = _with_potential(system, residual.potential)
     if residual.cholesky is not None:
         system = _with_inertia(system, NaturalSystem(residual.cholesky))
     return with_friction(system, residual.dissipation)
+
+
+def _sum(L: Lagrangian, residual: Residual) -> Lagrangian:
+    def both(q: Vector, qd: Vector) -> Scalar:
+        total = minus_potential(L(q, qd), residual.potential, q)
+        return total if residual.cholesky is None else total + 0.5 * jnp.sum((residual.cholesky(q).T @ qd) ** 2)
+
+    return both
+
+
+def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> RecursiveSystem:
+    """The same system by its forces."""
+    if isinstance(system, RecursiveSystem):
+        return system
+    D = system.dissipation
+    if isinstance(system, ClosedForm):
+        bare = system._replace(dissipation=None, friction=None)
+        forces = partial(closed_form.inverse_dynamics, bare)
+        return RecursiveSystem(system.mass_matrix, forces, system.potential, D, system.friction)
+    forces = partial(natural.inverse_dynamics, system._replace(dissipation=None))
+    friction = None if D is None else partial(friction_force, D)
+    return RecursiveSystem(partial(natural.mass_matrix, system), forces, system.potential, D, friction)
 
 
 def _with_potential(system: RecursiveSystem, V: Potential) -> RecursiveSystem:

@@ -32,13 +32,12 @@ from dln_jax.runs.dynamics_task import Task, needs_of_tree, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.identification_additions import with_network
 from dln_jax.runs.identification_task import Case, Sets, with_description, with_shapes
-from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import Description, build, describe
 
 RUNG_SECONDS = 120.0
 """Of a search or of the training of a network, where --seconds says nothing."""
 MOST_SAMPLES = 4_000
-"""That networks beside a tree are fitted to."""
+"""That networks beside other models are fitted to."""
 NETWORK, EXPLICIT, KERNEL = "structured-delan", "trigonometric", "trigonometric-kernel"
 BESIDE = "-residual"
 """Behind the name of a model to which a network is added."""
@@ -110,30 +109,33 @@ def as_json(found: Climb) -> dict[str, Any]:
 
 def _rungs(given: Options, recorded: Recorded, folder: Path) -> list[Rung]:
     """Those that state most first."""
-    trees: dict[str, Fitted] = {}
+    bases: dict[str, Fitted] = {}
 
-    def of_tree(name: str, fit: Callable[[float], Fitted]) -> list[Rung]:
+    def both(name: str, fit: Callable[[float], Fitted]) -> list[Rung]:
         def base(left: float) -> Fitted:
-            trees[name] = fit(left)
-            return trees[name]
+            bases[name] = fit(left)
+            return bases[name]
 
-        return [Rung(name, base), Rung(name + BESIDE, lambda left: _with_network(recorded, trees.get(name), left))]
+        return [Rung(name, base), Rung(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left))]
 
     def by_name(name: str) -> Callable[[float], Fitted]:
         return lambda left: _by_name(name, given, recorded, folder, left)
 
     robot = recorded.robot
-    known = [] if robot is None else of_tree("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
-    learned = of_tree("learned-tree", by_name("learned-tree"))
+    known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
+    learned = both("learned-tree", by_name("learned-tree"))
     first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
     # A small basis is fitted in a second, a tree of unknown frames in half a minute.
     small = second is not None and second <= MOST_PARAMETERS
-    explicit = [
-        Rung(EXPLICIT, by_name(EXPLICIT) if first is not None and first <= MOST_PARAMETERS else _too_large(first))
-    ]
-    kernel = [Rung(KERNEL, by_name(KERNEL))] if KERNEL in CATALOGUE and not small else []
-    direct = [*known[:1], *(explicit if small else []), learned[0], *([] if small else explicit), *kernel]
-    return [*direct, *known[1:], *learned[1:], Rung(NETWORK, by_name(NETWORK))]
+    explicit = (
+        both(EXPLICIT, by_name(EXPLICIT))
+        if first is not None and first <= MOST_PARAMETERS
+        else [Rung(EXPLICIT, _too_large(first))]
+    )
+    kernel = [] if small else both(KERNEL, by_name(KERNEL))
+    order = [known, explicit, learned, kernel] if small else [known, learned, explicit, kernel]
+    direct = [rungs[0] for rungs in order if rungs]
+    return [*direct, *(rung for rungs in order for rung in rungs[1:]), Rung(NETWORK, by_name(NETWORK))]
 
 
 def _too_large(size: int | None) -> Callable[[float], str]:
@@ -171,9 +173,9 @@ def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
 
 
 def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitted | str:
-    """A network beside a tree, if held-out motions ask for one."""
+    """A network beside a model, if held-out motions ask for one."""
     if base is None:
-        return "there is no tree to add a network to"
+        return "there is no model to add a network to"
     began = time.perf_counter()
     if base.outcome[0].kind == "learned-tree":
         base = _as_rigid(base, recorded)

@@ -65,9 +65,9 @@ def stored_description(case: Case, added: ResidualFit | None) -> Description:
 
 
 def with_network(description: Description, added: ResidualFit) -> Description:
-    """Of a rigid tree with what was added to it."""
+    """Of a model with what was added to it."""
     keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
-    return describe("rigid-tree-residual", precision="f64", **keywords, **added.settings)
+    return describe(f"{description['name']}-residual", precision="f64", **keywords, **added.settings)
 
 
 def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | int]) -> "Predictions":

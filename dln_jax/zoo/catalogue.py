@@ -157,46 +157,54 @@ def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> 
     return make_rigid_tree(frames, friction=needs.joint_friction or needs.friction, **keywords)
 
 
-@extending(make_stored_tree)
-def make_stored_residual(
-    needs: Needs,
-    *,
-    terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
-    width: int = 8,
-    depth: int = 1,
-    activation: Activation = tanh,
-    resolved_velocity: Scale = 0.05,
-    torque_scale: Scale = 1.0,
-    rate_scale: Scale = 1.0,
-    acceleration_scale: Scale = 1.0,
-    dtype: DTypeLike = jnp.float64,
-    **keywords: Any,
-) -> Model:
-    """`make_stored_tree` with a `make_residual`, whose `velocity_scale` is `resolved_velocity` here."""
-    residual = make_residual(
-        needs,
-        terms=tuple(terms),
-        width=width,
-        depth=depth,
-        activation=activation,
-        velocity_scale=resolved_velocity,
-        torque_scale=torque_scale,
-        rate_scale=rate_scale,
-        acceleration_scale=acceleration_scale,
-        dtype=dtype,
-    )
-    return make_with_residual(make_stored_tree(needs, dtype=dtype, **keywords), residual)
+def with_residual_network(make: Callable[..., Model]) -> Callable[..., Model]:
+    """The factory of a model with a `make_residual` beside it, whose `velocity_scale` is `resolved_velocity` here."""
+
+    @extending(make)
+    def factory(
+        needs: Needs,
+        *,
+        terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
+        width: int = 8,
+        depth: int = 1,
+        activation: Activation = tanh,
+        resolved_velocity: Scale = 0.05,
+        torque_scale: Scale = 1.0,
+        rate_scale: Scale = 1.0,
+        acceleration_scale: Scale = 1.0,
+        dtype: DTypeLike = jnp.float64,
+        **keywords: Any,
+    ) -> Model:
+        residual = make_residual(
+            needs,
+            terms=tuple(terms),
+            width=width,
+            depth=depth,
+            activation=activation,
+            velocity_scale=resolved_velocity,
+            torque_scale=torque_scale,
+            rate_scale=rate_scale,
+            acceleration_scale=acceleration_scale,
+            dtype=dtype,
+        )
+        return make_with_residual(make(needs, dtype=dtype, **keywords), residual)
+
+    return factory
 
 
 MOMENTUM = {"momentum_scale": ("p",)}
+make_basis = with_friction_laws(make_trigonometric, linear=True)
+make_kernel = with_friction_laws(make_trigonometric_kernel, linear=True)
 CATALOGUE = {
     "structured-delan": Entry(with_friction_laws(make_delan), Properties(definite=True)),
     "black-box-delan": Entry(with_friction_laws(make_black_box_lagrangian), Properties(), {"rate_scale": ("qd",)}),
-    "trigonometric": Entry(with_friction_laws(make_trigonometric, linear=True), Properties(linear=True)),
-    "trigonometric-kernel": Entry(with_friction_laws(make_trigonometric_kernel, linear=True), Properties(kernel=True)),
+    "trigonometric": Entry(make_basis, Properties(linear=True)),
+    "trigonometric-residual": Entry(with_residual_network(make_basis), Properties()),
+    "trigonometric-kernel": Entry(make_kernel, Properties(kernel=True)),
+    "trigonometric-kernel-residual": Entry(with_residual_network(make_kernel), Properties(kernel=True)),
     "planar-chain": Entry(with_friction_laws(make_planar_chain, linear=True), Properties(linear=True)),
     "rigid-tree": Entry(make_stored_tree, Properties(linear=True)),
-    "rigid-tree-residual": Entry(make_stored_residual, Properties()),
+    "rigid-tree-residual": Entry(with_residual_network(make_stored_tree), Properties()),
     "learned-tree": Entry(make_serial_tree, Properties(searched=True)),
     "feed-forward": Entry(
         with_friction_laws(make_feed_forward),

@@ -10,8 +10,10 @@ from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.joint_friction import with_friction
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.mechanics.loaded import Load
+from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import inertial_parameters, lagrangian, serial, tree_system
+from dln_jax.scenes.two_link_arm import two_link_arm
 
 TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 ARM = serial([np.eye(3), TURN], [[0, 0, 0.1], [0.3, 0, 0]], [inertial_parameters(2, [0.1, 0.2, 0], np.eye(3))] * 2)
@@ -45,6 +47,31 @@ def test_forces_are_those_of_the_sum_of_energies(terms):
     np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-10)
     np.testing.assert_allclose(ours.energy(q, qd), slow.energy(q, qd), rtol=1e-12)
     np.testing.assert_allclose(ours.friction(q, qd), jax.grad(losses, 1)(*map(jnp.asarray, (q, qd))), rtol=1e-12)
+
+
+SCENE = two_link_arm()
+RECORDS = {
+    "closed-form": SCENE.closed_form,
+    "natural": NaturalSystem(lambda q: jnp.linalg.cholesky(SCENE.mass_matrix(q)), SCENE.potential),
+    "lagrangian": SCENE.energies,
+}
+
+
+@pytest.mark.parametrize("record", RECORDS)
+def test_any_record_of_energies_takes_a_residual(record):
+    friction = joint_dissipation([0.3, 0.1], [0.2, 0.4])
+    own = with_friction(RECORDS[record], friction)
+
+    def energy(q, qd):
+        return SCENE.lagrangian(q, qd) + 0.5 * jnp.sum((RESIDUAL.cholesky(q).T @ qd) ** 2) - RESIDUAL.potential(q)
+
+    slow = dynamics(LagrangianSystem(energy, lambda q, qd: friction(q, qd) + RESIDUAL.dissipation(q, qd)))
+    ours = dynamics(with_residual(own, RESIDUAL))
+    q, qd, qdd = STATE
+    tau = slow.inverse_dynamics(*STATE)
+    np.testing.assert_allclose(ours.inverse_dynamics(*STATE), tau, rtol=1e-11)
+    np.testing.assert_allclose(ours.forward_dynamics(q, qd, tau), qdd, rtol=1e-9)
+    np.testing.assert_allclose(ours.energy(q, qd), slow.energy(q, qd), rtol=1e-12)
 
 
 def test_transmissions_carry_the_residual_too():

@@ -34,6 +34,8 @@ MODELS = {
     "black-box-delan": {"needs": SWING, **SMALL, "activation": "softplus", "rate_scale": [2.0]},
     "trigonometric": {"needs": SWING, "degree": [2]},
     "trigonometric-kernel": {"needs": SWING, "samples": 4, "serial": False},
+    "trigonometric-residual": {"needs": SWING, "degree": [2], "terms": ["potential", "inertia"], **SMALL},
+    "trigonometric-kernel-residual": {"needs": SWING, "samples": 4, "terms": ["dissipation"], **SMALL},
     "rigid-tree": {"needs": SWING, "tree": tree_to_json(PENDULUM), "velocity_scale": 0.1},
     "rigid-tree-residual": {
         **{"needs": SWING._replace(friction=False, joint_friction=("asymmetric",)), "tree": tree_to_json(PENDULUM)},

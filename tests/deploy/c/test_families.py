@@ -37,6 +37,8 @@ MODELS = {
     "rigid-tree-residual": {
         **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
     },
+    "trigonometric-residual": {"needs": FREE, "degree": 1, **SMALL},
+    "trigonometric-kernel-residual": {"needs": MIXED, "samples": 3, **SMALL},
     "planar-chain": {"needs": FREE._replace(gravity=True, friction=True), "armature": True},
     "learned-tree": {"needs": MIXED._replace(actuation=None)},
     "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
