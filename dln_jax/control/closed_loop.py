@@ -16,7 +16,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.state_space import Field
-from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
+from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import InputError, require_positive
 
 
@@ -142,8 +142,7 @@ def simulate(
         if noisy:
             u = u + lab.control_noise * jax.random.normal(of_control, (controls,), x.dtype)
         step = runge_kutta(CLASSICAL, lambda t, state: field(state, u))
-        for _ in range(substeps):
-            x = step(0.0, x, dt / substeps)
+        x = advance(step, 0.0, x, dt, substeps=substeps)
         return (x, memory, waiting), (x, u, y)
 
     start = (x, controller.start, waiting)

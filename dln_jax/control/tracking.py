@@ -2,7 +2,7 @@
 
     gravity compensation    tau = g(q) + feedback
     feed-forward            tau = f(q*, qd*, qdd*) + feedback
-    computed torque         tau = f(q, qd, qdd* + M-free feedback)
+    computed torque         tau = f(q, qd, qdd* + feedback)
 
 with f the inverse dynamics of a model, known or learned, and feedback = P (q* - q) + D (qd* - qd). Computed torque
 trusts the model at the measured state, whatever that is: with a bad model it is worse than feedback alone

@@ -25,8 +25,6 @@ HEIGHT = 0.9
 """Of the stretched length, above the shoulder."""
 GOAL = np.array([np.pi, 0.0, 0.0, 0.0])
 Motor = Literal["elbow", "shoulder"]
-BEST = {"elbow": 0.655, "shoulder": None}
-"""Of the board for simulation, version 2, in August 2026, where it is known."""
 
 
 class Criteria(NamedTuple):

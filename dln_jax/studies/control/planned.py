@@ -70,8 +70,8 @@ def problem(motor: Motor, weights: Weights) -> Problem:
     return Problem(step, cost, final_cost)
 
 
-def planned(motor: Motor, weights: Weights, seconds: float, guess: Array, *, iterations: int = 300) -> Plan:
-    """The best trajectory over so many seconds from a guess of the torque's slopes [N, 1]."""
+def planned(motor: Motor, weights: Weights, guess: Array, *, iterations: int = 300) -> Plan:
+    """The best trajectory from a guess of the torque's slopes [N, 1], which says how long it takes."""
     return optimise(problem(motor, weights), np.zeros(5), guess, iterations=iterations)
 
 
@@ -102,7 +102,7 @@ def search(
     for each in weights:
         for seconds in horizons:
             steps = round(seconds * RATE / EVERY)
-            solve = jax.jit(lambda guess, each=each, seconds=seconds: planned(motor, each, seconds, guess))
+            solve = jax.jit(lambda guess, each=each: planned(motor, each, guess))
             for seed in range(guesses):
                 plan = solve(jnp.asarray(10.0 * np.random.default_rng(seed).normal(size=(steps, 1))))
                 found = score(criteria(motor, play(motor, follower(motor, each, plan))))

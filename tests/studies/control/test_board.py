@@ -33,7 +33,7 @@ def test_criteria_of_a_motion_that_is_known():
 
 def test_a_plan_is_followed_up_and_held():
     weights = Weights()
-    plan = planned("shoulder", weights, 1.2, jnp.asarray(10.0 * np.random.default_rng(0).normal(size=(60, 1))))
+    plan = planned("shoulder", weights, jnp.asarray(10.0 * np.random.default_rng(0).normal(size=(60, 1))))
     found = criteria("shoulder", play("shoulder", follower("shoulder", weights, plan)))
     assert found.time < 1.2 and score(found) > 0.6
     # What goes in is at least what the goal has more.
