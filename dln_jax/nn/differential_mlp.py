@@ -20,7 +20,7 @@ One state, no batch axis: `jax.vmap` over x. In the code n inputs come first in 
 Jacobians meets a weight in one matrix product.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Literal
 
@@ -85,6 +85,14 @@ def value_and_jacobian(
     else:
         jacobian = _input_jacobians(layers, preactivations, activation)[-1].T
     return y, jacobian
+
+
+def value_and_pull_back(
+    layers: Layers, x: Array, *, activation: Activation
+) -> tuple[Float[Array, "m"], Callable[[Array], Float[Array, "n"]]]:
+    """y [m] at x [n], and w [m] -> (dy/dx)ᵀ w [n], which goes backward once for all outputs. Errors as of `value`."""
+    _, preactivations, y = _forward(layers, x, activation)
+    return y, lambda w: _gradient(layers, preactivations, layers[-1][0] @ w, activation)
 
 
 def value_jacobian_and_hessian(

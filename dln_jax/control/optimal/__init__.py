@@ -1,0 +1,1 @@
+"""Optimal feedback by value functions: the cost to go as a network, and the control that descends it best."""

@@ -1,0 +1,95 @@
+"""Costs to go as networks that are zero at the goal and positive elsewhere, with their gradients in the same pass.
+
+    V(x) = (z - z0)ᵀ L(z) L(z)ᵀ (z - z0)
+
+L is lower triangular, its entries are the outputs of a differential network of z - z0, and its diagonal is positive
+(Lutter et al. 2021, arXiv:2105.04682). z has the sine and cosine of each angle and the other states in units of the
+box. Without hidden layers L is constant: V is a quadratic form, which a linear-quadratic problem needs exactly.
+
+An ensemble is a leading axis of members in the parameters; V and V_x are the means over it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.optimal.problem import ControlProblem, features
+from dln_jax.nn import differential_mlp, ensembles
+from dln_jax.nn.activations import Activation, softplus, tanh
+from dln_jax.types import InputError, require_network, require_positive
+
+
+class ValueNetwork(NamedTuple):
+    """A family of values; functions of one state."""
+
+    init: Callable[[Array], Any]
+    """Key -> parameters, whose leading axis is that of the members."""
+    value_and_gradient: Callable[[Any, Array], tuple[Array, Array]]
+    """(parameters, x [n]) -> V and V_x [n], means over the members."""
+    members: Callable[[Any, Array], tuple[Array, Array]]
+    """(parameters, x [n]) -> V [K] and V_x [K, n] of each."""
+
+
+def value_network(
+    problem: ControlProblem,
+    *,
+    widths: Sequence[int] = (32, 32),
+    members: int = 1,
+    activation: Activation = tanh,
+    floor: float = 1e-3,
+    scale: float = 1.0,
+) -> ValueNetwork:
+    """A family for the states of a problem.
+
+    Args:
+        problem: whose box, joints and goal give z.
+        widths: of the hidden layers; none for a constant L.
+        members: K of the ensemble.
+        activation: between layers.
+        floor: least entry of the diagonal of L; 0 leaves the form semi-definite.
+        scale: factor on V, such as the cost that is expected at the edge of the box.
+
+    Raises:
+        InputError: sizes that make no network.
+    """
+    require_positive(members=members, scale=scale)
+    for width in widths:
+        require_network(width=width, depth=len(widths))
+    if not floor >= 0:
+        raise InputError(f"floor is {floor}; expected 0 or more")
+    size = int(jax.eval_shape(lambda x: features(problem, x), jnp.asarray(problem.goal, float)).shape[0])
+    rows, columns = np.tril_indices(size)
+    diagonal = rows == columns
+
+    def init(key: Array) -> Any:
+        layers = ensembles.init(key, (size, *widths, len(rows)), members=members)
+        # Without hidden layers the output layer's bias alone is L.
+        return layers if widths else layers[-1][1]
+
+    def one(layers: Any, x: Array) -> tuple[Array, Array]:
+        z, back_to_x = jax.vjp(lambda x: features(problem, x), x)
+        if widths:
+            entries, back_to_z = differential_mlp.value_and_pull_back(layers, z, activation=activation)
+        else:
+            entries, back_to_z = layers, lambda _: jnp.zeros_like(z)
+        lower = jnp.where(diagonal, softplus.value(entries) + floor, entries)
+        L = jnp.zeros((size, size), z.dtype).at[rows, columns].set(lower)
+        y = L.T @ z
+        # dV/dL = 2 z yᵀ, of which the network has the lower triangle.
+        slopes = 2 * (z[rows] * y[columns]) * jnp.where(diagonal, softplus.first(entries), 1.0)
+        (slope,) = back_to_x(2 * L @ y + back_to_z(slopes))
+        return scale * (y @ y), scale * slope
+
+    def each(layers: Any, x: Array) -> tuple[Float[Array, " K"], Float[Array, "K n"]]:
+        return jax.vmap(one, in_axes=(0, None))(layers, x)
+
+    def mean(layers: Any, x: Array) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+        values, slopes = each(layers, x)
+        return jnp.mean(values), jnp.mean(slopes, axis=0)
+
+    return ValueNetwork(init, mean, each)

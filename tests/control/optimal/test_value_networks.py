@@ -1,0 +1,91 @@
+"""Values against autodiff of their own, zero at the goal, and the equation of the problem they belong to."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import field_of
+from dln_jax.control.optimal.action_costs import centred, quadratic, scaled, tanh
+from dln_jax.control.optimal.problem import ControlProblem, checked, from_plant, hjb_residual, optimal_control, rates
+from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.types import InputError
+
+SCENE = cart_pole(friction=0.1)
+PLANT, B = dynamics(SCENE.energies), np.asarray(SCENE.needs.actuation)
+HIGH = np.array([0.5, np.pi, 5.0, 20.0])
+PROBLEM = ControlProblem(
+    *from_plant(PLANT, B), lambda x: x @ x, quadratic(0.1), 0.1, -HIGH, HIGH, SCENE.needs.joints, np.zeros(4)
+)
+X = jnp.array([0.2, -2.0, 1.0, 3.0])
+FAMILIES = {"network": {"widths": (6, 5), "members": 3}, "form": {"widths": (), "scale": 7.0, "floor": 0.0}}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_value_and_its_gradient(name):
+    network = value_network(PROBLEM, **FAMILIES[name])
+    parameters = jax.tree.map(lambda leaf: leaf + 0.1, network.init(jax.random.key(0)))
+    value, slope = jax.jit(network.value_and_gradient)(parameters, X)
+    assert value > 0
+    np.testing.assert_allclose(
+        slope, jax.grad(lambda x: network.value_and_gradient(parameters, x)[0])(X), rtol=1e-12, atol=1e-12
+    )
+    at_goal = network.value_and_gradient(parameters, jnp.zeros(4))
+    assert at_goal[0] == 0 and not np.any(at_goal[1])
+    around = network.value_and_gradient(parameters, X.at[1].add(2 * np.pi))
+    np.testing.assert_allclose(around[1], slope, rtol=1e-9)
+    each = network.members(parameters, X)
+    np.testing.assert_allclose(np.mean(each[1], axis=0), slope, rtol=1e-12)
+
+
+def test_drift_and_actuation_are_those_of_the_plant():
+    u = jnp.array([2.0])
+    np.testing.assert_allclose(rates(PROBLEM)(X, u), field_of(PLANT, B)(X, u), rtol=1e-12)
+
+
+def test_the_equation_is_the_least_over_controls():
+    slope, value = jnp.array([1.0, -2.0, 0.3, 0.7]), jnp.asarray(3.0)
+
+    def hamiltonian(u):
+        now = PROBLEM.state_cost(X) + PROBLEM.action_cost.cost(u)
+        return PROBLEM.discount * value - now - rates(PROBLEM)(X, u) @ slope
+
+    u = optimal_control(PROBLEM, X, slope)
+    assert hamiltonian(u) == pytest.approx(float(hjb_residual(PROBLEM, X, value, slope)))
+    np.testing.assert_allclose(jax.grad(hamiltonian)(u), 0, atol=1e-12)
+
+
+BAD = [
+    ({"goal": np.array([0.0, 0.5, 0.0, 0.0])}, "no equilibrium"),
+    ({"goal": np.array([0.0, 9.0, 0.0, 0.0])}, "outside the box"),
+    ({"high": -HIGH}, "the box is from"),
+    ({"low": np.zeros(3)}, "have shapes"),
+    ({"discount": -1.0}, "discount is -1.0"),
+    ({"state_cost": lambda x: 1.0 + x @ x}, "a second at the goal costs 1"),
+    ({"joints": ("revolute",) * 5}, "5 joints"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD)
+def test_what_is_no_problem_is_one_line(change, message):
+    with pytest.raises(InputError, match=message):
+        checked(PROBLEM._replace(**change))
+
+
+def test_a_goal_that_is_held_by_a_control():
+    weight, push = 2.0, scaled(tanh, 5.0)  # of a mass on a line
+    lift = ControlProblem(
+        lambda x: jnp.array([x[1], -weight]), lambda x: jnp.array([[0.0], [1.0]]), lambda x: x @ x,
+        centred(push, [weight]), 0.0, -np.ones(2), np.ones(2), ("prismatic",), np.zeros(2),
+    )  # fmt: skip
+    assert checked(lift).goal.shape == (2,)
+    with pytest.raises(InputError, match="no equilibrium"):
+        checked(lift._replace(action_cost=push))
+
+
+def test_sizes_that_make_no_network():
+    for wrong, message in (({"widths": (0,)}, "width"), ({"members": 0}, "members"), ({"floor": -1.0}, "floor")):
+        with pytest.raises(InputError, match=message):
+            value_network(PROBLEM, **wrong)
