@@ -47,11 +47,11 @@ def test_the_conjugate_is_the_most_that_any_control_gains(name):
     cost, least, most = COSTS[name]
     conjugate, policy, of = (jax.jit(each) for each in (cost.conjugate, cost.policy, cost.cost))
     for w in W:
-        gain = lambda u, w=w: float(w * u - of(jnp.array([u])))  # noqa: E731
-        found = minimize_scalar(lambda u: -gain(u), bounds=(least, most), method="bounded", options={"xatol": 1e-10})
+        loss = lambda u, w=w: float(of(jnp.array([u])) - w * u)  # noqa: E731
+        found = minimize_scalar(loss, bounds=(least, most), method="bounded", options={"xatol": 1e-10})
         u = float(policy(jnp.array([w]))[0])
         assert conjugate(jnp.array([w])) == pytest.approx(-found.fun, rel=1e-6, abs=1e-6), w
-        assert gain(u) == pytest.approx(float(conjugate(jnp.array([w]))), rel=1e-12, abs=1e-12), w
+        assert -loss(u) == pytest.approx(float(conjugate(jnp.array([w]))), rel=1e-12, abs=1e-12), w
         above, below = (conjugate(jnp.array([w + step])) for step in (1e-5, -1e-5))
         assert (above - below) / 2e-5 == pytest.approx(u, abs=1e-8), w
 
