@@ -1,0 +1,80 @@
+"""What an adversary of bounded strength does to a plant, in closed form (Lutter et al. 2021, arXiv:2105.12189).
+
+    dx/dt = f(x + xi_o, u + xi_u, p + xi_p) + xi_x
+
+Each disturbance drives the cost to go up as fast as its bound lets it, to first order along V_xᵀ f:
+
+    xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   each of a given length,
+    xi_p = +- a share of each parameter, by the sign of (df/dp)ᵀ V_x
+
+A value function that is trained against it is one of robust control.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from dln_jax.types import InputError
+
+Disturbance = Callable[[Array, Array, Array], Array]
+"""(x, V_x, u) -> the change of dx/dt [n] that an adversary makes."""
+
+
+class Bounds(NamedTuple):
+    """Of the disturbances; zero for those that are not there."""
+
+    state: float = 0.0
+    """|xi_x|, in the units of dx/dt."""
+    action: float = 0.0
+    """|xi_u|, in the units of u."""
+    observation: float = 0.0
+    """|xi_o|, in the units of x."""
+    parameters: float = 0.0
+    """|xi_p| / |p|."""
+
+
+def adversary(
+    plant: Callable[[Array, Array, Array], Array],
+    parameters: Any,
+    bounds: Bounds,
+    *,
+    least: Any = None,
+    most: Any = None,
+) -> Disturbance:
+    """The worst of all disturbances at once.
+
+    Args:
+        plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
+        parameters: p.
+        bounds: of each.
+        least: bound of p + xi_p from below [k], as no mass is negative; by default none.
+        most: likewise from above.
+
+    Raises:
+        InputError: bounds that are negative.
+    """
+    for name, bound in bounds._asdict().items():
+        if not bound >= 0:
+            raise InputError(f"the bound of {name} is {bound}; expected 0 or more")
+    p = jnp.asarray(parameters, float)
+
+    def change(x: Array, slope: Array, u: Array) -> Array:
+        rate, pull_back = jax.vjp(plant, x, u, p.astype(x.dtype))
+        to_x, to_u, to_p = pull_back(slope)
+        worst_p = p + bounds.parameters * jnp.abs(p) * jnp.sign(to_p)
+        if least is not None or most is not None:
+            worst_p = jnp.clip(worst_p, least, most)
+        moved = plant(x + bounds.observation * unit(to_x), u + bounds.action * unit(to_u), worst_p.astype(x.dtype))
+        return moved - rate + bounds.state * unit(slope)
+
+    return change
+
+
+def unit(z: Array) -> Array:
+    """z / |z|, zero where z is, with finite derivatives."""
+    square = jnp.sum(z**2)
+    some = square > 0
+    return jnp.where(some, z / jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)

@@ -1,0 +1,155 @@
+"""Value functions from the Hamilton-Jacobi-Bellman equation itself, by Levenberg-Marquardt in float64.
+
+The mean square over the box of
+
+    (rho V + g*(-Bᵀ V_x) - q - aᵀ V_x) / (mean of q)
+
+is made small. The equation has several solutions, only one of which is the cost to go. With a large discount that one
+is near q / rho and the others are far away, so training starts there and follows it while the discount comes down to
+the problem's own (continuation: Lutter, Belousov et al. 2019). The samples of each discount are new ones; parameters
+are chosen by samples that no fit has seen.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.optimal.adversaries import Disturbance
+from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
+from dln_jax.solvers import levenberg_marquardt
+from dln_jax.types import InputError, require_positive
+
+
+class Stage(NamedTuple):
+    """A discount, and how far the equation is from holding there."""
+
+    discount: float
+    iterations: int
+    residual: float
+    """Root mean square on the samples of the fit, as a share of the mean of q."""
+    validation: float
+    """On samples of validation, with this discount."""
+
+
+class ResidualFit(NamedTuple):
+    """What a training gives."""
+
+    parameters: Any
+    """Of the lowest validation at the problem's own discount."""
+    validation: float
+    stages: list[Stage]
+
+
+def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.5, last: float = 0.01) -> list[float]:
+    """discount + first ratioᵏ while the second term is at least `last`, and then the discount itself, all in 1/s.
+
+    Args:
+        discount: rho of the problem.
+        first: what is added at first; V is then about q / (rho + first).
+        ratio: of one step to the one before, between 0 and 1.
+        last: least that is added.
+
+    Raises:
+        InputError: numbers out of range.
+    """
+    require_positive(first=first, ratio=ratio, last=last)
+    if not ratio < 1:
+        raise InputError(f"ratio is {ratio}; expected less than 1, as the discount is to come down")
+    steps = max(int(np.floor(np.log(last / first) / np.log(ratio))), 0) + 1
+    return [*(discount + first * ratio**step for step in range(steps)), discount]
+
+
+def fit_residual(
+    problem: ControlProblem,
+    value_and_gradient: Callable[[Any, Array], tuple[Array, Array]],
+    parameters: Any,
+    key: Array,
+    *,
+    discounts: Sequence[float] | None = None,
+    samples: int = 2048,
+    validation: int = 2048,
+    iterations: int = 20,
+    rounds: int = 10,
+    patience: int = 2,
+    disturbance: Disturbance | None = None,
+    report: Callable[[Stage], None] = lambda stage: None,
+) -> ResidualFit:
+    """The value function of a family that fits the equation best, in float64.
+
+    Args:
+        problem: whose cost to go is wanted.
+        value_and_gradient: (parameters, x) -> V and V_x, such as `value_network` has.
+        parameters: to start from, float64.
+        key: of the samples.
+        discounts: to go through, the problem's own last; by default `discounts_down_to` it.
+        samples: uniform in the box, for each discount.
+        validation: samples that parameters are chosen by.
+        iterations: of Levenberg-Marquardt for each draw of samples, at most.
+        rounds: of new samples at the last discount, at most.
+        patience: rounds without a lower validation, after which it ends.
+        disturbance: of an adversary, for a robust value function.
+        report: called after each draw.
+
+    Raises:
+        InputError: a problem that is none, discounts that do not end with its own, or an equation that is not finite.
+    """
+    problem = checked(problem)
+    require_positive(samples=samples, validation=validation, iterations=iterations, rounds=rounds, patience=patience)
+    discounts = discounts_down_to(problem.discount) if discounts is None else list(discounts)
+    if not discounts or discounts[-1] != problem.discount:
+        raise InputError(f"discounts are {discounts}; expected some that end with the problem's, {problem.discount}")
+    of_draws, of_validation = jax.random.split(key)
+    unseen = uniform(problem, of_validation, validation)
+    unit = float(jnp.mean(jax.vmap(problem.state_cost)(unseen)))
+
+    def residual(parameters: Any, x: Array, discount: Array) -> Array:
+        value, slope = value_and_gradient(parameters, x)
+        left = hjb_residual(problem._replace(discount=discount), x, value, slope)
+        if disturbance is not None:
+            left -= disturbance(x, slope, optimal_control(problem, x, slope)) @ slope
+        return left / unit
+
+    @jax.jit
+    def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array, Array]:
+        arrays = (x, jnp.full(len(x), discount))
+        state = levenberg_marquardt.run(residual, levenberg_marquardt.init(parameters), arrays, iterations)
+        return state.parameters, state.iteration, jnp.sqrt(state.loss)
+
+    @jax.jit
+    def validated(parameters: Any, discount: Array) -> Array:
+        return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
+
+    stages: list[Stage] = []
+
+    def fitted(parameters: Any, discount: float) -> Any:
+        x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
+        parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
+        stages.append(Stage(discount, int(done), float(loss), float(validated(parameters, jnp.asarray(discount)))))
+        report(stages[-1])
+        return parameters
+
+    for discount in discounts[:-1]:
+        parameters = fitted(parameters, discount)
+    best, lowest, since = parameters, np.inf, 0
+    for _ in range(rounds):
+        parameters = fitted(parameters, problem.discount)
+        found = stages[-1].validation
+        best, lowest, since = (parameters, found, 0) if found < lowest else (best, lowest, since + 1)
+        if since >= patience:
+            break
+    if not np.isfinite(lowest):
+        raise InputError(
+            "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
+        )
+    return ResidualFit(best, float(lowest), stages)
+
+
+def uniform(problem: ControlProblem, key: Array, samples: int) -> Float[Array, "samples n"]:
+    """States, uniform in the box."""
+    low, high = jnp.asarray(problem.low, float), jnp.asarray(problem.high, float)
+    return jax.random.uniform(key, (samples, len(low)), low.dtype, low, high)
