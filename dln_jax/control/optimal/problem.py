@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.action_costs import ActionCost
+from dln_jax.control.optimal.action_costs import ActionCost, centred
 from dln_jax.control.state_space import Field, field_of
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, JointKind, Scalar
@@ -136,6 +136,36 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not abs(cost) <= tolerance:
         raise InputError(f"a second at the goal costs {cost:.3g}; expected none, as V is zero there")
     return problem._replace(low=low, high=high, goal=goal)
+
+
+def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> ControlProblem:
+    """The problem of another goal: the state cost moves there, and controls cost what they differ from the one that
+    holds it.
+
+    Args:
+        problem: whose goal costs nothing.
+        goal: state [n].
+        tolerance: of what is left of dx/dt.
+
+    Raises:
+        InputError: no control holds the goal, or none within the limits of the action cost.
+    """
+    goal, before = jnp.asarray(goal, float), jnp.asarray(problem.goal, float)
+    if goal.shape != before.shape:
+        raise InputError(f"the goal has shape {goal.shape}; expected {before.shape}, a state")
+    drift, B = problem.drift(goal), problem.actuation(goal)
+    u = jnp.linalg.lstsq(B, -drift)[0]
+    left = float(jnp.max(jnp.abs(drift + B @ u)))
+    if not left <= tolerance:
+        raise InputError(f"the goal is no equilibrium: no control makes dx/dt less than {left:.3g} there; give another")
+    cost = problem.state_cost
+    return checked(
+        problem._replace(
+            state_cost=lambda x: cost(x - (goal - before)),
+            action_cost=centred(problem.action_cost, u),
+            goal=np.asarray(goal),
+        )
+    )
 
 
 def features(problem: ControlProblem, x: Array) -> Float[Array, " k"]:

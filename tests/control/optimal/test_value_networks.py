@@ -6,19 +6,27 @@ import numpy as np
 import pytest
 
 from dln_jax.control import field_of
-from dln_jax.control.optimal.action_costs import centred, quadratic, scaled, tanh
-from dln_jax.control.optimal.problem import ControlProblem, checked, from_plant, hjb_residual, optimal_control, rates
+from dln_jax.control.optimal.action_costs import quadratic, scaled, tanh
+from dln_jax.control.optimal.problem import (
+    ControlProblem,
+    at_goal,
+    checked,
+    from_plant,
+    hjb_residual,
+    optimal_control,
+    rates,
+)
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.pendulum import pendulum
 from dln_jax.types import InputError
 
-SCENE = cart_pole(friction=0.1)
-PLANT, B = dynamics(SCENE.energies), np.asarray(SCENE.needs.actuation)
 HIGH = np.array([0.5, np.pi, 5.0, 20.0])
 PROBLEM = ControlProblem(
-    *from_plant(PLANT, B), lambda x: x @ x, quadratic(0.1), 0.1, -HIGH, HIGH, SCENE.needs.joints, np.zeros(4)
-)
+    lambda x: jnp.concatenate([x[2:], jnp.sin(x[1]) * jnp.array([1.0, 2.0]) - 0.1 * x[2:]]),
+    lambda x: jnp.stack([0.0, 0.0, 2.0, jnp.cos(x[1])])[:, None],
+    lambda x: x @ x, quadratic(0.1), 0.1, -HIGH, HIGH, ("prismatic", "revolute"), np.zeros(4),
+)  # fmt: skip
 X = jnp.array([0.2, -2.0, 1.0, 3.0])
 FAMILIES = {"network": {"widths": (6, 5), "members": 3}, "form": {"widths": (), "scale": 7.0, "floor": 0.0}}
 
@@ -41,8 +49,9 @@ def test_a_value_and_its_gradient(name):
 
 
 def test_drift_and_actuation_are_those_of_the_plant():
-    u = jnp.array([2.0])
-    np.testing.assert_allclose(rates(PROBLEM)(X, u), field_of(PLANT, B)(X, u), rtol=1e-12)
+    plant, B, x, u = dynamics(pendulum(friction=0.1).energies), np.array([[2.0]]), X[1:3], jnp.array([2.0])
+    a, of = from_plant(plant, B)
+    np.testing.assert_allclose(a(x) + of(x) @ u, field_of(plant, B)(x, u), rtol=1e-12)
 
 
 def test_the_equation_is_the_least_over_controls():
@@ -75,14 +84,22 @@ def test_what_is_no_problem_is_one_line(change, message):
 
 
 def test_a_goal_that_is_held_by_a_control():
-    weight, push = 2.0, scaled(tanh, 5.0)  # of a mass on a line
-    lift = ControlProblem(
-        lambda x: jnp.array([x[1], -weight]), lambda x: jnp.array([[0.0], [1.0]]), lambda x: x @ x,
-        centred(push, [weight]), 0.0, -np.ones(2), np.ones(2), ("prismatic",), np.zeros(2),
+    weight, push = 2.0, scaled(tanh, 5.0)  # of a rod that stands at 0
+    rod = ControlProblem(
+        lambda x: jnp.stack([x[1], weight * jnp.sin(x[0])]), lambda x: jnp.array([[0.0], [1.0]]), lambda x: x @ x,
+        push, 0.0, -HIGH[1:3], HIGH[1:3], ("revolute",), np.zeros(2),
     )  # fmt: skip
-    assert checked(lift).goal.shape == (2,)
+    aside = at_goal(rod, [0.4, 0.0])
+    held = optimal_control(aside, jnp.asarray(aside.goal), jnp.zeros(2))
+    np.testing.assert_allclose(held, -weight * np.sin(0.4), rtol=1e-12)
+    with pytest.raises(InputError, match="limits cannot hold the goal"):
+        at_goal(rod._replace(action_cost=scaled(tanh, 0.5)), [0.4, 0.0])
     with pytest.raises(InputError, match="no equilibrium"):
-        checked(lift._replace(action_cost=push))
+        at_goal(rod, [0.4, 1.0])
+    with pytest.raises(InputError, match="shape"):
+        at_goal(rod, [0.4])
+    with pytest.raises(InputError, match="no equilibrium"):
+        checked(aside._replace(action_cost=push))
 
 
 def test_sizes_that_make_no_network():

@@ -1,0 +1,60 @@
+"""No disturbance within its bounds makes the cost rise faster than the adversary's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control.optimal.action_costs import quadratic
+from dln_jax.control.optimal.adversaries import Bounds, adversary, unit
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.types import InputError
+
+A, B = np.array([[0.0, 1.0], [2.0, -0.3]]), np.array([[0.0, 0.5], [1.5, 0.0]])
+BOUNDS = Bounds(state=0.3, action=0.2, observation=0.1, parameters=0.15)
+X, U, P = jnp.array([0.4, -1.0]), jnp.array([0.7, 0.2]), jnp.array([1.2, -0.8])
+
+
+def plant(x, u, p):
+    """Linear in each of the three, so that first order is all there is; but not in all at once."""
+    return A @ x + B @ u + p * X
+
+
+@pytest.mark.parametrize("slope", ([1.0, 2.0], [-0.3, 0.1], [0.0, -4.0]))
+def test_it_is_the_worst(slope):
+    slope, random = jnp.asarray(slope), np.random.default_rng(0)
+    worst = float(slope @ adversary(plant, P, BOUNDS)(X, slope, U))
+    most = -np.inf
+    for _ in range(300):
+        of_state, of_action, of_reading = (unit(jnp.asarray(random.normal(size=2))) for _ in range(3))
+        signs = random.choice([-1, 1], 2)
+        moved = plant(X + 0.1 * of_reading, U + 0.2 * of_action, P + 0.15 * signs * np.abs(P)) + 0.3 * of_state
+        most = max(most, float(slope @ (moved - plant(X, U, P))))
+    assert 0.95 * worst < most <= worst * (1 + 1e-12)
+
+
+def test_without_a_slope_or_a_bound_it_does_nothing():
+    assert not np.any(adversary(plant, P, BOUNDS)(X, jnp.zeros(2), U))
+    assert not np.any(adversary(plant, P, Bounds())(X, jnp.ones(2), U))
+
+
+def test_parameters_stay_where_they_make_sense():
+    change = adversary(plant, P, Bounds(parameters=0.5), least=[1.0, -1.0], most=[1.5, 0.0])
+    np.testing.assert_allclose(change(X, jnp.array([1.0, 1.0]), U), [(1.5 - 1.2) * 0.4, -0.2 * -1.0], rtol=1e-12)
+    with pytest.raises(InputError, match="bound of action"):
+        adversary(plant, P, Bounds(action=-1.0))
+
+
+def test_a_robust_value_is_that_of_the_worst_plant():
+    """dx/dt = p x + u with p off by a tenth: the worst is always the larger p, whose regulator has a closed form."""
+    line = ControlProblem(
+        lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.0, [-5.0], [5.0], (), [0.0]
+    )
+    worst = adversary(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=0.1))
+
+    fit = fit_residual(
+        line, lambda theta, x: (theta * x[0] ** 2, 2 * theta * x), jnp.asarray(1.0), jax.random.key(0),
+        samples=64, validation=64, disturbance=worst,
+    )  # fmt: skip
+    assert fit.parameters == pytest.approx((1.1 + np.sqrt(1.1**2 + 1)) / 2, rel=1e-10)
