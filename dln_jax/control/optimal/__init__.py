@@ -1,1 +1,42 @@
 """Optimal feedback by value functions: the cost to go as a network, and the control that descends it best."""
+
+from dln_jax.control.optimal import action_costs
+from dln_jax.control.optimal.action_costs import ActionCost
+from dln_jax.control.optimal.adversaries import Bounds, adversary
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import (
+    Affine,
+    ControlProblem,
+    at_goal,
+    checked,
+    from_field,
+    from_plant,
+    hjb_residual,
+    optimal_control,
+    rates,
+)
+from dln_jax.control.optimal.residual import ResidualFit, Stage, discounts_down_to, fit_residual
+from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+
+__all__ = [
+    "ActionCost",
+    "Affine",
+    "Bounds",
+    "ControlProblem",
+    "ResidualFit",
+    "Stage",
+    "ValueNetwork",
+    "action_costs",
+    "adversary",
+    "at_goal",
+    "checked",
+    "discounts_down_to",
+    "fit_residual",
+    "from_field",
+    "from_plant",
+    "hjb_policy",
+    "hjb_residual",
+    "optimal_control",
+    "rates",
+    "value_network",
+]

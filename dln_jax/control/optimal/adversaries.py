@@ -60,13 +60,12 @@ def adversary(
         if not bound >= 0:
             raise InputError(f"the bound of {name} is {bound}; expected 0 or more")
     p = jnp.asarray(parameters, float)
+    lowest, highest = jnp.asarray(-jnp.inf if least is None else least), jnp.asarray(jnp.inf if most is None else most)
 
     def change(x: Array, slope: Array, u: Array) -> Array:
         rate, pull_back = jax.vjp(plant, x, u, p.astype(x.dtype))
         to_x, to_u, to_p = pull_back(slope)
-        worst_p = p + bounds.parameters * jnp.abs(p) * jnp.sign(to_p)
-        if least is not None or most is not None:
-            worst_p = jnp.clip(worst_p, least, most)
+        worst_p = jnp.clip(p + bounds.parameters * jnp.abs(p) * jnp.sign(to_p), lowest, highest)
         moved = plant(x + bounds.observation * unit(to_x), u + bounds.action * unit(to_u), worst_p.astype(x.dtype))
         return moved - rate + bounds.state * unit(slope)
 

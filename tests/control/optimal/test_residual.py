@@ -85,8 +85,8 @@ def test_a_network_has_the_value_of_limited_controls():
 
     for x in (0.5, 2.0, 4.0, 4.9):
         value, found = network.value_and_gradient(fit.parameters, jnp.array([x]))
-        assert value == pytest.approx(quad(slope, 0, x)[0], rel=1e-3)
-        assert found[0] == pytest.approx(slope(x), rel=1e-3)
+        assert value == pytest.approx(quad(slope, 0, x)[0], rel=5e-3)
+        assert found[0] == pytest.approx(slope(x), rel=5e-3)
 
 
 BAD = [
