@@ -1,0 +1,282 @@
+"""Continuous fitted value iteration: a network's greedy policy is followed, and the network fitted to what that costs.
+
+Each iteration draws states in the box and follows u = grad g*(-Bᵀ V_x) from them for N steps. Along each trajectory,
+backwards, costs are added up with exponential weights (Lutter et al. 2021, arXiv:2105.04682):
+
+    G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
+
+so that every state on the way has a target, and not the first alone. So has its slope,
+
+    p_k = dc_k/dx + (dx_{k+1}/dx)ᵀ e^(-rho dt) [(1 - w) V_x(x_{k+1}) + w p_{k+1}]
+
+with the controls held, which is the costate of Pontryagin's principle: where they are best, a change of theirs costs
+nothing, and p = dG/dx. With a long memory the targets are the policy's own cost, which is above the best by the square
+of what the policy is off, and the iteration is Howard's of policies, which converges as Newton's method does. With a
+short one they are the value's of n-step returns, which needs no good policy.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.optimal.flow import Flow, circles, flow
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, optimal_control
+from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.types import InputError, require_positive
+
+
+class Iteration(NamedTuple):
+    """Numbers of fitted value iteration."""
+
+    iterations: int = 40
+    starts: int = 1024
+    """States that are drawn in an iteration."""
+    seconds: float = 3.0
+    """For which the policy is followed from each."""
+    dt: float = 0.02
+    """s, of a step."""
+    memory: float = 1.0
+    """s, in the last iteration; infinite for the policy's own cost."""
+    first_memory: float = 0.2
+    """s, in the first."""
+    kept: int = 8
+    """States of a trajectory that are fitted: the first, and others ever less densely."""
+    steps: int = 200
+    """Of Adam in an iteration."""
+    batch: int = 1024
+    learning_rate: float = 3e-3
+    """The largest; falls by a cosine over all iterations."""
+    slope_weight: float = 0.3
+    """Of the slopes' misfit, in units of the box, beside that of the values."""
+    floor: float = 0.02
+    """Share of the largest target that is added to a target to make a misfit relative."""
+    margin: float = 1.25
+    """Factor on the box: states are drawn within, and trajectories end there; 1 as published, where a value of the box
+    alone counts what its edges do."""
+
+
+class Targets(NamedTuple):
+    """Of the states of trajectories."""
+
+    x: Float[Array, "N n"]
+    V: Float[Array, " N"]
+    slope: Float[Array, "N n"]
+
+
+class Progress(NamedTuple):
+    """Of an iteration."""
+
+    iteration: int
+    loss: float
+    validation: float
+    """Mean cost of the policy from validation states, and what V is off it."""
+    seconds: float
+    """Since the start, compilation apart."""
+
+
+class Fitted(NamedTuple):
+    """What came of an iteration."""
+
+    parameters: Any
+    """Those with the least validation."""
+    history: list[Progress]
+    train_seconds: float
+    compile_seconds: float
+
+
+def targets(
+    problem: ControlProblem,
+    value: ValueAndGradient,
+    x: Array,
+    *,
+    steps: int,
+    dt: float,
+    memory: Any,
+) -> Targets:
+    """Targets at all states of the trajectory from x [n], the last of which is not among them.
+
+    Args:
+        problem: what is controlled.
+        value: the present one.
+        x: the start.
+        steps: N.
+        dt: s.
+        memory: of the weights, s.
+    """
+    step: Flow = flow(problem, dt, clipped=True)
+    share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)
+
+    def closed(x: Array) -> tuple[Array, Array]:
+        return step(x, optimal_control(problem, x, value(x)[1]))
+
+    def forward(x: Array, _: Any) -> tuple[Array, Array]:
+        return closed(x)[0], x
+
+    last, states = jax.lax.scan(forward, x, length=steps)
+
+    def back(carry: tuple[Array, ...], x: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        V_next, slope_next, G, p = carry
+        (_, cost), pull_back = jax.vjp(closed, x)
+        G = cost + discount * ((1 - share) * V_next + share * G)
+        (p,) = pull_back((discount * ((1 - share) * slope_next + share * p), jnp.ones_like(cost)))
+        return (*value(x), G, p), (G, p)
+
+    V_end, slope_end = value(last)
+    _, (G, p) = jax.lax.scan(back, (V_end, slope_end, V_end, slope_end), states, reverse=True)
+    return Targets(states, G, p)
+
+
+def fit_value(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    *,
+    seed: int = 0,
+    numbers: Iteration = Iteration(),  # noqa: B008
+    parameters: Any = None,
+    dtype: Any = jnp.float32,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Fitted:
+    """Iterates, and keeps what does best from validation states that are drawn apart.
+
+    Args:
+        problem: what is controlled.
+        network: family of values.
+        seed: of parameters and states.
+        numbers: of the iteration.
+        parameters: to start from; by default drawn.
+        dtype: of everything.
+        report: called after every iteration.
+
+    Raises:
+        InputError: numbers out of range, or a value that was never finite.
+    """
+    require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
+    problem = widened(problem, numbers.margin)
+    key = jax.random.key(seed)
+    if parameters is None:
+        parameters = network.init(jax.random.fold_in(key, 0))
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
+    adam = optax.adam(rate, b2=0.99)
+    state = adam.init(parameters)
+    validated = drawn(problem, jax.random.fold_in(key, 1), 256, dtype)
+
+    began = time.perf_counter()
+    iterate = jax.jit(lambda *given: _iterate(problem, network, numbers, adam, *given))
+    iterate = iterate.lower(parameters, state, key, jnp.asarray(0.0, dtype)).compile()
+    score = jax.jit(lambda parameters: _score(problem, network, numbers, parameters, validated))
+    score = score.lower(parameters).compile()
+    compile_seconds, began = time.perf_counter() - began, time.perf_counter()
+
+    best, least, history = parameters, math.inf, []
+    for number in range(numbers.iterations):
+        grown = number / max(numbers.iterations - 1, 1)
+        memory = numbers.first_memory ** (1 - grown) * numbers.memory**grown
+        parameters, state, loss = iterate(
+            parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory, dtype)
+        )
+        now = float(score(parameters))
+        if now < least:
+            best, least = parameters, now
+        history.append(Progress(number + 1, float(loss), now, time.perf_counter() - began))
+        report(history[-1])
+    if not math.isfinite(least):
+        raise InputError("the cost of the policy was never finite; take a smaller dt, or a box that it can stay near")
+    return Fitted(best, history, time.perf_counter() - began, compile_seconds)
+
+
+def widened(problem: ControlProblem, factor: float) -> ControlProblem:
+    """The problem in a box that is so many times as wide."""
+    low, high = np.asarray(problem.low), np.asarray(problem.high)
+    middle, half = (low + high) / 2, factor * (high - low) / 2
+    straight = ~circles(problem)
+    return problem._replace(low=np.where(straight, middle - half, low), high=np.where(straight, middle + half, high))
+
+
+def drawn(problem: ControlProblem, key: Array, count: int, dtype: Any) -> Float[Array, "N n"]:
+    """States uniform in the box."""
+    low, high = (jnp.asarray(each, dtype) for each in (problem.low, problem.high))
+    return low + (high - low) * jax.random.uniform(key, (count, len(low)), dtype)
+
+
+def _iterate(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    adam: optax.GradientTransformation,
+    parameters: Any,
+    state: Any,
+    key: Array,
+    memory: Array,
+) -> tuple[Any, Any, Array]:
+    of_starts, of_batches = jax.random.split(key)
+    dtype = jax.tree.leaves(parameters)[0].dtype
+    steps = round(numbers.seconds / numbers.dt)
+    x = drawn(problem, of_starts, numbers.starts, dtype)
+    found = jax.vmap(
+        lambda x: targets(
+            problem,
+            lambda x: network.value_and_gradient(parameters, x),
+            x,
+            steps=steps,
+            dt=numbers.dt,
+            memory=memory,
+        )
+    )(x)
+    index = np.unique((steps * (np.arange(numbers.kept) / numbers.kept) ** 2).astype(int))
+    data = jax.tree.map(lambda each: each[:, index].reshape(-1, *each.shape[2:]), found)
+    half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, dtype)
+    largest = jnp.quantile(data.V, 0.9)
+
+    def loss(parameters: Any, batch: Targets) -> Array:
+        V, slope = jax.vmap(lambda x: network.members(parameters, x))(batch.x)
+        size = (batch.V + numbers.floor * largest)[:, None]
+        off = (V - batch.V[:, None]) / size
+        off_slope = (slope - batch.slope[:, None]) * half / size[..., None]
+        return jnp.mean(_robust(off)) + numbers.slope_weight * jnp.mean(_robust(off_slope))
+
+    def descend(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], Array]:
+        parameters, state = carry
+        batch = jax.tree.map(lambda each: each[jax.random.randint(key, (numbers.batch,), 0, len(data.V))], data)
+        value, gradient = jax.value_and_grad(loss)(parameters, batch)
+        updates, state = adam.update(gradient, state, parameters)
+        return (optax.apply_updates(parameters, updates), state), value
+
+    keys = jax.random.split(of_batches, numbers.steps)
+    (parameters, state), losses = jax.lax.scan(descend, (parameters, state), keys)
+    return parameters, state, jnp.mean(losses)
+
+
+def _robust(off: Array) -> Array:
+    """Quadratic where small, else linear: at a ridge the slopes of either side are far from each other."""
+    size = 0.1
+    return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
+
+
+def _score(problem: ControlProblem, network: ValueNetwork, numbers: Iteration, parameters: Any, x: Array) -> Array:
+    steps = round(numbers.seconds / numbers.dt)
+
+    def one(x: Array) -> tuple[Array, Array]:
+        value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
+        step, discount = flow(problem, numbers.dt, clipped=True), math.exp(-problem.discount * numbers.dt)
+
+        def forward(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
+            x, total, weight = carry
+            after, cost = step(x, optimal_control(problem, x, value(x)[1]))
+            return (after, total + weight * cost, weight * discount), None
+
+        (last, total, weight), _ = jax.lax.scan(
+            forward, (x, jnp.zeros((), x.dtype), jnp.ones((), x.dtype)), length=2 * steps
+        )
+        return value(x)[0], total + weight * value(last)[0]
+
+    V, cost = jax.vmap(one)(x)
+    return jnp.mean(cost + jnp.abs(V - cost))

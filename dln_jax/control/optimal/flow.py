@@ -1,0 +1,58 @@
+"""Steps of a control problem with its cost: the state after a time with held controls, and what that time costs.
+
+    x(t + dt),   integral from 0 to dt of e^(-rho s) (q(x(t + s)) + g(u)) ds
+
+by the classical Runge-Kutta method on both at once.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control.optimal.problem import ControlProblem, rates
+from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
+from dln_jax.types import Scalar, require_positive
+
+Flow = Callable[[Array, Array], tuple[Array, Scalar]]
+"""(x [n], u [m]) -> the state after a step [n], and its discounted cost."""
+
+
+def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool = False) -> Flow:
+    """The step of a problem.
+
+    Args:
+        problem: whose plant and costs.
+        dt: for which the controls are held, s.
+        substeps: of the integrator.
+        clipped: whether states that are not on a circle end at the box, as published fitted iterations have it: a plant
+            that is another one wherever trajectories leave the box.
+    """
+    require_positive(dt=dt, substeps=substeps)
+    field, rho = rates(problem), problem.discount
+    low, high = (jnp.asarray(each) for each in limits(problem))
+
+    def step(x: Array, u: Array) -> tuple[Array, Scalar]:
+        spent = problem.action_cost.cost(u)
+
+        def rate(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+            x, _ = state
+            return field(x, u), jnp.exp(-rho * t) * (problem.state_cost(x) + spent)
+
+        after, cost = advance(runge_kutta(CLASSICAL, rate), 0.0, (x, jnp.zeros((), x.dtype)), dt, substeps=substeps)
+        return (jnp.clip(after, low.astype(x.dtype), high.astype(x.dtype)) if clipped else after), cost
+
+    return step
+
+
+def circles(problem: ControlProblem) -> np.ndarray:
+    """Which of the n coordinates are angles on a circle."""
+    on_circle = np.array(problem.joints) == "revolute"
+    return np.concatenate([on_circle, np.zeros(len(problem.low) - len(on_circle), bool)])
+
+
+def limits(problem: ControlProblem) -> tuple[np.ndarray, np.ndarray]:
+    """The box, without limits of angles on a circle."""
+    angles = circles(problem)
+    return np.where(angles, -np.inf, problem.low), np.where(angles, np.inf, problem.high)
