@@ -10,6 +10,7 @@ the problem's own (continuation: Lutter, Belousov et al. 2019). The samples of e
 are chosen by samples that no fit has seen.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.solvers import levenberg_marquardt
@@ -76,7 +78,6 @@ def fit_residual(
     iterations: int = 20,
     rounds: int = 10,
     patience: int = 2,
-    linear_from: float = np.inf,
     disturbance: Disturbance | None = None,
     report: Callable[[Stage], None] = lambda stage: None,
 ) -> ResidualFit:
@@ -93,8 +94,6 @@ def fit_residual(
         iterations: of Levenberg-Marquardt for each draw of samples, at most.
         rounds: of new samples at the last discount, at most.
         patience: rounds without a lower validation, after which it ends.
-        linear_from: share of the mean of q from which on what is left counts linearly and not by its square, as it has
-            to where V has a ridge and the equation no solution that is smooth.
         disturbance: of an adversary, for a robust value function.
         report: called after each draw.
 
@@ -103,7 +102,6 @@ def fit_residual(
     """
     problem = checked(problem)
     require_positive(samples=samples, validation=validation, iterations=iterations, rounds=rounds, patience=patience)
-    require_positive(linear_from=linear_from)
     discounts = discounts_down_to(problem.discount) if discounts is None else list(discounts)
     if not discounts or discounts[-1] != problem.discount:
         raise InputError(f"discounts are {discounts}; expected some that end with the problem's, {problem.discount}")
@@ -118,20 +116,15 @@ def fit_residual(
             left -= disturbance(x, slope, optimal_control(problem, x, slope)) @ slope
         return left / unit
 
-    def softened(parameters: Any, x: Array, discount: Array) -> Array:
-        left = residual(parameters, x, discount)
-        # Its square is 2 c² (√(1 + left²/c²) - 1), by Charbonnier et al. (1997).
-        return left * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (left / linear_from) ** 2)))
-
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=quick_compilation())
     def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array, Array]:
         arrays = (x, jnp.full(len(x), discount))
-        state = levenberg_marquardt.run(softened, levenberg_marquardt.init(parameters), arrays, iterations)
+        state = levenberg_marquardt.run(residual, levenberg_marquardt.init(parameters), arrays, iterations)
         return state.parameters, state.iteration, jnp.sqrt(state.loss)
 
     @jax.jit
     def validated(parameters: Any, discount: Array) -> Array:
-        return jnp.sqrt(jnp.mean(jax.vmap(softened, (None, 0, None))(parameters, unseen, discount) ** 2))
+        return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
 
     stages: list[Stage] = []
 
