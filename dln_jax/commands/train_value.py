@@ -16,6 +16,7 @@ from dln_jax.command_line.options import Folder
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
 from dln_jax.files import finite, write_json
+from dln_jax.precision import with_float64
 from dln_jax.runs.results import print_numbers
 from dln_jax.runs.values import (
     METHODS,
@@ -23,7 +24,6 @@ from dln_jax.runs.values import (
     Trained,
     ValueRun,
     family_of,
-    in_double,
     load_value,
     measured,
     plant_named,
@@ -75,7 +75,7 @@ def main(given: Arguments) -> None:
     if given.stored is not None:
         run = load_value(given.stored)
         with command_folder(given, "train_value") as folder:
-            finish(folder, ValueRun(run.plant, run.network, in_double(run.parameters)), given, {})
+            finish(folder, ValueRun(run.plant, run.network, with_float64(run.parameters)), given, {})
         return
     goal = posture(given.goal)
     plant = plant_named(given.plant, goal)
@@ -90,7 +90,7 @@ def main(given: Arguments) -> None:
         numbers = {"train_seconds": best.train_seconds, "validation": best.validation}
         if len(trained) > 1:
             numbers |= over_seeds(trained)
-        finish(folder, ValueRun(plant, network, in_double(best.parameters)), given, numbers)
+        finish(folder, ValueRun(plant, network, with_float64(best.parameters)), given, numbers)
 
 
 def trained_one(plant: ValuePlant, family: Family, given: Arguments, seed: int) -> Trained:

@@ -174,8 +174,3 @@ def load_value(folder: str | Path) -> ValueRun:
 
     like = jax.eval_shape(parameters, jax.random.key(0))
     return ValueRun(plant, network, load_tree(folder, VALUE, like))
-
-
-def in_double(parameters: Any) -> Any:
-    """Parameters in float64, in which evaluations and laws compute."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), parameters)

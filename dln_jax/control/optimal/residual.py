@@ -73,7 +73,7 @@ def fit_residual(
     key: Array,
     *,
     discounts: Sequence[float] | None = None,
-    samples: int = 2048,
+    samples: int = 4096,
     validation: int = 2048,
     iterations: int = 20,
     rounds: int = 10,
