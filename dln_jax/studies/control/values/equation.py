@@ -79,7 +79,7 @@ def limited_value(x: float) -> float:
             return gain - x * s - x**2 / 2
 
         # The other root drives away from the goal.
-        return brentq(left, WEIGHT * np.tan(np.pi * x / (2 * LIMIT)), 1e4, xtol=1e-13)
+        return float(brentq(left, WEIGHT * np.tan(np.pi * x / (2 * LIMIT)), 1e4, xtol=1e-13))  # type: ignore[arg-type]
 
     return quad(slope, 0, x, epsabs=1e-12, epsrel=1e-12)[0]
 
@@ -89,11 +89,11 @@ def linear(quick: bool) -> Findings:
     case, scene = "equation/flexible-cart-pole", flexible_cart_pole()
     field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
     at = linearise(field, np.zeros(6), np.zeros(1))
-    A, B = np.asarray(at.A), np.asarray(at.B)
+    A, B = at.A, at.B
     Q, R = np.diag([10.0, 10.0, 10.0, 0.1, 0.1, 0.1]), np.array([[0.1]])
     high = np.array([0.5, 0.1, 0.5, 2.0, 1.0, 5.0])
     problem = ControlProblem(
-        lambda x: A @ x, lambda x: jnp.asarray(B), lambda x: x @ Q @ x, quadratic(2 * R), 0.0, -high, high, (),
+        lambda x: A @ x, lambda x: B, lambda x: x @ Q @ x, quadratic(2 * R), 0.0, -high, high, (),
         np.zeros(6),
     )  # fmt: skip
     x = high * np.random.default_rng(0).uniform(-1, 1, (200, 6))
