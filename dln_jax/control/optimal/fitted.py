@@ -141,7 +141,7 @@ def fit_value(
     seed: int = 0,
     numbers: Iteration = Iteration(),  # noqa: B008
     parameters: Any = None,
-    dtype: Any = jnp.float32,
+    double: bool = False,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Fitted:
     """Iterates, and keeps what does best from validation states that are drawn apart.
@@ -152,26 +152,37 @@ def fit_value(
         seed: of parameters and states.
         numbers: of the iteration.
         parameters: to start from; by default drawn.
-        dtype: of everything.
+        double: whether to compute in float64, which takes twice as long.
         report: called after every iteration.
 
     Raises:
         InputError: numbers out of range, or a value that was never finite.
     """
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
-    problem = widened(problem, numbers.margin)
+    with jax.enable_x64(double):
+        return _fit(widened(problem, numbers.margin), network, seed, numbers, parameters, report)
+
+
+def _fit(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    seed: int,
+    numbers: Iteration,
+    parameters: Any,
+    report: Callable[[Progress], None],
+) -> Fitted:
     key = jax.random.key(seed)
     if parameters is None:
         parameters = network.init(jax.random.fold_in(key, 0))
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
     rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
     adam = optax.adam(rate, b2=0.99)
     state = adam.init(parameters)
-    validated = drawn(problem, jax.random.fold_in(key, 1), 256, dtype)
+    validated = drawn(problem, jax.random.fold_in(key, 1), 256)
 
     began = time.perf_counter()
     iterate = jax.jit(lambda *given: _iterate(problem, network, numbers, adam, *given))
-    iterate = iterate.lower(parameters, state, key, jnp.asarray(0.0, dtype)).compile()
+    iterate = iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile()
     score = jax.jit(lambda parameters: _score(problem, network, numbers, parameters, validated))
     score = score.lower(parameters).compile()
     compile_seconds, began = time.perf_counter() - began, time.perf_counter()
@@ -181,7 +192,7 @@ def fit_value(
         grown = number / max(numbers.iterations - 1, 1)
         memory = numbers.first_memory ** (1 - grown) * numbers.memory**grown
         parameters, state, loss = iterate(
-            parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory, dtype)
+            parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory)
         )
         now = float(score(parameters))
         if now < least:
@@ -201,10 +212,10 @@ def widened(problem: ControlProblem, factor: float) -> ControlProblem:
     return problem._replace(low=np.where(straight, middle - half, low), high=np.where(straight, middle + half, high))
 
 
-def drawn(problem: ControlProblem, key: Array, count: int, dtype: Any) -> Float[Array, "N n"]:
+def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
     """States uniform in the box."""
-    low, high = (jnp.asarray(each, dtype) for each in (problem.low, problem.high))
-    return low + (high - low) * jax.random.uniform(key, (count, len(low)), dtype)
+    low, high = (jnp.asarray(each, float) for each in (problem.low, problem.high))
+    return low + (high - low) * jax.random.uniform(key, (count, len(low)))
 
 
 def _iterate(
@@ -218,9 +229,8 @@ def _iterate(
     memory: Array,
 ) -> tuple[Any, Any, Array]:
     of_starts, of_batches = jax.random.split(key)
-    dtype = jax.tree.leaves(parameters)[0].dtype
     steps = round(numbers.seconds / numbers.dt)
-    x = drawn(problem, of_starts, numbers.starts, dtype)
+    x = drawn(problem, of_starts, numbers.starts)
     found = jax.vmap(
         lambda x: targets(
             problem,
@@ -233,7 +243,7 @@ def _iterate(
     )(x)
     index = np.unique((steps * (np.arange(numbers.kept) / numbers.kept) ** 2).astype(int))
     data = jax.tree.map(lambda each: each[:, index].reshape(-1, *each.shape[2:]), found)
-    half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, dtype)
+    half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, float)
     largest = jnp.quantile(data.V, 0.9)
 
     def loss(parameters: Any, batch: Targets) -> Array:
