@@ -124,15 +124,18 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
         raise InputError(f"{len(problem.joints)} joints for {len(goal)} states; expected the kinds of the first states")
     if not problem.discount >= 0:
         raise InputError(f"discount is {problem.discount}; expected a rate in 1/s, 0 or more")
-    at = jnp.asarray(goal)
-    u = optimal_control(problem, at, jnp.zeros_like(at))
-    moving = float(jnp.max(jnp.abs(rates(problem)(at, u))))
+
+    @jax.jit  # compiled once, for many small programs take longer
+    def at_rest(x: Array) -> tuple[Array, Array]:
+        u = optimal_control(problem, x, jnp.zeros_like(x))
+        return jnp.max(jnp.abs(rates(problem)(x, u))), problem.state_cost(x) + problem.action_cost.cost(u)
+
+    moving, cost = map(float, at_rest(jnp.asarray(goal)))
     if not moving <= tolerance:
         raise InputError(
             f"the goal is no equilibrium: dx/dt is {moving:.3g} there with the cheapest control, above {tolerance:g}; "
             "give a state at rest, or centre the action cost at the control that holds it"
         )
-    cost = float(problem.state_cost(at) + problem.action_cost.cost(u))
     if not abs(cost) <= tolerance:
         raise InputError(f"a second at the goal costs {cost:.3g}; expected none, as V is zero there")
     return problem._replace(low=low, high=high, goal=goal)
@@ -153,7 +156,7 @@ def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> C
     goal, before = jnp.asarray(goal, float), jnp.asarray(problem.goal, float)
     if goal.shape != before.shape:
         raise InputError(f"the goal has shape {goal.shape}; expected {before.shape}, a state")
-    drift, B = problem.drift(goal), problem.actuation(goal)
+    drift, B = jax.jit(lambda x: (problem.drift(x), problem.actuation(x)))(goal)
     u = jnp.linalg.lstsq(B, -drift)[0]
     left = float(jnp.max(jnp.abs(drift + B @ u)))
     if not left <= tolerance:
