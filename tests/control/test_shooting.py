@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Problem, field_of, integrated, optimise, receding, shoot, time_varying_lqr
+from dln_jax.control import Problem, field_of, integrated, receding, shoot, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import CLASSICAL, GAUSS_LEGENDRE_4, RADAU_3
+from dln_jax.mechanics.integrators import CLASSICAL, GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.types import InputError
@@ -62,22 +62,20 @@ def from_a_straight_line():
 def test_a_guess_that_is_no_motion_comes_to_the_optimum_of_single_shooting():
     found = from_a_straight_line()
     assert found.converged and found.defect < 1e-8 and np.abs(found.plan.u).max() <= 10.0
-    plan = jax.jit(lambda u: optimise(swing_up(), DOWN, u, tolerance=1e-12))(found.plan.u + 0.1)
-    assert float(found.plan.cost) == pytest.approx(float(plan.cost), rel=1e-7)
-    np.testing.assert_allclose(found.plan.u, plan.u, atol=1e-2)
-    assert (np.abs(plan.u) > 9.999).any()  # limits are in play
-    _, moved = jax.jit(receding(swing_up()))(jnp.asarray(DOWN), found.plan)
-    assert float(moved.cost) == pytest.approx(float(found.plan.cost), rel=1e-6)
+    assert (np.abs(found.plan.u) > 9.999).any() and np.cos(found.plan.x[-1, 1]) > 0.999
+    # Regulators iterated from it, by the motion and its feedback alone, stay there.
+    _, moved = jax.jit(receding(swing_up(), iterations=1))(jnp.asarray(DOWN), found.plan)
+    assert float(moved.cost) == pytest.approx(float(found.plan.cost), rel=1e-7)
+    np.testing.assert_allclose(moved.u[:-1], found.plan.u[1:], atol=2e-2)
 
 
-def test_gains_are_derivatives_of_the_optimum_and_all_curvature_saves_iterations():
+def test_gains_are_derivatives_of_the_optimum_and_convergence_is_quadratic():
     limit = 1e3  # where none is reached, u is a smooth function of the start
     first = shooter(True)(DOWN, from_a_straight_line().plan.x, from_a_straight_line().plan.u, limit)
-    near = first.plan.x + 1e-2, first.plan.u
-    exact, gauss_newton = (shooter(each)(DOWN, *near, limit) for each in (True, False))
-    assert exact.converged and gauss_newton.converged
-    assert float(exact.plan.cost) == pytest.approx(float(gauss_newton.plan.cost), rel=1e-8)
-    assert 2 * exact.iterations <= gauss_newton.iterations
+    exact = shooter(True)(DOWN, first.plan.x + 1e-2, first.plan.u, limit)
+    # Gauss-Newton's method takes 25.
+    assert exact.converged and exact.iterations <= 9
+    assert float(exact.plan.cost) == pytest.approx(float(first.plan.cost), rel=1e-10)
     step, slopes = 1e-3, []
     for axis in step * np.eye(4):
         ahead, behind = (shooter(True)(DOWN + each, *exact.plan[1::-1], limit).plan.u[0] for each in (axis, -axis))
@@ -87,16 +85,16 @@ def test_gains_are_derivatives_of_the_optimum_and_all_curvature_saves_iterations
 
 @functools.cache
 def stiff(method):
-    # The spring swings at 150 Hz: steps of 20 ms are ten times the stability limit of the classical method.
+    # The spring swings at 150 Hz: steps of 20 ms are seven times the stability limit of the classical method.
     scene = flexible_cart_pole(stiffness=2e5)
-    field = field_of(dynamics(scene.energies), np.asarray(scene.needs.actuation))
+    field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
     return integrated(field, 0.02, method=method)
 
 
 def test_implicit_steps_have_the_derivatives_of_finite_differences():
-    step = jax.jit(stiff(RADAU_3))
+    step = jax.jit(stiff(MIDPOINT))
     x, u = 0.01 * jnp.arange(1.0, 7.0).at[1].set(1e-4), jnp.array([2.0])
-    slopes = jax.jit(jax.jacfwd(stiff(RADAU_3), argnums=(0, 1)))(x, u)
+    slopes = jax.jit(jax.jacfwd(stiff(MIDPOINT), argnums=(0, 1)))(x, u)
     for slope, by, size in ((slopes[0], lambda e: step(x + e, u), 6), (slopes[1], lambda e: step(x, u + e), 1)):
         numeric = np.stack([(by(1e-6 * each) - by(-1e-6 * each)) / 2e-6 for each in np.eye(size)], axis=1)
         np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)
@@ -107,13 +105,13 @@ def test_a_stiff_plant_is_planned_by_implicit_steps_alone():
     weights = jnp.array([1.0, 0.0, 1.0, 0.01, 0.0, 0.01])
     off = lambda x: jnp.sum(weights * x**2)  # noqa: E731
 
-    def plan(method):
-        problem = Problem(stiff(method), lambda x, u: 0.02 * (off(x) + 1e-3 * u @ u), lambda x: 10 * off(x), -20.0, 20.0)
-        return jax.jit(lambda: shoot(problem, start, np.linspace(start, goal, 51), np.zeros((50, 1))))()
-
-    found = plan(RADAU_3)
+    problem = Problem(stiff(MIDPOINT), lambda x, u: 0.02 * (off(x) + 1e-3 * u @ u), lambda x: 10 * off(x), -20.0, 20.0)
+    found = jax.jit(lambda: shoot(problem, start, np.linspace(start, goal, 51), np.zeros((50, 1))))()
     assert found.converged and np.abs(found.plan.x[-1, :3]).max() < 0.02 and np.abs(found.plan.x[:, 1]).max() < 1e-3
-    assert not plan(CLASSICAL).converged
+    classical, x = jax.jit(stiff(CLASSICAL)), jnp.asarray(start)
+    for u in found.plan.u:
+        x = classical(x, u)
+    assert not np.abs(x).max() < 1e3
 
 
 def test_radau_is_of_order_three_and_forgets_what_decays_fast():
