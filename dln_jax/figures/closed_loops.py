@@ -17,7 +17,6 @@ from dln_jax.types import InputError, JointKind
 LIMIT = style.VERMILLION
 MOST_SHOWN = 30
 """Runs whose traces are drawn."""
-LATE = "#7a0177"
 
 
 def closed_loop_traces(
@@ -27,6 +26,7 @@ def closed_loop_traces(
     names: tuple[str, ...] | None = None,
     goal: Any = None,
     limits: tuple[Any, Any] = (-np.inf, np.inf),
+    unit: str = "N or N m",
     energy: Float[np.ndarray, "K T"] | None = None,
     goal_energy: float | None = None,
 ) -> Figure:
@@ -38,6 +38,7 @@ def closed_loop_traces(
         names: of the coordinates.
         goal: state [2 d], dashed; none by default.
         limits: of the controls, [m] or one for all, in red.
+        unit: of the controls.
         energy: along the runs, J.
         goal_energy: J, dashed.
 
@@ -59,8 +60,8 @@ def closed_loop_traces(
             _angles(axis)
         _curves(axis, t, values)
         axis.axhline(0.0 if kind == "revolute" else goal[joint], color="0.3", linestyle="--", linewidth=0.9)
-        unit = "rad" if kind == "revolute" else "m"
-        axis.set_ylabel(f"{names[joint] if names else f'q{joint + 1}'}, {unit}")
+        name = names[joint] if names else f"q{joint + 1}"
+        axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
     for control in range(m):
         axis = axes[d + control, 0]
         _curves(axis, t[:-1], u[:MOST_SHOWN, :, control], steps=True)
@@ -68,14 +69,14 @@ def closed_loop_traces(
             level = float(np.broadcast_to(limit, m)[control])
             if np.isfinite(level):
                 axis.axhline(level, color=LIMIT, linewidth=1.2)
-        axis.set_ylabel("control, N or N m" if m == 1 else f"u{control + 1}")
+        axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
         axis.margins(y=0.15)
     if energy is not None:
-        factor, unit = style.prefixed(float(np.nanmax(np.abs(energy))), "J")
+        factor, joules = style.prefixed(float(np.nanmax(np.abs(energy))), "J")
         _curves(axes[-1, 0], t, np.asarray(energy)[:MOST_SHOWN] / factor)
         if goal_energy is not None:
             axes[-1, 0].axhline(goal_energy / factor, color="0.3", linestyle="--", linewidth=0.9)
-        axes[-1, 0].set_ylabel(f"energy, {unit}")
+        axes[-1, 0].set_ylabel(f"energy, {joules}")
     axes[-1, 0].set(xlabel="t, s", xlim=(t[0], t[-1]))
     figure.align_ylabels()
     return figure
