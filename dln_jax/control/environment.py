@@ -64,9 +64,9 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         failure_cost: float = 1e3,
     ):
         require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
-        least, most = (np.broadcast_to(np.asarray(each, float), controls) for each in laboratory[:2])
-        if not (np.isfinite(least) & np.isfinite(most) & (least < most)).all():
-            raise InputError(f"limits are {least} and {most}; expected finite ones, which actions in [-1, 1] span")
+        low, high = (np.broadcast_to(np.asarray(each, float), controls) for each in laboratory[:2])
+        if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+            raise InputError(f"limits are {low} and {high}; expected finite ones, which actions in [-1, 1] span")
         noise_of(laboratory, jax.random.key(0))
         self._samples, self._failure_cost = round(seconds * rate), failure_cost
         self._key, self._place, self._seen = jax.random.key(0), None, np.zeros(0)
@@ -78,6 +78,8 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
             angles, rates = y[turning], y[len(joints) :]
             return jnp.concatenate([y[sliding], jnp.cos(angles), jnp.sin(angles), rates])
 
+        middle, half = jnp.asarray((low + high) / 2), jnp.asarray((high - low) / 2)
+
         @jax.jit
         def begin(key: Array) -> tuple[_Place, Array]:
             of_start, of_encoder = jax.random.split(jax.random.fold_in(key, 0))
@@ -87,7 +89,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         @jax.jit
         def advance(key: Array, place: _Place, action: Array) -> tuple[_Place, Array, Array, Array]:
             of_control, of_encoder = jax.random.split(jax.random.fold_in(key, place.number))
-            wanted = (least + most) / 2 + (most - least) / 2 * action
+            wanted = middle + half * action
             u, waiting = delivered(laboratory, place.waiting, wanted, of_control)
             after = _Place(step(place.x, u), waiting, place.number + 1)
             return after, observe(after.x, of_encoder), cost(place.x, u) / rate, u

@@ -30,8 +30,10 @@ def cart_pole_drawing(length: float) -> Drawing:
         tip = np.stack([q[:, 0] + length * np.sin(q[:, 1]), length * np.cos(q[:, 1])], axis=1)
         low, most = q[:, 0].min() - 1.25 * length, q[:, 0].max() + 1.25 * length
         axis.plot([low, most], [-high / 2 - 0.07 * length] * 2, color=GROUND, linewidth=2.5, zorder=0)
-        cart = axis.add_patch(Rectangle((0, 0), wide, high, facecolor=BODY, edgecolor="none", zorder=2))
-        wheels = [axis.add_patch(Circle((0, 0), 0.07 * length, facecolor="0.45", zorder=3)) for _ in range(2)]
+        cart = Rectangle((0, 0), wide, high, facecolor=BODY, edgecolor="none", zorder=2)
+        wheels = [Circle((0, 0), 0.07 * length, facecolor="0.45", zorder=3) for _ in range(2)]
+        for patch in (cart, *wheels):
+            axis.add_patch(patch)
         moving = _rod(axis, tip, trail)
         axis.set(xlim=(low, most), ylim=(-1.25 * length, 1.25 * length), aspect="equal")
         axis.set_axis_off()

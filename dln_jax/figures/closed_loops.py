@@ -1,4 +1,4 @@
-"""Figures of closed loops: traces with their limits, the phase plane with what a regulator catches, and where it works."""
+"""Figures of closed loops: traces with limits, the phase plane with what a regulator catches, and where they work."""
 
 from typing import Any
 
@@ -170,7 +170,7 @@ def _angles(axis: Axes, side: Any = None) -> None:
     """Ticks at halves of pi, the whole circle in view."""
     side = axis.yaxis if side is None else side
     side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
-    names = {-2: "−π", -1: "−π/2", 0: "0", 1: "π/2", 2: "π"}
+    names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}
     side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
     if side is axis.yaxis:
         axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)

@@ -67,7 +67,7 @@ assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 # %%
 # The film and the phase plane
 # ----------------------------
-# Grey levels are the pole's energy with the arm at rest; on the dashed one it comes up by itself, as slowly as it likes.
+# Grey levels are the pole's energy with the arm at rest; on the dashed one it comes up by itself.
 
 folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
 write_closed_loop_gif(

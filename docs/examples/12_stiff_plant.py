@@ -71,9 +71,7 @@ for x, u, K in zip(plan.x, plan.u, plan.K, strict=False):
     true.append(many(true[-1], forces[-1]))
     exploded = few(exploded, u)
 apart = np.abs(np.stack(true) - plan.x)[:, [0, 2]].max()
-print(
-    f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT} s end at {np.abs(exploded).max():.0e}"
-)
+print(f"cart and pole stay within {apart:.3f} of the plan; explicit steps of {DT} s explode")
 assert apart < 0.2 and not np.abs(exploded).max() < 1e3
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True, layout="constrained")

@@ -46,7 +46,8 @@ def draw_traces(curves: Mapping[str, Any]) -> Figure:
     sliding = curves["revolute"][0] == 0.0
     return closed_loop_traces(
         runs, ("prismatic" if sliding else "revolute", "revolute"), names=("cart" if sliding else "arm", "pole"),
-        limits=(-limit, limit), unit="N" if sliding else "N m", energy=np.reshape(curves["energy"], x.shape[:2]), goal_energy=goal,
+        limits=(-limit, limit), unit="N" if sliding else "N m",
+        energy=np.reshape(curves["energy"], x.shape[:2]), goal_energy=goal,
     )  # fmt: skip
 
 
