@@ -71,30 +71,37 @@ def least_cost(horizon: Horizon) -> Solution:
         return jnp.sum(products) / limits
 
     def step(point: _Point) -> _Point:
-        du, below, above = point.solution.du, point.below, point.above
+        dx, du, below, above = *point.solution[:2], point.below, point.above
         under, over, aim = du - low, high - du, CENTRING * point.product
-        weight = below / under + above / over
-        solution = _recursion(horizon, aim / over - aim / under - weight * du, weight)
-        change = solution.du - du
+        # About the point, since the weights of controls at their limits exceed all else by ten orders.
+        found = _recursion(_about(horizon, dx, du), aim / over - aim / under, below / under + above / over)
+        change = found.du
         of_below, of_above = (aim - below * change) / under - below, (aim + above * change) / over - above
         fastest = [-change / under, change / over]
         fastest += [jnp.where(z > 0, -dz / z, 0.0) for z, dz in ((below, of_below), (above, of_above))]
         length = jnp.minimum(1.0, SHORT_OF_LIMITS / jnp.maximum(jnp.max(jnp.stack(fastest)), 1e-30))
-        # Whole steps solve the linear equations; the states and gains are those of the last.
         du, below, above = du + length * change, below + length * of_below, above + length * of_above
-        return _Point(solution._replace(du=du), below, above, complementarity(du, below, above), point.steps + 1)
+        solution = found._replace(dx=dx + length * found.dx, du=du)
+        return _Point(solution, below, above, complementarity(du, below, above), point.steps + 1)
 
     first = complementarity(du, below, above)
 
     def going(point: _Point) -> Array:
         return (point.product > SMALL * first) & (point.steps < MOST_STEPS)
 
-    start = Solution(
-        jnp.zeros((len(du) + 1, horizon.missed.shape[1]), du.dtype), du,
-        jnp.zeros((*du.shape, horizon.missed.shape[1]), du.dtype), jnp.zeros_like(horizon.missed),
-    )  # fmt: skip
-    last = jax.lax.while_loop(going, step, step(_Point(start, below, above, first, jnp.asarray(0)))).solution
-    return last._replace(dx=_followed(horizon, last.du))
+    K = jnp.zeros((*du.shape, horizon.missed.shape[1]), du.dtype)
+    start = Solution(_followed(horizon, du), du, K, jnp.zeros_like(horizon.missed))
+    return jax.lax.while_loop(going, step, step(_Point(start, below, above, first, jnp.asarray(0)))).solution
+
+
+def _about(horizon: Horizon, dx: Array, du: Array) -> Horizon:
+    """The program of further changes."""
+    both = jnp.concatenate([dx[:-1], du], axis=1)
+    return horizon._replace(
+        missed=jnp.zeros_like(horizon.missed),
+        gradients=horizon.gradients + jnp.einsum("kij,kj->ki", horizon.curvatures, both),
+        end_gradient=horizon.end_gradient + horizon.end_curvature @ dx[-1],
+    )
 
 
 def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:

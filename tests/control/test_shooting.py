@@ -27,13 +27,16 @@ STEPS, DT = 50, 0.04
 
 def test_a_linear_problem_takes_one_iteration_from_any_guess():
     guess = RANDOM.normal(size=(N + 1, 3)), RANDOM.normal(size=(N, 2))
-    found = jax.jit(lambda: shoot(LINEAR, START, *guess, iterations=1))()
+    solve = jax.jit(lambda x: shoot(LINEAR, x, *guess, iterations=1))
+    found = solve(START)
     known = time_varying_lqr(np.tile(F, (N, 1, 1)), np.tile(G, (N, 1, 1)), np.eye(3), 0.5 * np.eye(2), 2 * np.eye(3))
     np.testing.assert_allclose(found.plan.K, -known.K, atol=1e-10)
     assert float(found.plan.cost) == pytest.approx(START @ np.asarray(known.S[0]) @ START, rel=1e-12)
     # The cost to go is xᵀ S x.
     np.testing.assert_allclose(found.multipliers[0], 2 * known.S[1] @ found.plan.x[1], rtol=1e-10)
     assert found.defect < 1e-13
+    lost = solve(START * np.nan)
+    assert np.isnan(lost.plan.cost) and not lost.converged
 
 
 @functools.cache
