@@ -58,7 +58,7 @@ def closed_loop_traces(
         if kind == "revolute":
             values = _short_way(values - goal[joint])
             _angles(axis)
-        _curves(axis, t, values)
+        _curves(axis, t, values, turning=kind == "revolute")
         axis.axhline(0.0 if kind == "revolute" else goal[joint], color="0.3", linestyle="--", linewidth=0.9)
         name = names[joint] if names else f"q{joint + 1}"
         axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
@@ -153,10 +153,10 @@ def success_over_starts(
     return figure
 
 
-def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, steps: bool = False) -> None:
+def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False, steps: bool = False) -> None:
     """The first in front; gaps where an angle goes round."""
     for number, each in reversed(list(enumerate(values))):
-        broken = np.concatenate([[False], np.abs(np.diff(each)) > np.pi]) & (not steps)
+        broken = np.concatenate([[False], np.abs(np.diff(each)) > np.pi]) & turning
         colour, width = (style.BLUE, 1.6) if number == 0 else (style.SKY, 0.6)
         drawn = np.where(broken, np.nan, each)
         axis.plot(t, drawn, color=colour, linewidth=width, drawstyle="steps-post" if steps else "default")

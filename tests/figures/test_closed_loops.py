@@ -23,13 +23,14 @@ U = 2.0 * np.sign(np.sin(9 * T[:-1]))[None, :, None].repeat(3, axis=0)
 
 def test_traces_show_every_coordinate_and_the_limits():
     runs = Run(T, X, U, X[:, :-1])
-    figure = closed_loop_traces(
-        runs, ("prismatic", "revolute"), limits=(-2.0, np.inf), energy=X[:, :, 0], goal_energy=0.1
-    )
+    joules = 10.0 * (-1.0) ** np.arange(51) * np.ones((3, 1))  # leaps are no turns
+    options = {"limits": (-2.0, np.inf), "energy": joules, "goal_energy": 0.1}
+    figure = closed_loop_traces(runs, ("prismatic", "revolute"), **options)
     cart, pole, control, energy = figure.axes
     assert len(cart.lines) == 4 and len(energy.lines) == 4
     assert [float(line.get_ydata()[0]) for line in control.lines[3:]] == [-2.0]
     assert np.abs(pole.lines[0].get_ydata()).max() <= np.pi
+    assert np.isfinite(energy.lines[0].get_ydata()).all()
     figure.draw_without_rendering()
     with pytest.raises(InputError, match=r"expected \[K, T, 2 d\]"):
         closed_loop_traces(runs, ("revolute",))
