@@ -21,7 +21,7 @@ from dln_jax.scenes import rotary_pendulum
 
 jax.config.update("jax_enable_x64", True)
 
-STARTS, FRAMES_PER_SECOND = 30, 25
+STARTS, FRAMES_PER_SECOND = 30, 25.0
 LIMIT = 0.05  # N m
 
 # %%

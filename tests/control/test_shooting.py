@@ -1,4 +1,4 @@
-"""Multiple shooting against Riccati's recursion, single shooting, finite differences, and on a plant that is stiff."""
+"""Multiple shooting against Riccati's recursion, single shooting and finite differences, and integrators for stiff plants."""
 
 import functools
 
@@ -9,7 +9,7 @@ import pytest
 
 from dln_jax.control import Problem, field_of, integrated, receding, shoot, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.integrators import CLASSICAL, GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
+from dln_jax.mechanics.integrators import GAUSS_LEGENDRE_4, MIDPOINT, RADAU_3
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.types import InputError
@@ -86,35 +86,16 @@ def test_gains_are_derivatives_of_the_optimum_and_convergence_is_quadratic():
     np.testing.assert_allclose(exact.plan.K[0], np.stack(slopes, axis=1), rtol=1e-3)
 
 
-@functools.cache
-def stiff(method):
-    # The spring swings at 150 Hz: steps of 20 ms are seven times the stability limit of the classical method.
-    scene = flexible_cart_pole(stiffness=2e5)
-    field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
-    return integrated(field, 0.02, method=method)
-
-
 def test_implicit_steps_have_the_derivatives_of_finite_differences():
-    step = jax.jit(stiff(MIDPOINT))
+    scene = flexible_cart_pole(stiffness=2e5)  # an example of the documentation plans through it
+    field = field_of(dynamics(scene.closed_form), np.asarray(scene.needs.actuation))
+    stiff = integrated(field, 0.02, method=MIDPOINT)
+    step = jax.jit(stiff)
     x, u = 0.01 * jnp.arange(1.0, 7.0).at[1].set(1e-4), jnp.array([2.0])
-    slopes = jax.jit(jax.jacfwd(stiff(MIDPOINT), argnums=(0, 1)))(x, u)
+    slopes = jax.jit(jax.jacfwd(stiff, argnums=(0, 1)))(x, u)
     for slope, by, size in ((slopes[0], lambda e: step(x + e, u), 6), (slopes[1], lambda e: step(x, u + e), 1)):
         numeric = np.stack([(by(1e-6 * each) - by(-1e-6 * each)) / 2e-6 for each in np.eye(size)], axis=1)
         np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-6)
-
-
-def test_a_stiff_plant_is_planned_by_implicit_steps_alone():
-    goal, start = np.zeros(6), np.array([0.2, 0.0, 0.3, 0.0, 0.0, 0.0])
-    weights = jnp.array([1.0, 0.0, 1.0, 0.01, 0.0, 0.01])
-    off = lambda x: jnp.sum(weights * x**2)  # noqa: E731
-
-    problem = Problem(stiff(MIDPOINT), lambda x, u: 0.02 * (off(x) + 1e-3 * u @ u), lambda x: 10 * off(x), -20.0, 20.0)
-    found = jax.jit(lambda: shoot(problem, start, np.linspace(start, goal, 51), np.zeros((50, 1))))()
-    assert found.converged and np.abs(found.plan.x[-1, :3]).max() < 0.02 and np.abs(found.plan.x[:, 1]).max() < 1e-3
-    classical, x = jax.jit(stiff(CLASSICAL)), jnp.asarray(start)
-    for u in found.plan.u:
-        x = classical(x, u)
-    assert not np.abs(x).max() < 1e3
 
 
 def test_radau_is_of_order_three_and_forgets_what_decays_fast():
