@@ -65,6 +65,7 @@ ROOMS = {
     "learning": "Learning",
     "metrics": "Numbers about a model",
     "figures": "Pictures",
+    "control": "Control",
     "deploy": "Real time, C and StableHLO",
     "softbody": "Soft bodies",
     "locomotion": "Locomotion",

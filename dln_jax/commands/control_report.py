@@ -1,22 +1,23 @@
 """Measure controllers: swing-ups from many starts, and a public board's acrobot and pendubot by energy and by plan.
 
-Prints one table (case, quantity, expected, value, unit, reference, to reach, pass) and writes report.json.
+Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
+figures.
 """
 
 from dataclasses import dataclass
 from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
-from dln_jax.command_line.options import Folder
+from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.control.cases import cases
 
-SUBJECTS = ("swing-up", "board", "equation")
+SUBJECTS = ("swing-up", "starts", "board", "equation")
 
 
 @dataclass(frozen=True)
-class Arguments(Folder):
+class Arguments(Folder, Drawn):
     """What to measure."""
 
     only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
@@ -30,4 +31,4 @@ def main(given: Arguments) -> None:
     subjects = names_in("--only", given.only, SUBJECTS)
     chosen = [case for case in cases(quick=given.quick) if case.name.split("/")[0] in subjects]
     with command_folder(given, "control") as folder:
-        measure_and_publish(folder, chosen, dtype="float64", quick=given.quick)
+        measure_and_publish(folder, chosen, figures=given.figures, dtype="float64", quick=given.quick)

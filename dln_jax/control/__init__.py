@@ -11,7 +11,8 @@ from dln_jax.control.energy_shaping import (
     passive_energy,
 )
 from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
-from dln_jax.control.state_space import Linearisation, field_of, holding_controls, linearise
+from dln_jax.control.shooting import Shooting, shoot
+from dln_jax.control.state_space import Linearisation, field_of, holding_controls, integrated, linearise
 from dln_jax.control.tracking import (
     Gains,
     Reference,
@@ -38,6 +39,7 @@ __all__ = [
     "Regulator",
     "Run",
     "SampledRegulators",
+    "Shooting",
     "Tracker",
     "computed_torque",
     "energy_shaping",
@@ -48,6 +50,7 @@ __all__ = [
     "gravity_compensation",
     "holding_controls",
     "improve",
+    "integrated",
     "limited",
     "linearise",
     "lqr",
@@ -59,6 +62,7 @@ __all__ = [
     "region_of_attraction",
     "regulated",
     "sampled_lqr",
+    "shoot",
     "simulate",
     "stateless",
     "switched",

@@ -118,36 +118,56 @@ def simulate(
     """
     require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
     lab = laboratory
-    if lab.delay < 0 or lab.delay != int(lab.delay):
-        raise InputError(f"delay is {lab.delay}; expected a whole number of samples, 0 or more")
-    noisy = any(not isinstance(each, int | float) or each != 0 for each in (lab.encoder_noise, lab.control_noise))
-    if noisy and key is None:
-        raise InputError("the laboratory has noise; give a key of jax.random, a new one for each run")
-    key = jax.random.key(0) if key is None else key
+    key = noise_of(lab, key)
     samples, dt = round(seconds * rate), 1.0 / rate
     x = jnp.asarray(x, float)
-    d = x.shape[0] // 2
-    waiting = jnp.zeros((lab.delay, controls), x.dtype)
 
     def sample(carry: tuple, number: Array) -> tuple[tuple, tuple[Array, Array, Array]]:
         x, memory, waiting = carry
         of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
-        q = x[:d]
-        if noisy:
-            q = q + lab.encoder_noise * jax.random.normal(of_encoder, (d,), x.dtype)
-        y = jnp.concatenate([rounded(q, lab.encoder_step), x[d:]] if lab.sees_rates else [rounded(q, lab.encoder_step)])
+        y = measured(lab, x, of_encoder)
         memory, wanted = controller.act(memory, number * dt, y)
-        queue = jnp.concatenate([waiting, jnp.clip(wanted, lab.least, lab.most)[None]])
-        u, waiting = queue[0], queue[1:]
-        if noisy:
-            u = u + lab.control_noise * jax.random.normal(of_control, (controls,), x.dtype)
+        u, waiting = delivered(lab, waiting, wanted, of_control)
         step = runge_kutta(CLASSICAL, lambda t, state: field(state, u))
         x = advance(step, 0.0, x, dt, substeps=substeps)
         return (x, memory, waiting), (x, u, y)
 
-    start = (x, controller.start, waiting)
+    start = (x, controller.start, jnp.zeros((lab.delay, controls), x.dtype))
     _, (later, u, y) = jax.lax.scan(sample, start, jnp.arange(samples))
     return Run(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
+
+
+def noise_of(laboratory: Laboratory, key: Array | None) -> Array:
+    """The key, or any where there is no noise; `InputError` for noise without a key, or a delay that is none."""
+    delay = laboratory.delay
+    if delay < 0 or delay != int(delay):
+        raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
+    if _noisy(laboratory) and key is None:
+        raise InputError("the laboratory has noise; give a key of jax.random, a new one for each run")
+    return jax.random.key(0) if key is None else key
+
+
+def measured(laboratory: Laboratory, x: Array, key: Array) -> Array:
+    """What a controller is given of a state (q, qd)."""
+    q, qd = jnp.split(x, 2)
+    if _noisy(laboratory):
+        q = q + laboratory.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
+    y = rounded(q, laboratory.encoder_step)
+    return jnp.concatenate([y, qd]) if laboratory.sees_rates else y
+
+
+def delivered(laboratory: Laboratory, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
+    """What drives the plant when a controller wants this, and the controls [delay, m] that are then on their way."""
+    queue = jnp.concatenate([waiting, jnp.clip(wanted, laboratory.least, laboratory.most)[None]])
+    u = queue[0]
+    if _noisy(laboratory):
+        u = u + laboratory.control_noise * jax.random.normal(key, u.shape, u.dtype)
+    return u, queue[1:]
+
+
+def _noisy(laboratory: Laboratory) -> bool:
+    stated = laboratory.encoder_noise, laboratory.control_noise
+    return any(not isinstance(each, int | float) or each != 0 for each in stated)
 
 
 def rounded(q: Array, step: Any) -> Array:

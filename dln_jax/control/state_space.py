@@ -9,7 +9,8 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.types import InputError, Vector
+from dln_jax.mechanics.integrators import CLASSICAL, Tableau, advance, runge_kutta
+from dln_jax.types import InputError, Vector, require_positive
 
 Field = Callable[[Array, Array], Array]
 """(x [n], u [m]) -> dx/dt [n]."""
@@ -38,6 +39,31 @@ def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
         return jnp.concatenate([qd, plant.forward_dynamics(q, qd, tau)])
 
     return field
+
+
+def integrated(
+    field: Field, dt: float, *, method: Tableau = CLASSICAL, substeps: int = 1
+) -> Callable[[Array, Array], Array]:
+    """(x, u) -> x after dt with u held: the step of a sampled controller and of a `Problem`, differentiable.
+
+    A step of an implicit method is NaN where its equations are not solved, and its derivatives are those of the
+    implicit function theorem.
+
+    Args:
+        field: (x, u) -> dx/dt.
+        dt: s.
+        method: of Runge and Kutta, such as `integrators.MIDPOINT` or `RADAU_3` for a stiff plant.
+        substeps: of the method.
+
+    Raises:
+        InputError: a time or a number of substeps that is not positive.
+    """
+    require_positive(dt=dt, substeps=substeps)
+
+    def step(x: Array, u: Array) -> Array:
+        return advance(runge_kutta(method, lambda t, state: field(state, u)), 0.0, x, dt, substeps=substeps)
+
+    return step
 
 
 def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linearisation:

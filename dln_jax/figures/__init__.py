@@ -2,6 +2,8 @@
 
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time
+from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import closed_loop_traces, phase_portrait, success_over_starts
 from dln_jax.figures.dynamics import force_decomposition, tip_paths
 from dln_jax.figures.friction import friction_curves, friction_laws
 from dln_jax.figures.functions import ensemble, function_curves, heat_maps, parity, surfaces
@@ -14,6 +16,8 @@ from dln_jax.figures.uncertainty import torque_bands
 __all__ = [
     "Moments",
     "call_times",
+    "cart_pole_drawing",
+    "closed_loop_traces",
     "cost_curves",
     "cost_panels",
     "cost_points",
@@ -29,11 +33,15 @@ __all__ = [
     "moments_figure",
     "motion_figure",
     "parity",
+    "phase_portrait",
+    "rotary_pendulum_drawing",
     "soft_body_frame",
+    "success_over_starts",
     "surfaces",
     "tip_paths",
     "torque_bands",
     "training_curve",
+    "write_closed_loop_gif",
     "write_frame_gif",
     "write_motion_gif",
     "write_soft_body_gif",

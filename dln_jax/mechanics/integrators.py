@@ -6,6 +6,7 @@
 | `rk4` | 4 | any field | |
 | `implicit_midpoint` | 2 | any field | symplectic, reversible, quadratic invariants |
 | `gauss_legendre4` | 4 | any field | symplectic, reversible, quadratic invariants |
+| `radau3` | 3 | any field | stiff ones at any dt: what decays fast is damped (L-stable) |
 | `symplectic_euler` | 1 | partitioned fields | symplectic if separable |
 | `stormer_verlet` | 2 | separable fields | symplectic, reversible |
 
@@ -62,6 +63,7 @@ CLASSICAL = Tableau(
 MIDPOINT = Tableau(stages=((0.5,),), weights=(1.0,))
 _SKEW = math.sqrt(3) / 6
 GAUSS_LEGENDRE_4 = Tableau(stages=((0.25, 0.25 - _SKEW), (0.25 + _SKEW, 0.25)), weights=(0.5, 0.5))
+RADAU_3 = Tableau(stages=((5 / 12, -1 / 12), (0.75, 0.25)), weights=(0.75, 0.25))
 
 
 def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iterations: int = 20) -> Step:
@@ -89,6 +91,7 @@ explicit_euler = functools.partial(runge_kutta, EULER)
 rk4 = functools.partial(runge_kutta, CLASSICAL)
 implicit_midpoint = functools.partial(runge_kutta, MIDPOINT)
 gauss_legendre4 = functools.partial(runge_kutta, GAUSS_LEGENDRE_4)
+radau3 = functools.partial(runge_kutta, RADAU_3)
 
 
 def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) -> Step:

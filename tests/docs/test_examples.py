@@ -18,6 +18,8 @@ REDUCED = {
     "08_c_in_a_loop": {},
     "09_fine_tune": {"ITERATIONS": 5},
     "10_encoder_log_to_c": {},
+    "11_swing_up": {"STARTS": 2, "FRAMES_PER_SECOND": 1.0},
+    "12_stiff_plant": {},
 }
 """Constants of the examples, and what they are here."""
 

@@ -10,7 +10,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.control import energy_laws
+from dln_jax.studies.control import energy_laws, pictures
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
@@ -57,7 +57,7 @@ def swing_up(name: str, quick: bool) -> Findings:
     rows = [expect(case, "success_share", words, np.isfinite(times).mean(), SUCCESS, at_least=True)]
     for quantity, of in (("median", np.median), ("worst", np.max)):
         rows.append(Row(case, f"seconds_{quantity}", float(of(reached)) if len(reached) else np.inf, "s"))
-    return Findings(rows)
+    return Findings(rows, pictures.traces(SWING_UPS[name]))
 
 
 def by_plan(motor: Motor, quick: bool) -> Findings:
@@ -80,10 +80,15 @@ def cases(*, quick: bool = False) -> list[Case]:
     """All, named SUBJECT/NAME, in float64."""
     measures: dict[str, Callable[[bool], Findings]] = {
         **{f"swing-up/{name}": functools.partial(swing_up, name) for name in SWING_UPS},
+        **{f"starts/{name}-starts": functools.partial(pictures.from_anywhere, SWING_UPS[name]) for name in SWING_UPS},
         "board/acrobot-energy": functools.partial(by_energy, "elbow"),
         "board/pendubot-energy": functools.partial(by_energy, "shoulder"),
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
         **equation.CASES,
     }
-    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]
+    drawn = pictures.DRAWN
+    return [
+        Case(name, in_float64(functools.partial(measure, quick)), draw=drawn.get(name.split("/")[0]))
+        for name, measure in measures.items()
+    ]

@@ -147,11 +147,9 @@ class SwingUp(NamedTuple):
     """Standard deviation of the driven coordinate at the start, m or rad."""
 
 
-def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> np.ndarray:
-    """Time from which on the pole is up, s, infinite where it is not, of starts near hanging, in a laboratory.
-
-    Encoders alone are read at 500 Hz, rates are differences of theirs, and torques come a sample late.
-    """
+def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Run]:
+    """Start [4] -> run in a laboratory: encoders alone are read at 500 Hz, rates are differences of theirs, and torques
+    come a sample late."""
     scene, rate = case.scene, 500.0
     system, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
     field, goal = field_of(system, B), jnp.zeros(4)
@@ -162,15 +160,30 @@ def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0)
     law = switched(lambda x: swing(x[:2], x[2:]), near, value(regulator, goal, joints), case.level)
     controller = with_differences(law, 2, rate=rate, cutoff=50.0)
     lab = Laboratory(-case.limit, case.limit, encoder_step=np.array(case.encoder_step), delay=1, sees_rates=False)
+    return lambda start: simulate(field, controller, start, seconds=seconds, rate=rate, controls=1, laboratory=lab)
+
+
+def near_hanging(case: SwingUp, starts: int, seed: int = 0) -> np.ndarray:
+    """Starts [starts, 4] at rest."""
     random = np.random.default_rng(seed)
     x = np.zeros((starts, 4))
     x[:, 0] = case.position * random.normal(size=starts)
     x[:, 1] = np.pi + 0.1 * random.normal(size=starts)
+    return x
+
+
+def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> np.ndarray:
+    """Time from which on the pole is up, s, infinite where it is not, of starts near hanging."""
+    return times_up(case, near_hanging(case, starts, seed), seconds=seconds)
+
+
+def times_up(case: SwingUp, starts: np.ndarray, *, seconds: float = 10.0) -> np.ndarray:
+    """Likewise of any starts [K, 4]."""
+    run, joints = closed_loop(case, seconds=seconds), case.scene.needs.joints
 
     def angles(start: Array) -> Array:
-        run = simulate(field, controller, start, seconds=seconds, rate=rate, controls=1, laboratory=lab)
-        return jax.vmap(lambda x: error(x, goal, joints)[1])(run.x)
+        return jax.vmap(lambda x: error(x, jnp.zeros(4), joints)[1])(run(start).x)
 
-    up = np.abs(np.asarray(jax.jit(jax.vmap(angles))(x))) < 0.1
+    up = np.abs(np.asarray(jax.jit(jax.vmap(angles))(starts))) < 0.1
     last_down = up.shape[1] - np.argmin(up[:, ::-1], axis=1)
-    return np.where(up[:, -1], last_down / rate, np.inf)
+    return np.where(up[:, -1], np.where(up.all(axis=1), 0, last_down) / 500.0, np.inf)

@@ -1,0 +1,135 @@
+"""A plant in its laboratory as a `gymnasium.Env`, for those who train controllers by other means (extra `[rl]`).
+
+NumPy in float32, actions in [-1, 1], which are the limits of the controls; the loop is that of `simulate`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.closed_loop import Laboratory, delivered, measured, noise_of
+from dln_jax.control.state_space import Field, integrated
+from dln_jax.types import InputError, JointKind, Scalar, require_positive
+
+
+class _Place(NamedTuple):
+    x: Array
+    waiting: Array
+    """[delay, m], controls on their way."""
+    number: Array
+
+
+class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One plant: an action in [-1, 1] per control spans its limits, the reward is minus the cost of the sample.
+
+    What is observed is what the laboratory measures, of revolute joints the cosine and sine. An episode is truncated
+    after its seconds. It is terminated where the state is no longer finite: `info["failed"]` is then true, the
+    observation is the last finite one, and the reward is minus the cost of a failure. `info["x"]` is the true state,
+    `info["u"]` what drove it.
+
+    Args:
+        field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
+        cost: (x, u) -> cost per second at the start of a sample.
+        start: key of jax.random -> x [2 d], drawn anew at each reset.
+        joints: their kinds [d].
+        seconds: of an episode.
+        rate: of the samples, Hz.
+        laboratory: whose limits are finite, one for each control or one for all.
+        controls: m.
+        substeps: of the integrator in a sample.
+        failure_cost: of a state that is not finite; expected to be above what is left to pay elsewhere.
+
+    Raises:
+        InputError: settings that are not positive, limits that are not finite, or a delay that is none.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        cost: Callable[[Array, Array], Scalar],
+        start: Callable[[Array], Array],
+        joints: tuple[JointKind, ...],
+        *,
+        seconds: float,
+        rate: float,
+        laboratory: Laboratory,
+        controls: int = 1,
+        substeps: int = 1,
+        failure_cost: float = 1e3,
+    ):
+        require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
+        low, high = (np.broadcast_to(np.asarray(each, float), controls) for each in laboratory[:2])
+        if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+            raise InputError(f"limits are {low} and {high}; expected finite ones, which actions in [-1, 1] span")
+        noise_of(laboratory, jax.random.key(0))
+        self._samples, self._failure_cost = round(seconds * rate), failure_cost
+        self._key, self._place, self._seen = jax.random.key(0), None, np.zeros(0)
+        step, revolute = integrated(field, 1 / rate, substeps=substeps), np.array(joints) == "revolute"
+        turning, sliding = np.flatnonzero(revolute), np.flatnonzero(~revolute)
+
+        def observe(x: Array, key: Array) -> Array:
+            y = measured(laboratory, x, key)
+            angles, rates = y[turning], y[len(joints) :]
+            return jnp.concatenate([y[sliding], jnp.cos(angles), jnp.sin(angles), rates])
+
+        middle, half = jnp.asarray((low + high) / 2), jnp.asarray((high - low) / 2)
+
+        @jax.jit
+        def begin(key: Array) -> tuple[_Place, Array]:
+            of_start, of_encoder = jax.random.split(jax.random.fold_in(key, 0))
+            place = _Place(start(of_start), jnp.zeros((laboratory.delay, controls)), jnp.asarray(1))
+            return place, observe(place.x, of_encoder)
+
+        @jax.jit
+        def advance(key: Array, place: _Place, action: Array) -> tuple[_Place, Array, Array, Array]:
+            of_control, of_encoder = jax.random.split(jax.random.fold_in(key, place.number))
+            wanted = middle + half * action
+            u, waiting = delivered(laboratory, place.waiting, wanted, of_control)
+            after = _Place(step(place.x, u), waiting, place.number + 1)
+            return after, observe(after.x, of_encoder), cost(place.x, u) / rate, u
+
+        self._begin, self._advance = begin, advance
+        size = len(joints) + len(turning) + laboratory.sees_rates * len(joints)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (controls,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
+        """The observation of a start that is drawn; the seed determines it, and all noise after it."""
+        super().reset(seed=seed, options=options)
+        self._key = jax.random.key(int(self.np_random.integers(2**32)))
+        self._place, seen = self._begin(self._key)
+        self._seen = np.asarray(seen, np.float32)
+        return self._seen, {"x": np.asarray(self._place.x)}
+
+    def step(
+        self, action: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
+        """Observation, reward, terminated, truncated and `info`; `InputError` before the first reset."""
+        if self._place is None:
+            raise InputError("the environment has no state; call reset before step")
+        after, seen, cost, u = self._advance(self._key, self._place, np.asarray(action, float))
+        self._place, seen = after, np.asarray(seen, np.float32)
+        failed = not (np.isfinite(after.x).all() and np.isfinite(seen).all() and np.isfinite(cost))
+        self._seen = self._seen if failed else seen
+        truncated = int(after.number) > self._samples and not failed
+        info = {"x": np.asarray(after.x), "u": np.asarray(u), "failed": failed}
+        return self._seen, -(self._failure_cost if failed else float(cost)), failed, truncated, info
+
+
+def register(name: str, make: Callable[[], PlantEnvironment]) -> None:
+    """Lets `gymnasium.make(name)` call `make`; nothing is registered before it is asked for.
+
+    Args:
+        name: as Gymnasium has them, such as "dln_jax/CartPole-v0".
+        make: the environment.
+    """
+    if name not in gymnasium.registry:
+        gymnasium.register(id=name, entry_point=lambda **options: make(**options))

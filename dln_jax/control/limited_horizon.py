@@ -1,0 +1,147 @@
+"""Convex quadratic programs over a horizon with limited controls, by an interior-point method.
+
+    min  sum_k gᵀ (dx_k, du_k) + ½ (dx_k, du_k)ᵀ H (dx_k, du_k) + end,   dx_0 = 0
+         dx_{k+1} = F (dx_k, du_k) + d_k,   low <= du_k <= high
+
+A primal-dual method whose linear systems are Riccati recursions (Rao, Wright and Rawlings 1998): limits add
+z / s to the controls' Hessian, s being the distance from a limit and z its multiplier, and s z goes to zero.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+CENTRING = 0.1
+"""Of s z, what a step aims at."""
+SHORT_OF_LIMITS = 0.995
+"""Of the step that would come to a limit."""
+SMALL = 1e-11
+"""Of the first s z, at which it ends."""
+MOST_STEPS = 60
+
+
+class Horizon(NamedTuple):
+    """A program of N steps of n states and m controls."""
+
+    slopes: Float[Array, "N n n+m"]
+    missed: Float[Array, "N n"]
+    gradients: Float[Array, "N n+m"]
+    curvatures: Float[Array, "N n+m n+m"]
+    end_gradient: Float[Array, " n"]
+    end_curvature: Float[Array, "n n"]
+    low: Float[Array, "N m"]
+    """Infinite where there is no limit; negative, and `high` positive, or zero."""
+    high: Float[Array, "N m"]
+
+
+class Solution(NamedTuple):
+    """Where it is least; not finite where it has no minimum."""
+
+    dx: Float[Array, "N+1 n"]
+    du: Float[Array, "N m"]
+    K: Float[Array, "N m n"]
+    """Of the controls with the state, nothing where a limit holds one."""
+    multipliers: Float[Array, "N n"]
+    """Slope of the cost to go with dx_{k+1}."""
+
+
+class _Point(NamedTuple):
+    solution: Solution
+    below: Array
+    above: Array
+    product: Array
+    steps: Array
+
+
+def least_cost(horizon: Horizon) -> Solution:
+    """The solution, traceable."""
+    low, high = horizon.low, horizon.high
+    finite = jnp.isfinite(low), jnp.isfinite(high)
+    limits = jnp.maximum(jnp.sum(finite[0]) + jnp.sum(finite[1]), 1)
+    width = jnp.where(finite[0] & finite[1], high - low, 1.0)
+    du = jnp.clip(jnp.zeros_like(low), low + 0.1 * width, high - 0.1 * width)
+    size = jnp.max(jnp.abs(horizon.gradients)) + jnp.max(jnp.abs(horizon.end_gradient))
+    below, above = (jnp.where(each, size / width, 0.0) for each in finite)
+
+    def complementarity(du: Array, below: Array, above: Array) -> Array:
+        products = jnp.where(finite[0], below * (du - low), 0.0) + jnp.where(finite[1], above * (high - du), 0.0)
+        return jnp.sum(products) / limits
+
+    def step(point: _Point) -> _Point:
+        dx, du, below, above = *point.solution[:2], point.below, point.above
+        under, over, aim = du - low, high - du, CENTRING * point.product
+        # About the point, since the weights of controls at their limits exceed all else by ten orders.
+        found = _recursion(_about(horizon, dx, du), aim / over - aim / under, below / under + above / over)
+        change = found.du
+        of_below, of_above = (aim - below * change) / under - below, (aim + above * change) / over - above
+        fastest = [-change / under, change / over]
+        fastest += [jnp.where(z > 0, -dz / z, 0.0) for z, dz in ((below, of_below), (above, of_above))]
+        length = jnp.minimum(1.0, SHORT_OF_LIMITS / jnp.maximum(jnp.max(jnp.stack(fastest)), 1e-30))
+        du, below, above = du + length * change, below + length * of_below, above + length * of_above
+        solution = found._replace(dx=dx + length * found.dx, du=du)
+        return _Point(solution, below, above, complementarity(du, below, above), point.steps + 1)
+
+    first = complementarity(du, below, above)
+
+    def going(point: _Point) -> Array:
+        return (point.product > SMALL * first) & (point.steps < MOST_STEPS)
+
+    K = jnp.zeros((*du.shape, horizon.missed.shape[1]), du.dtype)
+    start = Solution(_followed(horizon, du), du, K, jnp.zeros_like(horizon.missed))
+    return jax.lax.while_loop(going, step, step(_Point(start, below, above, first, jnp.asarray(0)))).solution
+
+
+def _about(horizon: Horizon, dx: Array, du: Array) -> Horizon:
+    """The program of further changes."""
+    both = jnp.concatenate([dx[:-1], du], axis=1)
+    return horizon._replace(
+        missed=jnp.zeros_like(horizon.missed),
+        gradients=horizon.gradients + jnp.einsum("kij,kj->ki", horizon.curvatures, both),
+        end_gradient=horizon.end_gradient + horizon.end_curvature @ dx[-1],
+    )
+
+
+def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
+    """The minimum without limits, of the program with ½ weight du² + gradient du beside it."""
+    n = horizon.missed.shape[1]
+
+    def back(value: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+        g, S = value
+        F, missed, of_cost, curvature, beside, weight = now
+        q, Q = of_cost + F.T @ (g + S @ missed), curvature + F.T @ S @ F
+        qu, Quu, Qux = q[n:] + beside, Q[n:, n:] + jnp.diag(weight), Q[n:, :n]
+        both = -jnp.linalg.solve(Quu, jnp.concatenate([qu[:, None], Qux], axis=1))
+        k, K = both[:, 0], both[:, 1:]
+        before = Q[:n, :n] + Qux.T @ K
+        # Where there is no minimum, there is no solution.
+        convex = jnp.isfinite(jnp.linalg.cholesky(Quu)).all()
+        return (q[:n] + Qux.T @ k, jnp.where(convex, (before + before.T) / 2, jnp.nan)), (k, K, g, S)
+
+    stages = horizon.slopes, horizon.missed, horizon.gradients, horizon.curvatures, gradient, weight
+    end = horizon.end_gradient, horizon.end_curvature
+    _, (k, K, g, S) = jax.lax.scan(back, end, stages, reverse=True)
+
+    def forth(dx: Array, now: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
+        F, missed, k, K, g, S = now
+        du = k + K @ dx
+        after = F @ jnp.concatenate([dx, du]) + missed
+        return after, (after, du, g + S @ after)
+
+    first = jnp.zeros(n, k.dtype)
+    _, (dx, du, prices) = jax.lax.scan(forth, first, (horizon.slopes, horizon.missed, k, K, g, S))
+    return Solution(jnp.concatenate([first[None], dx]), du, K, prices)
+
+
+def _followed(horizon: Horizon, du: Array) -> Array:
+    """States of some controls."""
+
+    def forth(dx: Array, now: tuple[Array, ...]) -> tuple[Array, Array]:
+        F, missed, du = now
+        after = F @ jnp.concatenate([dx, du]) + missed
+        return after, after
+
+    first = jnp.zeros_like(horizon.end_gradient)
+    return jnp.concatenate([first[None], jax.lax.scan(forth, first, (horizon.slopes, horizon.missed, du))[1]])

@@ -1,0 +1,102 @@
+"""The closed loop around a plant that MuJoCo simulates, which shares no equation with ours (extra `[robot]`)."""
+
+import importlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control.closed_loop import Controller, Laboratory, Run, delivered, measured, noise_of
+from dln_jax.types import InputError, require_positive
+
+INSTALL = "pip install 'dln-jax[robot]'"
+
+
+def simulate_in_mujoco(
+    model: Any,
+    controller: Controller,
+    x: Any,
+    *,
+    seconds: float,
+    rate: float,
+    actuation: Any = None,
+    laboratory: Laboratory = Laboratory(),  # noqa: B008
+    key: Array | None = None,
+) -> Run:
+    """As `simulate`, in MuJoCo: one run, sample by sample, by the model's own integrator and time step.
+
+    After a control that is not finite, and where MuJoCo warns that it diverges, all is NaN.
+
+    Args:
+        model: the text of an MJCF file, such as `data.mjcf` writes of a tree, or a `mujoco.MjModel`.
+        controller: asked once a sample.
+        x: the start (q, qd) [2 d], in MuJoCo's order of joints.
+        seconds: of the run.
+        rate: of the samples, Hz; a sample has a whole number of MuJoCo's steps.
+        actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
+        laboratory: limits, noise, delay; the model's own limits hold too.
+        key: of the noise; needed where there is any.
+
+    Raises:
+        InputError: MuJoCo is missing or refuses the model, whose joints are not all hinges and slides; a start of
+            another size; samples that are no whole number of steps; settings as for `simulate`.
+    """
+    require_positive(seconds=seconds, rate=rate)
+    key = noise_of(laboratory, key)
+    mujoco, model = _compiled(model)
+    data, x = mujoco.MjData(model), np.asarray(x, float)
+    if model.nq != model.nv or x.shape != (2 * model.nv,):
+        raise InputError(f"x has shape {x.shape} for {model.nv} degrees of freedom; expected hinges, slides and [2 d]")
+    steps = 1 / (rate * model.opt.timestep)
+    if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
+        raise InputError(f"a sample has {steps:.4g} steps of {model.opt.timestep:g} s; expected a whole number")
+    B = np.eye(model.nu) if actuation is None else np.asarray(actuation, float)
+    data.qpos[:], data.qvel[:] = np.split(x, 2)
+
+    @jax.jit
+    def sample(memory: Any, waiting: Array, x: Array, number: Array) -> tuple[Any, Array, Array, Array]:
+        of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
+        y = measured(laboratory, x, of_encoder)
+        memory, wanted = controller.act(memory, number / rate, y)
+        u, waiting = delivered(laboratory, waiting, wanted, of_control)
+        return memory, waiting, u, y
+
+    memory, waiting = controller.start, jnp.zeros((laboratory.delay, B.shape[1]))
+    states, controls, seen = [x], [], []
+    for number in range(round(seconds * rate)):
+        memory, waiting, u, y = sample(memory, waiting, jnp.asarray(states[-1]), jnp.asarray(number))
+        controls.append(u)
+        seen.append(y)
+        states.append(_advanced(mujoco, model, data, B @ np.asarray(u), round(steps)))
+    t = jnp.arange(len(states)) / rate
+    return Run(t, jnp.asarray(np.stack(states)), jnp.stack(controls), jnp.stack(seen))
+
+
+def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: int) -> np.ndarray:
+    """The state after a sample, NaN where there is none."""
+    # MuJoCo replaces what is not finite, and begins anew where it diverges: both would hide a failure.
+    if np.isfinite(control).all() and np.isfinite(data.qpos).all():
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data, steps)
+    else:
+        data.qpos[:] = np.nan
+    bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+    if any(data.warning[each].number for each in bad):
+        data.qpos[:] = np.nan
+    x = np.concatenate([data.qpos, data.qvel])
+    return x if np.isfinite(x).all() else np.full_like(x, np.nan)
+
+
+def _compiled(model: Any) -> tuple[Any, Any]:
+    try:
+        mujoco: Any = importlib.import_module("mujoco")
+    except ImportError:
+        raise InputError(f"MuJoCo simulates the plant and is missing; {INSTALL}") from None
+    if not isinstance(model, str):
+        return mujoco, model
+    try:
+        return mujoco, mujoco.MjModel.from_xml_string(model)
+    except ValueError as error:
+        raise InputError(f"MuJoCo refuses the model: {str(error).splitlines()[0]}") from None

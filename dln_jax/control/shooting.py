@@ -1,0 +1,207 @@
+"""Trajectories of least cost by multiple shooting: the states of all knots are unknowns, and steps may be implicit.
+
+    min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
+
+What a step misses of the next knot, its defect d_k = f(x_k, u_k) - x_{k+1}, is nothing at the solution alone: a guess
+need not be a motion, and an unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
+Sequential quadratic programming: all steps are expanded at once, `limited_horizon` finds the changes of states and
+controls, and they are shortened until cost + nu |defects|_1 falls enough, nu being above the multipliers (Nocedal and
+Wright 2006, section 18.3); whole, they may also lower the augmented Lagrangian, since near a solution the other merit
+can refuse steps that lead there (Maratos). Of the costs' curvature what is negative is left out. Through steps that
+are `integrated` by implicit methods, derivatives are those of the implicit function theorem.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from dln_jax.control.limited_horizon import Horizon, least_cost
+from dln_jax.control.trajectories import FIRST_DAMPING, Plan, Problem
+from dln_jax.types import InputError, require_positive
+
+SHORTEST = 2.0**-12
+"""Of the steps that are tried."""
+ENOUGH = 1e-4
+"""Of the decrease that the slope promises (Armijo)."""
+ABOVE = 2.0
+"""nu over the largest multiplier."""
+CLOSE = 1e-2
+"""Of the cost: where a change promises less and is taken whole, the curvature of the steps is of use."""
+
+
+class Shooting(NamedTuple):
+    """What multiple shooting found."""
+
+    plan: Plan
+    """For `receding` and for feedback along it; its states are the knots, a motion to within the defect."""
+    multipliers: Float[Array, "N n"]
+    """Slope of the cost to go with the state at the end of each step."""
+    defect: Float[Array, ""]
+    """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
+    promised: Float[Array, ""]
+    """By how much the last change was to lower the cost, relative to it."""
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+    """Whether the defects, and what was promised, were within the tolerance."""
+
+
+class _Knots(NamedTuple):
+    x: Array
+    u: Array
+    K: Array
+    cost: Array
+    missed: Array
+    """[N, n], the defects."""
+    multipliers: Array
+    promised: Array
+    close: Array
+    """Whether the last change was taken whole, and promised little."""
+    better: Array
+    iterations: Array
+    done: Array
+
+
+def shoot(
+    problem: Problem,
+    x: Any,
+    states: Any,
+    u: Any,
+    *,
+    iterations: int = 100,
+    tolerance: float = 1e-9,
+    exact: bool = False,
+) -> Shooting:
+    """The trajectory of least cost near a guess, traceable.
+
+    Args:
+        problem: to solve.
+        x: the start [n].
+        states: guess [N+1, n], of which the first is replaced by the start; it need not be a motion.
+        u: guess [N, m]; put within the limits.
+        iterations: at most.
+        tolerance: of the defects, relative to 1 + |x|, and of the cost.
+        exact: whether close to the optimum all curvature is used, that of the steps too: quadratic convergence, by
+            more derivatives. Otherwise it is Gauss-Newton's method.
+
+    Raises:
+        InputError: shapes that do not agree, or settings that are not positive.
+    """
+    require_positive(iterations=iterations, tolerance=tolerance)
+    x, states, u = (jnp.asarray(each, float) for each in (x, states, u))
+    if x.ndim != 1 or u.ndim != 2 or not len(u) or states.shape != (len(u) + 1, x.shape[0]):
+        raise InputError(
+            f"x has shape {x.shape}, states {states.shape}, u {u.shape}; expected [n], [N+1, n] and [N, m]"
+        )
+    states, u = states.at[0].set(x), jnp.clip(u, problem.least, problem.most)
+    cost, missed = _judge(problem, states, u)
+    no = jnp.asarray(False)
+    knots = _Knots(
+        states, u, jnp.zeros((*u.shape, x.shape[0]), u.dtype), cost, missed, jnp.zeros_like(missed),
+        jnp.zeros_like(cost), no, ~no, jnp.asarray(0), no,
+    )  # fmt: skip
+
+    def going(knots: _Knots) -> Array:
+        return (knots.iterations < iterations) & ~knots.done & knots.better & jnp.isfinite(knots.cost)
+
+    last = jax.lax.while_loop(going, lambda knots: _iterate(problem, knots, tolerance, exact), knots)
+    plan = Plan(last.u, last.x, last.K, last.cost, jnp.asarray(FIRST_DAMPING, u.dtype), ~no)
+    defect = jnp.max(jnp.abs(last.missed))
+    return Shooting(plan, last.multipliers, defect, last.promised, last.iterations, last.done)
+
+
+def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:
+    """Judges the knots, and improves them."""
+    n = knots.x.shape[1]
+    horizon = _expand(problem, knots, exact)
+    change = least_cost(horizon)
+    linear = jnp.sum(horizon.gradients[:, :n] * change.dx[:-1]) + jnp.sum(horizon.gradients[:, n:] * change.du)
+    linear = linear + horizon.end_gradient @ change.dx[-1]
+    largest = jnp.max(jnp.abs(knots.missed))
+    done = (largest <= tolerance * (1 + jnp.max(jnp.abs(knots.x)))) & (
+        jnp.abs(linear) <= tolerance * jnp.abs(knots.cost)
+    )
+    nu = ABOVE * jnp.max(jnp.abs(change.multipliers))
+    rho = nu / (1 + jnp.max(jnp.abs(knots.x)))
+
+    def merits(cost: Array, missed: Array) -> Array:
+        of_lagrangian = cost + jnp.sum(change.multipliers * missed) + rho / 2 * jnp.sum(missed**2)
+        return jnp.stack([cost + nu * jnp.sum(jnp.abs(missed)), of_lagrangian])
+
+    now = merits(knots.cost, knots.missed)
+    priced = jnp.sum(change.multipliers * knots.missed) + rho * jnp.sum(knots.missed**2)
+    slopes = linear - jnp.stack([nu * jnp.sum(jnp.abs(knots.missed)), priced])
+
+    def judged(length: Array) -> tuple[Array, Array, Array, Array]:
+        cost, missed = _judge(problem, knots.x + length * change.dx, knots.u + length * change.du)
+        fell = merits(cost, missed) <= now + ENOUGH * length * slopes
+        # At the solution, what is left to gain is below the rounding of the cost.
+        return length, cost, missed, done | fell[0] | (fell[1] & (length == 1))
+
+    def too_long(trial: tuple[Array, Array, Array, Array]) -> Array:
+        return ~trial[3] & (trial[0] > SHORTEST)
+
+    twice = jnp.asarray(2.0, knots.u.dtype), knots.cost, knots.missed, jnp.asarray(False)
+    length, cost, missed, better = jax.lax.while_loop(too_long, lambda trial: judged(trial[0] / 2), twice)
+    new = knots._replace(x=knots.x + length * change.dx, u=knots.u + length * change.du, cost=cost, missed=missed)
+    kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), new, knots)
+    close = better & (length == 1) & (jnp.abs(linear) <= CLOSE * jnp.abs(knots.cost))
+    # What fails with all curvature is tried without.
+    return kept._replace(
+        K=change.K, multipliers=change.multipliers, promised=-linear / jnp.abs(knots.cost), close=close,
+        better=better | knots.close, iterations=knots.iterations + 1, done=done,
+    )  # fmt: skip
+
+
+def _judge(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
+    """Cost, and defects [N, n]."""
+    missed = jax.vmap(problem.step)(x[:-1], u) - x[1:]
+    return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1]), missed
+
+
+def _expand(problem: Problem, knots: _Knots, exact: bool) -> Horizon:
+    """The quadratic program at the knots."""
+    n = knots.x.shape[1]
+    both = jnp.concatenate([knots.x[:-1], knots.u], axis=1)
+
+    def step(xu: Array) -> Array:
+        return problem.step(xu[:n], xu[n:])
+
+    def cost(xu: Array) -> Array:
+        return problem.cost(xu[:n], xu[n:])
+
+    gradients, slopes = jax.vmap(jax.grad(cost))(both), jax.vmap(jax.jacfwd(step))(both)
+    of_costs, end_gradient = jax.vmap(jax.hessian(cost))(both), jax.grad(problem.final_cost)(knots.x[-1])
+    of_end = jax.hessian(problem.final_cost)(knots.x[-1])
+    curvatures, end_curvature = _not_negative(of_costs, of_end)
+    if exact:
+
+        def of_lagrangian() -> tuple[Array, Array]:
+            prices = _adjoint(slopes[:, :, :n], gradients[:, :n], end_gradient)
+            bent = jax.vmap(lambda xu, price: jax.hessian(lambda each: price @ step(each))(xu))(both, prices)
+            return of_costs + bent, of_end
+
+        curvatures, end_curvature = jax.lax.cond(knots.close, of_lagrangian, lambda: (curvatures, end_curvature))
+    low, high = (jnp.broadcast_to(jnp.asarray(each, knots.u.dtype), knots.u.shape) - knots.u for each in problem[3:])
+    return Horizon(slopes, knots.missed, gradients, curvatures, end_gradient, end_curvature, low, high)
+
+
+def _adjoint(slopes: Array, gradients: Array, end: Array) -> Array:
+    """Multipliers [N, n] by the slopes of the steps and of the costs with the states."""
+
+    def back(after: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        slope, gradient = now
+        return gradient + slope.T @ after, after
+
+    return jax.lax.scan(back, end, (slopes, gradients), reverse=True)[1]
+
+
+def _not_negative(curvatures: Array, end: Array) -> tuple[Array, Array]:
+    """Hessians without their negative eigenvalues."""
+    n = len(end)
+    every = jnp.concatenate([curvatures, jnp.zeros_like(curvatures[:1]).at[0, :n, :n].set(end)])
+    sizes, axes = jnp.linalg.eigh(every)
+    kept = jnp.einsum("kij,kj,klj->kil", axes, jnp.maximum(sizes, 0.0), axes)
+    return kept[:-1], kept[-1, :n, :n]

@@ -1,0 +1,167 @@
+"""Animated GIFs of closed loops: the machine as it moves, and its control between the limits beside it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Polygon, Rectangle
+
+from dln_jax.figures import style
+from dln_jax.figures.animations import DPI, write_gif
+from dln_jax.types import InputError, require_positive
+
+Drawing = Callable[[Axes, Float[np.ndarray, "T d"], int], Callable[[int], None]]
+"""(axis, q of all samples, how many of them the tip leaves a trace of) -> what draws a sample."""
+BODY, POLE, TIP, GROUND = "#3b4252", "#2e6fa7", style.VERMILLION, "0.72"
+TRACE = 0.8
+"""s, for which the tip leaves a trace."""
+VIEW = np.deg2rad([35.0, 22.0])
+"""Azimuth and elevation of what is in space."""
+
+
+def cart_pole_drawing(length: float) -> Drawing:
+    """Of q = (cart, pole from upright), m and rad; `length` of the pole in m."""
+
+    def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
+        wide, high = 0.55 * length, 0.28 * length
+        tip = np.stack([q[:, 0] + length * np.sin(q[:, 1]), length * np.cos(q[:, 1])], axis=1)
+        low, most = q[:, 0].min() - 1.25 * length, q[:, 0].max() + 1.25 * length
+        axis.plot([low, most], [-high / 2 - 0.07 * length] * 2, color=GROUND, linewidth=2.5, zorder=0)
+        cart = Rectangle((0, 0), wide, high, facecolor=BODY, edgecolor="none", zorder=2)
+        wheels = [Circle((0, 0), 0.07 * length, facecolor="0.45", zorder=3) for _ in range(2)]
+        for patch in (cart, *wheels):
+            axis.add_patch(patch)
+        moving = _rod(axis, tip, trail)
+        axis.set(xlim=(low, most), ylim=(-1.25 * length, 1.25 * length), aspect="equal")
+        axis.set_axis_off()
+
+        def show(index: int) -> None:
+            x = q[index, 0]
+            cart.set_xy((x - wide / 2, -high / 2))
+            for wheel, side in zip(wheels, (-1, 1), strict=True):
+                wheel.set_center((x + side * 0.3 * wide, -high / 2))
+            moving(index, np.array([x, 0.0]))
+
+        return show
+
+    return prepare
+
+
+def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
+    """Of q = (arm, pole from upright), rad, seen at an angle from above; lengths in m."""
+
+    def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
+        out = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 0 * q[:, 0]], axis=1)
+        across = np.stack([-np.sin(q[:, 0]), np.cos(q[:, 0]), 0 * q[:, 0]], axis=1)
+        hinge = arm * out
+        tip = hinge + pole * (np.sin(q[:, 1:]) * across + np.cos(q[:, 1:]) * np.array([0.0, 0.0, 1.0]))
+        turn = np.linspace(0, 2 * np.pi, 120)[:, None]
+        ring = np.concatenate([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        floor, reach = np.array([0.0, 0.0, -1.1 * pole]), float(np.hypot(arm, pole))
+        disc = _seen(reach * ring + floor)
+        axis.add_patch(Polygon(disc, facecolor="0.95", edgecolor="none", zorder=0))
+        axis.plot(*_seen(arm * ring).T, color="0.85", linewidth=1.0, zorder=1)
+        post = _seen(np.stack([floor, np.zeros(3)]))
+        axis.plot(*post.T, color=GROUND, linewidth=9, solid_capstyle="butt", zorder=1)
+        (shadow,) = axis.plot([], [], color="0.82", linewidth=4, solid_capstyle="round", zorder=0.5)
+        (beam,) = axis.plot([], [], color=BODY, linewidth=7, solid_capstyle="round", zorder=3)
+        axis.plot(*_seen(np.zeros((1, 3))).T, "o", color=BODY, markersize=13, zorder=3)
+        flat, hinges = _seen(tip), _seen(hinge)
+        moving = _rod(axis, flat, trail)
+        top = float(flat[:, 1].max()) + 0.12 * reach
+        axis.set(xlim=(-1.1 * reach, 1.1 * reach), ylim=(disc[:, 1].min() - 0.02 * reach, top), aspect="equal")
+        axis.set_axis_off()
+
+        def show(index: int) -> None:
+            beam.set_data(*np.stack([np.zeros(2), hinges[index]]).T)
+            fallen = np.stack([np.zeros(3), hinge[index], tip[index]]) * np.array([1.0, 1.0, 0.0]) + floor
+            shadow.set_data(*_seen(fallen).T)
+            moving(index, hinges[index])
+
+        return show
+
+    return prepare
+
+
+def write_closed_loop_gif(
+    path: Path,
+    drawing: Drawing,
+    t: Float[np.ndarray, " times"],
+    q: Float[np.ndarray, "times d"],
+    u: Float[np.ndarray, " times"],
+    *,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+    unit: str = "N",
+    title: str = "",
+    frames_per_second: float = 25.0,
+) -> None:
+    """Writes a run in real time, as the machine moves and as its control goes.
+
+    Args:
+        path: of the GIF.
+        drawing: of the machine, such as `cart_pole_drawing(length)`.
+        t: times, s, of any spacing below that of the frames.
+        q: coordinates.
+        u: the control, held from each time on.
+        limits: of the control, in red.
+        unit: of the control.
+        title: above the picture.
+        frames_per_second: of the GIF, and of the run.
+
+    Raises:
+        InputError: arrays of other lengths, or a run that is not finite.
+    """
+    require_positive(frames_per_second=frames_per_second)
+    t, q, u = (np.asarray(each) for each in (t, q, u))
+    if not len(t) == len(q) == len(u) > 1 or not np.isfinite(q).all():
+        raise InputError(f"there are {len(t)} times, {len(q)} states, {len(u)} controls; expected as many, all finite")
+    frames = np.searchsorted(t, np.arange(t[0], t[-1], 1 / frames_per_second) - 1e-9)
+    figure, [[machine, trace]] = style.figure(1, 2, width=6.4, height=2.9, dpi=DPI, width_ratios=[1.5, 1.0])
+    machine.grid(False)
+    show_machine = drawing(machine, q, int(np.searchsorted(t, t[0] + TRACE)))
+    trace.plot(t, u, color="0.85", linewidth=1.0, drawstyle="steps-post")
+    (line,) = trace.plot([], [], color=style.BLUE, linewidth=1.4, drawstyle="steps-post")
+    (now,) = trace.plot([], [], "o", color=style.BLUE, markersize=4)
+    for limit in limits:
+        if np.isfinite(limit):
+            trace.axhline(limit, color=style.VERMILLION, linewidth=1.2)
+    trace.set(xlabel="t, s", ylabel=f"control, {unit}", xlim=(t[0], t[-1]))
+    trace.margins(y=0.12)
+
+    def show(number: int) -> None:
+        index = int(frames[number])
+        show_machine(index)
+        line.set_data(t[: index + 1], u[: index + 1])
+        now.set_data([t[index]], [u[index]])
+
+    write_gif(
+        path, figure, show, t[frames], frames=range(len(frames)), frames_per_second=frames_per_second, title=title
+    )
+
+
+def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:
+    """A pole with a bob and its trace; what draws it at a sample, from a foot."""
+    (trace,) = axis.plot([], [], color=TIP, linewidth=1.2, alpha=0.45, zorder=1.5)
+    (pole,) = axis.plot([], [], color=POLE, linewidth=5, solid_capstyle="round", zorder=4)
+    (bob,) = axis.plot([], [], "o", color=TIP, markersize=9, zorder=5)
+    (pin,) = axis.plot([], [], "o", color="white", markersize=3.5, zorder=6)
+
+    def show(index: int, foot: np.ndarray) -> None:
+        trace.set_data(*tip[max(0, index - trail) : index + 1].T)
+        pole.set_data(*np.stack([foot, tip[index]]).T)
+        bob.set_data(*tip[index : index + 1].T)
+        pin.set_data(*foot[:, None])
+
+    return show
+
+
+def _seen(points: Any) -> np.ndarray:
+    """Points of space [..., 3] as a distant eye sees them [..., 2]."""
+    azimuth, elevation = VIEW
+    x, y, z = np.moveaxis(np.asarray(points), -1, 0)
+    right = x * np.cos(azimuth) + y * np.sin(azimuth)
+    back = -x * np.sin(azimuth) + y * np.cos(azimuth)
+    return np.stack([right, z * np.cos(elevation) + back * np.sin(elevation)], axis=-1)

@@ -1,0 +1,183 @@
+"""Figures of closed loops: traces with limits, the phase plane with what a regulator catches, and where they work."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter
+
+from dln_jax.control.closed_loop import Run
+from dln_jax.figures import style
+from dln_jax.types import InputError, JointKind
+
+LIMIT = style.VERMILLION
+MOST_SHOWN = 30
+"""Runs whose traces are drawn."""
+
+
+def closed_loop_traces(
+    runs: Run,
+    joints: tuple[JointKind, ...],
+    *,
+    names: tuple[str, ...] | None = None,
+    goal: Any = None,
+    limits: tuple[Any, Any] = (-np.inf, np.inf),
+    unit: str = "N or N m",
+    energy: Float[np.ndarray, "K T"] | None = None,
+    goal_energy: float | None = None,
+) -> Figure:
+    """Coordinates, controls between their limits, and energy of some runs over time; the first run is in colour.
+
+    Args:
+        runs: K of them, along a leading axis, such as `vmap` of `simulate` gives.
+        joints: kinds; angles are shown as they are off the goal, the short way round.
+        names: of the coordinates.
+        goal: state [2 d], dashed; none by default.
+        limits: of the controls, [m] or one for all, in red.
+        unit: of the controls.
+        energy: along the runs, J.
+        goal_energy: J, dashed.
+
+    Raises:
+        InputError: runs without the leading axis, or names that are not as many as coordinates.
+    """
+    x, u, d = np.asarray(runs.x), np.asarray(runs.u), len(joints)
+    if x.ndim != 3 or x.shape[2] != 2 * d or (names is not None and len(names) != d):
+        raise InputError(f"x has shape {x.shape} for {d} joints; expected [K, T, 2 d], and a name for each")
+    t = np.asarray(runs.t).reshape(-1, x.shape[1])[0]
+    goal = np.zeros(2 * d) if goal is None else np.asarray(goal)
+    m = u.shape[2]
+    rows = d + m + (energy is not None)
+    figure, axes = style.figure(rows, 1, height=1.25 * rows + 0.6, sharex=True)
+    for joint, (axis, kind) in enumerate(zip(axes[:d, 0], joints, strict=True)):
+        values = x[:MOST_SHOWN, :, joint]
+        if kind == "revolute":
+            values = _short_way(values - goal[joint])
+            _angles(axis)
+        _curves(axis, t, values, turning=kind == "revolute")
+        axis.axhline(0.0 if kind == "revolute" else goal[joint], color="0.3", linestyle="--", linewidth=0.9)
+        name = names[joint] if names else f"q{joint + 1}"
+        axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
+    for control in range(m):
+        axis = axes[d + control, 0]
+        _curves(axis, t[:-1], u[:MOST_SHOWN, :, control], steps=True)
+        for limit in limits:
+            level = float(np.broadcast_to(limit, m)[control])
+            if np.isfinite(level):
+                axis.axhline(level, color=LIMIT, linewidth=1.2)
+        axis.set_ylabel(f"control, {unit}" if m == 1 else f"u{control + 1}, {unit}")
+        axis.margins(y=0.15)
+    if energy is not None:
+        factor, joules = style.prefixed(float(np.nanmax(np.abs(energy))), "J")
+        _curves(axes[-1, 0], t, np.asarray(energy)[:MOST_SHOWN] / factor)
+        if goal_energy is not None:
+            axes[-1, 0].axhline(goal_energy / factor, color="0.3", linestyle="--", linewidth=0.9)
+        axes[-1, 0].set_ylabel(f"energy, {joules}")
+    axes[-1, 0].set(xlabel="t, s", xlim=(t[0], t[-1]))
+    figure.align_ylabels()
+    return figure
+
+
+def phase_portrait(
+    angle: Float[np.ndarray, "K T"],
+    rate: Float[np.ndarray, "K T"],
+    *,
+    energy: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    goal_energy: float | None = None,
+    caught: tuple[np.ndarray, float] | None = None,
+) -> Figure:
+    """Closed loops in the plane of an angle off upright and its rate, over the energy, with what a regulator catches.
+
+    Args:
+        angle: of the runs, rad; drawn from -pi to pi.
+        rate: rad/s.
+        energy: angles [a], rates [b] and the energy [b, a] there, whose levels are drawn.
+        goal_energy: whose level, on which the pole comes up by itself, is dashed.
+        caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
+    """
+    figure, [[axis]] = style.figure(height=4.2)
+    angle, rate = _short_way(np.asarray(angle)), np.asarray(rate)
+    if energy is not None:
+        axis.contourf(*energy, levels=18, cmap="Greys", alpha=0.35, zorder=0)
+        if goal_energy is not None:
+            axis.contour(*energy, levels=[goal_energy], colors="0.25", linestyles="--", linewidths=1.2)
+    for number, (q, qd) in reversed(list(enumerate(zip(angle[:MOST_SHOWN], rate[:MOST_SHOWN], strict=True)))):
+        broken = np.concatenate([[False], np.abs(np.diff(q)) > np.pi])
+        strong = number == 0
+        colour, width = (style.BLUE, 1.8) if strong else (style.SKY, 0.7)
+        axis.plot(np.where(broken, np.nan, q), qd, color=colour, linewidth=width, alpha=1.0 if strong else 0.6)
+        axis.plot(q[0], qd[0], "o", color=colour, markersize=6 if strong else 3)
+    if caught is not None:
+        axis.fill(*_ellipse(*caught), facecolor=style.GREEN, edgecolor=style.GREEN, alpha=0.45, zorder=4)
+        axis.annotate(
+            "the regulator\ntakes over", (0, 0), (0.5, 0.93), xycoords="data", textcoords="axes fraction",
+            ha="center", va="top", fontsize=style.SMALL, color="#00563f",
+            arrowprops={"arrowstyle": "-", "color": style.GREEN, "linewidth": 0.8},
+        )  # fmt: skip
+    _angles(axis, axis.xaxis)
+    room = 1.12 * float(np.nanmax(np.abs(rate)))
+    axis.set(xlim=(-np.pi, np.pi), ylim=(-room, room), xlabel="angle from upright, rad", ylabel="rate, rad/s")
+    axis.grid(False)
+    return figure
+
+
+def success_over_starts(
+    starts: Float[np.ndarray, "K 2"],
+    seconds: Float[np.ndarray, " K"],
+    *,
+    labels: tuple[str, str] = ("angle from upright, rad", "rate, rad/s"),
+) -> Figure:
+    """Starts in the plane of two of their coordinates, coloured by the time to the goal; a cross failed.
+
+    `seconds` are infinite, or no number, where the goal was not reached.
+    """
+    starts, seconds = np.asarray(starts), np.asarray(seconds)
+    good = np.isfinite(seconds)
+    figure, [[axis]] = style.figure(height=4.0)
+    worst = float(seconds[good].max()) if good.any() else 1.0
+    scale = Normalize(0.0, worst)
+    axis.scatter(*starts[good].T, c=seconds[good], norm=scale, cmap="viridis_r", s=22, linewidths=0)
+    axis.scatter(*starts[~good].T, marker="x", color=style.VERMILLION, s=40, linewidths=1.6, zorder=3)
+    bar = figure.colorbar(ScalarMappable(scale, "viridis_r"), ax=axis, pad=0.02)
+    bar.set_label("up after, s", fontsize=style.TEXT)
+    bar.ax.tick_params(labelsize=style.SMALL)
+    if labels[0].startswith("angle"):
+        _angles(axis, axis.xaxis)
+    axis.set(xlabel=labels[0], ylabel=labels[1])
+    failed = f", {(~good).sum()} failed (crosses)" if not good.all() else ""
+    style.title(axis, f"{good.sum()} of {len(good)} starts are up{failed}", loc="left")
+    return figure
+
+
+def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False, steps: bool = False) -> None:
+    """The first in front; gaps where an angle goes round."""
+    for number, each in reversed(list(enumerate(values))):
+        broken = np.concatenate([[False], np.abs(np.diff(each)) > np.pi]) & turning
+        colour, width = (style.BLUE, 1.6) if number == 0 else (style.SKY, 0.6)
+        drawn = np.where(broken, np.nan, each)
+        axis.plot(t, drawn, color=colour, linewidth=width, drawstyle="steps-post" if steps else "default")
+
+
+def _short_way(angle: np.ndarray) -> np.ndarray:
+    return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def _angles(axis: Axes, side: Any = None) -> None:
+    """Ticks at halves of pi, the whole circle in view."""
+    side = axis.yaxis if side is None else side
+    side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
+    names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}
+    side.set_major_formatter(FuncFormatter(lambda value, _: names[round(2 * value / np.pi)]))
+    if side is axis.yaxis:
+        axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
+
+
+def _ellipse(S: np.ndarray, level: float) -> np.ndarray:
+    """The curve xᵀ S x = level [2, 100]."""
+    turn = np.linspace(0, 2 * np.pi, 100)
+    sizes, axes = np.linalg.eigh(np.asarray(S))
+    return axes @ (np.sqrt(level / sizes)[:, None] * np.stack([np.cos(turn), np.sin(turn)]))

@@ -1,0 +1,96 @@
+"""
+A swing-up in a minute
+======================
+
+A motor turns an arm, and a free pole hangs at its end. From the energy of the machine alone follow a law that pumps the
+pole up, a regulator that holds it there, and the set of states from which it may take over.
+"""
+
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import dln_jax
+from dln_jax import control
+from dln_jax.figures import phase_portrait, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.scenes import rotary_pendulum
+
+jax.config.update("jax_enable_x64", True)
+
+STARTS, FRAMES_PER_SECOND = 30, 25.0
+LIMIT = 0.05  # N m
+
+# %%
+# The machine
+# -----------
+# Coordinates are the arm's angle and the pole's, from upright; only the arm is driven.
+
+scene = rotary_pendulum(friction=1e-5)
+plant, B, joints = dln_jax.dynamics(scene.energies), np.array(scene.needs.actuation), scene.needs.joints
+field, goal = control.field_of(plant, B), jnp.zeros(4)
+
+# %%
+# Holding it up
+# -------------
+# A linear-quadratic regulator, and by simulation with the motor's limit the largest ellipsoid that it brings home.
+
+at = control.linearise(jax.jit(field), goal, control.holding_controls(plant, goal[:2], B))
+regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
+near = control.regulated(regulator, goal, at.u, joints)
+levels = 10.0 ** np.arange(-2, 1.01, 0.1)
+region = control.region_of_attraction(
+    field, near, regulator, goal, joints, least=-LIMIT, most=LIMIT, rate=500.0, levels=levels, starts=32
+)
+print(f"the regulator holds what is below {region.level:.3g} of its value")
+
+# %%
+# Swinging it up
+# --------------
+# The energy of the pole is driven to that of the upright posture; the regulator takes over where its region begins.
+
+swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
+law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, joints), region.level)
+laboratory = control.Laboratory(-LIMIT, LIMIT, delay=1)
+starts = np.zeros((STARTS, 4))
+starts[:, 1] = np.pi + 0.2 * np.random.default_rng(0).normal(size=STARTS)
+runs = jax.jit(jax.vmap(lambda x: control.simulate(
+    field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, laboratory=laboratory
+)))(starts)  # fmt: skip
+off = np.abs(jax.vmap(lambda x: control.error(x, goal, joints))(runs.x[:, -1])[:, 1])
+print(f"{np.sum(off < 0.05)} of {STARTS} starts are up after 4 s; largest torque {np.abs(runs.u).max():.3f} N m")
+assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
+
+# %%
+# The film and the phase plane
+# ----------------------------
+# Grey levels are the pole's energy with the arm at rest; on the dashed one it comes up by itself.
+
+folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
+write_closed_loop_gif(
+    folder / "rotary-pendulum.gif", rotary_pendulum_drawing(0.085, 0.129), t, np.asarray(runs.x[0, :-1, :2]), torque[0],
+    limits=(-LIMIT, LIMIT), unit="N m", frames_per_second=FRAMES_PER_SECOND,
+)  # fmt: skip
+angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)
+resting = jax.vmap(lambda angle, rate: plant.energy(jnp.array([0.0, angle]), jnp.array([0.0, rate])))
+each = [grid.ravel() for grid in np.meshgrid(angles, rates)]
+levels = np.asarray(jax.jit(resting)(*each)).reshape(len(rates), len(angles))
+phase_portrait(
+    runs.x[:, :, 1], runs.x[:, :, 3], energy=(angles, rates, levels),
+    goal_energy=float(plant.energy(goal[:2], goal[2:])), caught=(regulator.S[1::2, 1::2], region.level),
+).savefig(folder / "phase-portrait.png")  # fmt: skip
+print(f"a film and the phase plane are in {folder}")
+
+# %%
+# Angles and torques over time, of all starts.
+
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4), sharex=True, layout="constrained")
+above.plot(t, runs.x[:, :-1, 1].T / (2 * np.pi), color="tab:blue", linewidth=0.6)
+above.set(ylabel="pole, turns from upright")
+below.plot(t, torque.T, color="tab:blue", linewidth=0.4)
+for limit in (-LIMIT, LIMIT):
+    below.axhline(limit, color="tab:red")
+below.set(xlabel="t, s", ylabel="torque, N m")

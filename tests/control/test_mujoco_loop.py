@@ -1,0 +1,69 @@
+"""MuJoCo, which shares no equation with ours, gives the same closed loop, with the same laboratory."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import Laboratory, field_of, simulate, stateless
+from dln_jax.control.mujoco_loop import simulate_in_mujoco
+from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robots import Robot
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import inertial_parameters, make_tree, tree_system
+from dln_jax.types import InputError
+
+mujoco = pytest.importorskip("mujoco")
+B = np.array([[1.0], [0.0]])
+START = np.array([0.1, 0.5, 0.0, -0.3])
+FREE = np.full((2, 2), [-np.inf, np.inf])
+
+
+@functools.cache
+def cart_pole():
+    bodies = [inertial_parameters(1.0, np.zeros(3), np.eye(3)), inertial_parameters(0.1, [0, 0, 0.5], 1e-3 * np.eye(3))]
+    still = np.tile(np.eye(3), (2, 1, 1))
+    tree = make_tree([-1, 0], ["prismatic", "revolute"], still, np.zeros((2, 3)), [[1, 0, 0], [0, 1, 0]], bodies)
+    return Robot(tree, np.zeros(2), np.zeros(2), FREE, FREE)
+
+
+def model():
+    return mujoco.MjModel.from_xml_string(mjcf(cart_pole(), time_step=0.002).replace("implicitfast", "RK4"))
+
+
+LAW = stateless(lambda y: jnp.array([8.0 * y[1] + 2.0 * y[3] + y[0]]))
+LAB = Laboratory(-3.0, 2.0, encoder_step=1e-3, delay=2)
+
+
+def test_both_plants_give_the_same_run():
+    found = simulate_in_mujoco(model(), LAW, START, seconds=1.0, rate=100.0, actuation=B, laboratory=LAB)
+    field = field_of(dynamics(tree_system(cart_pole().tree)), B)
+    expected = jax.jit(lambda: simulate(
+        field, LAW, START, seconds=1.0, rate=100.0, controls=1, laboratory=LAB, substeps=5
+    ))()  # fmt: skip
+    for ours, theirs in zip(expected, found, strict=True):
+        np.testing.assert_allclose(theirs, ours, atol=1e-7)
+    u = np.asarray(found.u)
+    assert (u[:2] == 0).all() and u[2] == 2.0 and u.min() >= -3.0 and u.max() <= 2.0
+    np.testing.assert_allclose(found.y[:, :2], np.round(np.asarray(found.x[:-1, :2]), 3), atol=1e-12)
+
+
+def test_what_is_no_number_stays_none():
+    bad = stateless(lambda y: jnp.where(y[:1] > 0.0999, jnp.nan, 1.0))
+    run = simulate_in_mujoco(model(), bad, START, seconds=0.1, rate=100.0, actuation=B)
+    assert np.isnan(run.x[1:]).all() and np.isnan(run.u[0]).all() and np.isfinite(run.x[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "start", "rate", "message"),
+    [
+        (lambda: "<mujoco><worldbody><body/></mujoco>", START, 100.0, "MuJoCo refuses the model"),
+        (model, START[:3], 100.0, r"x has shape \(3,\) for 2 degrees"),
+        (model, START, 300.0, "a sample has 1.667 steps of 0.002 s"),
+    ],
+)
+def test_mistakes_are_one_line(given, start, rate, message):
+    with pytest.raises(InputError, match=message):
+        simulate_in_mujoco(given(), LAW, start, seconds=0.1, rate=rate, actuation=B)
