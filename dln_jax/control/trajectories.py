@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from dln_jax.control.finite import where_finite
 from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -129,7 +130,7 @@ def receding(problem: Problem, *, iterations: int = 1) -> Callable[[Array, Plan]
         moved = jnp.concatenate([now.u[1:], now.u[-1:]])
         gains = jnp.concatenate([now.K[1:], now.K[-1:]])
         last = problem.step(now.x[-1], now.u[-1])
-        return now.u[0], now._replace(u=moved, K=gains, x=jnp.concatenate([now.x[1:], last[None]]))
+        return where_finite(now.u[0], x), now._replace(u=moved, K=gains, x=jnp.concatenate([now.x[1:], last[None]]))
 
     return act
 
