@@ -1,4 +1,4 @@
-"""Measurements that come late: how late is seen when the system first moves, and a model predicts what has come since."""
+"""Measurements that come late: how late is seen when the system first moves; a model predicts what has come since."""
 
 from collections.abc import Callable
 from typing import NamedTuple

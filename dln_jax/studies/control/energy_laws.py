@@ -120,10 +120,21 @@ def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
     return lambda numbers: simulate(field, controller(numbers), np.zeros(4), laboratory=lab, **settings)
 
 
+def runs_of_drawn_laws(motor: Motor, draws: int) -> list[Criteria]:
+    """Of laws drawn at random."""
+    runs = jax.jit(jax.vmap(runs_by_energy(motor)))(drawn_laws(draws))
+    return [criteria(motor, jax.tree.map(lambda each, index=index: each[index], runs)) for index in range(draws)]
+
+
+def best_law(motor: Motor, draws: int = DRAWS) -> Law:
+    """The one with the best score."""
+    place = int(np.argmax([score(each) for each in runs_of_drawn_laws(motor, draws)]))
+    return jax.tree.map(lambda each: each[place], drawn_laws(draws))
+
+
 def board(motor: Motor, draws: int = DRAWS) -> Findings:
     """The best score of laws drawn at random, and how many succeed."""
-    runs = jax.jit(jax.vmap(runs_by_energy(motor)))(drawn_laws(draws))
-    found = [criteria(motor, jax.tree.map(lambda each, index=index: each[index], runs)) for index in range(draws)]
+    found = runs_of_drawn_laws(motor, draws)
     scores = np.array([score(each) for each in found])
     best = found[int(np.argmax(scores))]
     name = plant(motor)[0].name

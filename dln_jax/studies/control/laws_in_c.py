@@ -40,7 +40,7 @@ from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Findings
 from dln_jax.studies.control.receding import HORIZONS, cart_pole_problem
 from dln_jax.studies.report import Row, expect
-from dln_jax.studies.robots.arm import D, DAMPING, STIFFNESS, arm
+from dln_jax.studies.robots.arm import DAMPING, STIFFNESS, D, arm
 from dln_jax.studies.speed.calls_in_c import Times, compiled, evicting, programs, timed
 from dln_jax.zoo.descriptions import build, describe
 
@@ -164,7 +164,12 @@ def rows_of(name: str, times: Times) -> list[Row]:
 
 def _rotary() -> tuple[Callable, Callable, Callable]:
     scene = rotary_pendulum(friction=1e-5)
-    plant, B, joints, goal = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints, np.zeros(4)
+    plant, B, joints, goal = (
+        dynamics(scene.energies),
+        np.asarray(scene.needs.actuation),
+        scene.needs.joints,
+        np.zeros(4),
+    )
     at = linearise(field_of(plant, B), goal, holding_controls(plant, goal[:2], B))
     found = lqr(at.A, at.B, np.diag([1.0, 1.0, 0.01, 0.01]), [[50.0]])
     near, cost = regulated(found, goal, at.u, joints), value(found, goal, joints)

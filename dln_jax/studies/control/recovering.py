@@ -32,8 +32,17 @@ from dln_jax.studies.control.planned import EVERY, Weights, follower
 
 CUTOFF = 1000.0
 """Hz, of the differences: above the samples' own, so that nearly all of each is taken."""
-STATE_COST, CONTROL_COST = np.diag([10.0, 10.0, 1.0, 1.0]), np.eye(1)
+STATE_COST = np.diag([10.0, 10.0, 1.0, 1.0])
 """Of the regulator."""
+
+
+class Recovery(NamedTuple):
+    """Numbers of what follows the plan."""
+
+    law: Law
+    """By energy, and where the regulator takes over."""
+    control_cost: float
+    """Of the regulator."""
 
 
 def by_angles(motor: Motor, controller: Controller) -> Controller:
@@ -46,14 +55,14 @@ def by_angles(motor: Motor, controller: Controller) -> Controller:
     return Controller(seeing.start, lambda memory, t, y: seeing.act(memory, t, y[:2]))
 
 
-def recovering(motor: Motor, weights: Weights, plan: Plan, law: Law) -> Controller:
+def recovering(motor: Motor, weights: Weights, plan: Plan, recovery: Recovery) -> Controller:
     """The plan; from its end on a regulator where its value is below the law's level, and else the law by energy."""
     scene, B = plant(motor)
     system, joints = dynamics(scene.closed_form), scene.needs.joints
     at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
-    regulator = sampled_lqr(at.A, at.B, STATE_COST, CONTROL_COST, 1 / RATE)
+    regulator = sampled_lqr(at.A, at.B, STATE_COST, recovery.control_cost * np.eye(1), 1 / RATE)
     near, cost, far = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints), pumping(motor)
-    planned, last = follower(motor, weights, plan), EVERY * len(plan.u)
+    planned, last, law = follower(motor, weights, plan), EVERY * len(plan.u), recovery.law
 
     def act(memory: tuple[Any, Array, Array], t: Array, y: Array) -> tuple[tuple[Any, Array, Array], Array]:
         inner, number, tau = memory
