@@ -38,8 +38,8 @@ PUBLISHED = {
 """Per cent by criterion and the mean, as the board prints them (version 2; the mean is rounded there)."""
 HORIZON, DRAWS = 1.6, 300
 """s of the plan, and laws by energy of which the best by the nominal score is taken."""
-# Gains, the regulator's level, the share of a new torque and the largest one: the best of 200 (shoulder) and 500 drawn, by
-# how many of 48 states, drawn at random, are up four seconds later, undisturbed.
+# Gains, the regulator's level, the share of a new torque and the largest one: the best of some hundreds drawn, by how
+# many of 48 states, drawn at random, are up four seconds later, undisturbed.
 RECOVERIES: dict[Motor, Recovery] = {
     "elbow": Recovery(Law(jnp.array([1.09, 21.0, 40.0]), jnp.array(3400.0), jnp.array(1.0), jnp.array(6.0)), 10.0),
     "shoulder": Recovery(Law(jnp.array([15.9, 4.13, 5.48]), jnp.array(136.0), jnp.array(1.0), jnp.array(6.0)), 10.0),
