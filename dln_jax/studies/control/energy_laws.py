@@ -10,7 +10,7 @@ known, and the score is what is asked for.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,16 +77,17 @@ def drawn_laws(count: int, seed: int = 0) -> Law:
     )
 
 
-def pumping(motor: Motor) -> Callable[[Array, Array], Array]:
-    """(x, the gains k1, k2, k3) -> the torque [1] of the swing-up by energy."""
+def pumping(motor: Motor) -> Callable[..., Array]:
+    """(x, the gains k1, k2, k3, energy beyond the goal's in J) -> the torque [1] of the swing-up by energy."""
     scene, B = plant(motor)
     system, parts = dynamics(scene.closed_form), parts_of(B)
     forces, (active,), (passive,) = partial_linearisation(system, parts), parts.active, parts.passive
     wanted = system.energy(GOAL[:2], np.zeros(2))
 
-    def far(x: Array, gains: Array) -> Array:
+    def far(x: Array, gains: Array, beyond: Any = 0.0) -> Array:
         (k1, k2, k3), q, qd = gains, x[:2], x[2:]
-        a = -k1 * (q[active] - GOAL[active]) - k2 * qd[active] + k3 * qd[passive] * (system.energy(q, qd) - wanted)
+        error = system.energy(q, qd) - wanted - beyond
+        a = -k1 * (q[active] - GOAL[active]) - k2 * qd[active] + k3 * qd[passive] * error
         return jnp.where(jnp.max(jnp.abs(qd)) <= STILL, LIMIT, forces(q, qd, a[None]))
 
     return far

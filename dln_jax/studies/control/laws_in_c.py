@@ -21,12 +21,10 @@ from dln_jax.control import (
     energy_shaping,
     feed_forward,
     field_of,
-    first_plan,
     holding_controls,
     linearise,
     lqr,
     parts_of,
-    receding,
     regulated,
     switched,
     value,
@@ -38,7 +36,7 @@ from dln_jax.mechanics.trees import tree_system
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Findings
-from dln_jax.studies.control.receding import HORIZONS, cart_pole_problem
+from dln_jax.studies.control.receding_calls import STACK, first_state, one_call
 from dln_jax.studies.report import Row, expect
 from dln_jax.studies.robots.arm import DAMPING, STIFFNESS, D, arm
 from dln_jax.studies.speed.calls_in_c import Times, compiled, evicting, programs, timed
@@ -47,6 +45,8 @@ from dln_jax.zoo.descriptions import build, describe
 AGREEMENT = 1e-10
 """Relative to the largest control, of C and JAX at drawn states."""
 STATES = 8
+STEPS = 80
+"""Of a plan."""
 LEAST_EVICTED = 32
 """MiB that are read before a cold call, at least."""
 
@@ -94,17 +94,8 @@ def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
 
 
 def one_iteration() -> Law:
-    """A call of `receding` with one iteration, a cart-pole over its horizon: (x, plan) -> (u, plan)."""
-    problem, steps = cart_pole_problem(), round(HORIZONS[0] * 100)
-    hanging = np.array([0.0, np.pi, 0.0, 0.0])
-    plan = first_plan(problem, hanging, 0.1 * np.sin(np.arange(steps))[:, None])
-    act = receding(problem)
-
-    def step(x: Any, u: Any, about: Any, K: Any) -> Any:
-        control, found = act(x, plan._replace(u=u, x=about, K=K))
-        return {"control": control, "planned": found.u, "states": found.x, "gains": found.K}
-
-    return Law(step, (hanging, *map(np.asarray, (plan.u, plan.x, plan.K))), 0.01)
+    """A call of `receding` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
+    return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
 
 
 LAWS: dict[str, Callable[[], Law]] = {
@@ -121,13 +112,13 @@ LAWS: dict[str, Callable[[], Law]] = {
 def laws(quick: bool) -> Findings:
     """Agreement with JAX, and microseconds of one call."""
     rows: list[Row] = []
-    effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 2000}
+    effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1200}
     mebibytes = max(evicting(), LEAST_EVICTED)
     for name, make in LAWS.items():
         law = make()
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place) / name
-            export_c({name: (law.function, law.examples)}, folder)
+            export_c({name: (law.function, law.examples)}, folder, stack=STACK)
             rows.append(agreement(name, law, load_c(folder)))
             program = programs(folder, compiled(folder, folder), [name])[name]
             # A plan takes a hundred times as long as a law.

@@ -31,6 +31,8 @@ ROOT = Path(__file__).parents[3]
 LIMIT = 170.0
 """Seconds after which the process is given up."""
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
+STACK = 2**20
+"""Bytes that a call may take in C."""
 SECONDS = 3.0
 """Of a loop: the swing-up, and balancing."""
 
@@ -69,7 +71,7 @@ def main(given: Arguments) -> None:
     with tempfile.TemporaryDirectory() as place:
         began = time.perf_counter()
         try:
-            export_c({"act": (act, first)}, Path(place) / "plan")
+            export_c({"act": (act, first)}, Path(place) / "plan", stack=STACK)
             in_c = load_c(Path(place) / "plan").act
             found["c"] = timed(in_c, first, given.loops, time.perf_counter() - began)._asdict()
         except InputError as error:

@@ -43,6 +43,10 @@ class Recovery(NamedTuple):
     """By energy, and where the regulator takes over."""
     control_cost: float
     """Of the regulator."""
+    sweep: Any = 0.0
+    """J, by which the energy that is pumped to goes up and down: a wrong model has the goal's wrong."""
+    period: Any = 2.0
+    """s, of the sweep."""
 
 
 def by_angles(motor: Motor, controller: Controller) -> Controller:
@@ -67,7 +71,8 @@ def recovering(motor: Motor, weights: Weights, plan: Plan, recovery: Recovery) -
     def act(memory: tuple[Any, Array, Array], t: Array, y: Array) -> tuple[tuple[Any, Array, Array], Array]:
         inner, number, tau = memory
         inner, by_plan = planned.act(inner, t, y)
-        by_energy = tau + law.share * (limited(far(y, law.gains), -law.most, law.most) - tau)
+        beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
+        by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
         u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
         u = limited(u, -LIMIT, LIMIT)
         return (inner, number + 1, u), u

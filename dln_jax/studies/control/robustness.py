@@ -41,7 +41,7 @@ HORIZON, DRAWS = 1.6, 300
 # Gains, the regulator's level, the share of a new torque and the largest one: the best of some hundreds drawn, by how
 # many of 48 states, drawn at random, are up four seconds later, undisturbed.
 RECOVERIES: dict[Motor, Recovery] = {
-    "elbow": Recovery(Law(jnp.array([1.09, 21.0, 40.0]), jnp.array(3400.0), jnp.array(1.0), jnp.array(6.0)), 10.0),
+    "elbow": Recovery(Law(jnp.array([3.54, 8.8, 67.3]), jnp.array(181.0), jnp.array(1.0), jnp.array(6.0)), 1.0),
     "shoulder": Recovery(Law(jnp.array([15.9, 4.13, 5.48]), jnp.array(136.0), jnp.array(1.0), jnp.array(6.0)), 10.0),
 }
 
