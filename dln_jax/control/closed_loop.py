@@ -9,7 +9,7 @@ a failure is never hidden.
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ def stateless(law: Callable[[Array], Array]) -> Controller:
 
 
 def with_differences(
-    law: Callable[[Array], Array] | Controller, d: int, *, rate: float, cutoff: float, order: Literal[1, 2] = 1
+    law: Callable[[Array], Array] | Controller, d: int, *, rate: float, cutoff: float, order: int = 1
 ) -> Controller:
     """A law or controller of (q, qd) where q alone is measured: rates by differences and a low-pass of first order.
 

@@ -158,7 +158,7 @@ def _rotary() -> tuple[Callable, Callable, Callable]:
     at = linearise(field_of(plant, B), goal, holding_controls(plant, goal[:2], B))
     found = lqr(at.A, at.B, np.diag([1.0, 1.0, 0.01, 0.01]), [[50.0]])
     near, cost = regulated(found, goal, at.u, joints), value(found, goal, joints)
-    return near, cost, energy_shaping(plant, parts_of(B), goal[:2], EnergyGains(2e7, 20.0, 5.0))
+    return near, cost, energy_shaping(plant, parts_of(B), [0.0, 0.0], EnergyGains(2e7, 20.0, 5.0))
 
 
 def _tracking(follow: Callable, d: int) -> Law:

@@ -22,7 +22,7 @@ from dln_jax.scenes.scene import Scene
 
 RATE, SECONDS, LIMIT, RAIL = 100.0, 6.0, 12.0, 0.5
 """Hz, s, N and m."""
-HORIZONS = (0.8, 1.2)
+HORIZONS = (1.2, 0.8)
 """s."""
 HANGING = np.array([0.0, np.pi, 0.0, 0.0])
 UP = 0.1

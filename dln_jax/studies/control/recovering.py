@@ -4,6 +4,7 @@ Angles alone are believed, and rates are differences of theirs; how late they co
 moves, and its known model predicts what has come since (`control.with_prediction`).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -41,8 +42,6 @@ class Recovery(NamedTuple):
 
     law: Law
     """By energy, and where the regulator takes over."""
-    control_cost: float
-    """Of the regulator."""
     sweep: Any = 0.0
     """J, by which the energy that is pumped to goes up and down: a wrong model has the goal's wrong."""
     period: Any = 2.0
@@ -59,22 +58,34 @@ def by_angles(motor: Motor, controller: Controller) -> Controller:
     return Controller(seeing.start, lambda memory, t, y: seeing.act(memory, t, y[:2]))
 
 
-def recovering(motor: Motor, weights: Weights, plan: Plan, recovery: Recovery) -> Controller:
-    """The plan; from its end on a regulator where its value is below the law's level, and else the law by energy."""
+def recovering(motor: Motor, weights: Weights, plan: Plan, control_cost: float) -> Callable[[Recovery], Controller]:
+    """The plan; from its end on a regulator where its value is below the law's level, and else the law by energy.
+
+    Args:
+        motor: of the board.
+        weights: of the plan.
+        plan: from hanging.
+        control_cost: of the regulator.
+    """
     scene, B = plant(motor)
     system, joints = dynamics(scene.closed_form), scene.needs.joints
     at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
-    regulator = sampled_lqr(at.A, at.B, STATE_COST, recovery.control_cost * np.eye(1), 1 / RATE)
+    regulator = sampled_lqr(at.A, at.B, STATE_COST, control_cost * np.eye(1), 1 / RATE)
     near, cost, far = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints), pumping(motor)
-    planned, last, law = follower(motor, weights, plan), EVERY * len(plan.u), recovery.law
+    planned, last = follower(motor, weights, plan), EVERY * len(plan.u)
 
-    def act(memory: tuple[Any, Array, Array], t: Array, y: Array) -> tuple[tuple[Any, Array, Array], Array]:
-        inner, number, tau = memory
-        inner, by_plan = planned.act(inner, t, y)
-        beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
-        by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
-        u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
-        u = limited(u, -LIMIT, LIMIT)
-        return (inner, number + 1, u), u
+    def controller(recovery: Recovery) -> Controller:
+        law = recovery.law
 
-    return Controller((planned.start, jnp.asarray(0), jnp.zeros(1)), act)
+        def act(memory: tuple[Any, Array, Array], t: Array, y: Array) -> tuple[tuple[Any, Array, Array], Array]:
+            inner, number, tau = memory
+            inner, by_plan = planned.act(inner, t, y)
+            beyond = recovery.sweep * jnp.sin(2 * jnp.pi * (number - last) / (RATE * recovery.period))
+            by_energy = tau + law.share * (limited(far(y, law.gains, beyond), -law.most, law.most) - tau)
+            u = jnp.where(number < last, by_plan, jnp.where(cost(y) <= law.level, near(y), by_energy))
+            u = limited(u, -LIMIT, LIMIT)
+            return (inner, number + 1, u), u
+
+        return Controller((planned.start, jnp.asarray(0), jnp.zeros(1)), act)
+
+    return controller

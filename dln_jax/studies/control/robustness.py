@@ -41,9 +41,11 @@ HORIZON, DRAWS = 1.6, 300
 # Gains, the regulator's level, the share of a new torque and the largest one: the best of some hundreds drawn, by how
 # many of 48 states, drawn at random, are up four seconds later, undisturbed.
 RECOVERIES: dict[Motor, Recovery] = {
-    "elbow": Recovery(Law(jnp.array([3.54, 8.8, 67.3]), jnp.array(181.0), jnp.array(1.0), jnp.array(6.0)), 1.0),
-    "shoulder": Recovery(Law(jnp.array([15.9, 4.13, 5.48]), jnp.array(136.0), jnp.array(1.0), jnp.array(6.0)), 10.0),
+    "elbow": Recovery(Law(jnp.array([3.54, 8.8, 67.3]), jnp.array(181.0), jnp.array(1.0), jnp.array(6.0))),
+    "shoulder": Recovery(Law(jnp.array([15.9, 4.13, 5.48]), jnp.array(136.0), jnp.array(1.0), jnp.array(6.0))),
 }
+CONTROL_COSTS: dict[Motor, float] = {"elbow": 1.0, "shoulder": 10.0}
+"""Of the regulators that they fall back to."""
 
 
 def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
@@ -55,7 +57,7 @@ def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
         "ours-planned": follower(motor, weights, plan),
         "ours-by-energy": controllers_by_energy(motor)(law),
         "ours-planned-by-angles": by_angles(motor, follower(motor, weights, plan)),
-        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, RECOVERIES[motor])),
+        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, CONTROL_COSTS[motor])(RECOVERIES[motor])),
     }
 
 
