@@ -80,7 +80,7 @@ def test_printed_means_are_those_of_printed_shares():
 
 
 def test_the_map_has_a_panel_for_each_plant():
-    row = dict.fromkeys((*CRITERIA, "mean"), 0.5)
+    row: dict[str, float] = dict.fromkeys([*CRITERIA, "mean"], 0.5)
     figure = shares({"acrobot": {"ours": row, "other": row}, "pendubot": {"ours": row}})
     assert len(figure.axes) == 2
 
