@@ -112,7 +112,7 @@ LAWS: dict[str, Callable[[], Law]] = {
 def laws(quick: bool) -> Findings:
     """Agreement with JAX, and microseconds of one call."""
     rows: list[Row] = []
-    effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1200}
+    effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1000}
     mebibytes = max(evicting(), LEAST_EVICTED)
     for name, make in LAWS.items():
         law = make()

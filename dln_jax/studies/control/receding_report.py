@@ -7,7 +7,7 @@ from dln_jax.studies.control.receding import HORIZONS, RATE, swing_ups
 from dln_jax.studies.control.receding_calls import calls_in_a_process
 from dln_jax.studies.report import Row, expect
 
-STARTS, LOOPS = 100, 10
+STARTS, LOOPS = 30, 10
 """Of swing-ups, and of those whose calls are timed."""
 WITHIN = 1e3 / RATE
 """ms that a call may take."""

@@ -38,9 +38,9 @@ PUBLISHED = {
 """Per cent by criterion and the mean, as the board prints them (version 2; the mean is rounded there)."""
 HORIZON, DRAWS = 1.6, 300
 """s of the plan, and laws by energy of which the best by the nominal score is taken."""
-# Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. The best of some
+# Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. The best of
 # hundreds drawn by how many random states come up undisturbed, then of eighty about it by disturbances that are drawn
-# likewise but are not those of the table.
+# likewise, but are not those of the table.
 RECOVERIES: dict[Motor, Recovery] = {
     "elbow": Recovery(Law(jnp.array([2.89, 17.1, 41.5]), jnp.array(313.0), jnp.array(1.0), jnp.array(6.0)), 0.2, 1.5),
     "shoulder": Recovery(Law(jnp.array([29.4, 3.37, 3.22]), jnp.array(84.8), jnp.array(1.0), jnp.array(6.0)), 0.4, 0.5),

@@ -52,7 +52,7 @@ COMPUTED = Gains(np.full(D, 400.0), np.full(D, 40.0))
 AHEAD = Gains(STIFFNESS, DAMPING)
 FEW = 2
 """Motions that the bad network is trained on."""
-STEPS = 60
+STEPS = 30
 """Of Gauss-Newton, for a network."""
 
 Plant = Callable[[Motion], tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]
@@ -70,7 +70,7 @@ class Effort(NamedTuple):
     searched: Search
 
 
-FULL = Effort(3, 15, 4, None, Search(seconds=60.0))
+FULL = Effort(3, 15, 2, 4000, Search(seconds=40.0))
 QUICK = Effort(1, 4, 1, 400, Search(starts=2, iterations=5))
 
 
@@ -229,17 +229,29 @@ def tracking(quick: bool) -> Findings:
     by_law: dict[str, list[Tracked]] = {}
     errors: dict[str, list[float]] = {}
     for seed in range(effort.seeds):
-        random = np.random.default_rng(seed)
-        known = models(robot, seed, effort, random)
-        wanted = [motion(random) for _ in range(effort.unseen)]
-        test = logs(robot, random, 1)
-        for name, (model, _) in known.items():
-            tau = jax.jit(jax.vmap(model.inverse_dynamics))(test.q, test.qd, test.qdd)
-            errors.setdefault(name, []).append(float(np.mean(normalised_error(np.asarray(tau), test.tau))))
-        for name, law in laws(known).items():
-            by_law.setdefault(name, []).extend(track(plant, law, each, effort.samples) for each in wanted)
+        of_models, of_laws = one_seed(robot, plant, seed, effort)
+        for name, nmse in of_models.items():
+            errors.setdefault(name, []).append(nmse)
+        for name, runs in of_laws.items():
+            by_law.setdefault(name, []).extend(runs)
     rows = [Row(f"tracking/model/{name}", "nmse", float(np.median(each))) for name, each in errors.items()]
     return Findings([*rows, *(row for name, each in by_law.items() for row in rows_of(name, each))])
+
+
+def one_seed(
+    robot: Robot, plant: Plant, seed: int, effort: Effort
+) -> tuple[dict[str, float], dict[str, list[Tracked]]]:
+    """nMSE of each model on a motion that it has not seen, and what each law makes of others."""
+    random = np.random.default_rng(seed)
+    known = models(robot, seed, effort, random)
+    wanted = [motion(random) for _ in range(effort.unseen)]
+    test, errors = logs(robot, random, 1), {}
+    for name, (model, _) in known.items():
+        tau = jax.jit(jax.vmap(model.inverse_dynamics))(test.q, test.qd, test.qdd)
+        errors[name] = float(np.mean(normalised_error(np.asarray(tau), test.tau)))
+    return errors, {
+        name: [track(plant, law, each, effort.samples) for each in wanted] for name, law in laws(known).items()
+    }
 
 
 def rows_of(name: str, runs: list[Tracked]) -> list[Row]:
