@@ -13,7 +13,7 @@ from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.control.cases import cases
 
-SUBJECTS = ("swing-up", "starts", "board", "equation")
+SUBJECTS = ("swing-up", "starts", "board", "equation", "tracking", "robustness", "laws", "receding")
 
 
 @dataclass(frozen=True)

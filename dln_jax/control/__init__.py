@@ -2,6 +2,7 @@
 
 from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
 from dln_jax.control.closed_loop import Controller, Laboratory, Run, simulate, stateless, with_differences
+from dln_jax.control.delays import with_prediction
 from dln_jax.control.energy_shaping import (
     EnergyGains,
     Parts,
@@ -10,6 +11,7 @@ from dln_jax.control.energy_shaping import (
     parts_of,
     passive_energy,
 )
+from dln_jax.control.finite import where_finite
 from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.shooting import Shooting, shoot
 from dln_jax.control.state_space import Linearisation, field_of, holding_controls, integrated, linearise
@@ -69,5 +71,7 @@ __all__ = [
     "time_varying_lqr",
     "trusted",
     "value",
+    "where_finite",
     "with_differences",
+    "with_prediction",
 ]

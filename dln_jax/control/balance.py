@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Bool
 
 from dln_jax.control.closed_loop import Controller, Laboratory, simulate
+from dln_jax.control.finite import where_finite
 from dln_jax.control.quadratic import Regulator
 from dln_jax.control.state_space import Field
 from dln_jax.types import JointKind, Scalar, require_positive
@@ -36,7 +37,7 @@ def error(x: Array, goal: Any, joints: tuple[JointKind, ...]) -> Array:
 
 def regulated(regulator: Regulator, goal: Any, controls: Any, joints: tuple[JointKind, ...]) -> Law:
     """u = u0 - K (x - x0)."""
-    return lambda x: jnp.asarray(controls) - regulator.K @ error(x, goal, joints)
+    return lambda x: where_finite(jnp.asarray(controls) - regulator.K @ error(x, goal, joints), x)
 
 
 def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Callable[[Array], Scalar]:
@@ -55,7 +56,7 @@ def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: Any) -
     def law(x: Array) -> Array:
         inside = cost(x) <= level
         # Both are computed: one of them may be no number where it does not apply.
-        return jnp.where(inside, near(x), far(x))
+        return where_finite(jnp.where(inside, near(x), far(x)), x)
 
     return law
 

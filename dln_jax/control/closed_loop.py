@@ -4,7 +4,8 @@ At each sample the controller is given the measured coordinates and answers with
 by whole samples, have noise added, and are held until the next while the plant is integrated by the classical
 Runge-Kutta method. `vmap` over starts and keys gives many runs in one program.
 
-A control that is not finite stays so, and so does everything after it: a failure is never hidden.
+A control that is not finite becomes NaN, one of a measurement that is not finite too, and so does everything after it:
+a failure is never hidden.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.control.finite import where_finite
 from dln_jax.control.state_space import Field
+from dln_jax.control.tracking import limited
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import InputError, require_positive
 
@@ -64,28 +67,37 @@ def stateless(law: Callable[[Array], Array]) -> Controller:
     return Controller((), lambda memory, t, y: (memory, law(y)))
 
 
-def with_differences(law: Callable[[Array], Array], d: int, *, rate: float, cutoff: float) -> Controller:
-    """A law of (q, qd) where q alone is measured: rates by differences and a low-pass of first order.
+def with_differences(
+    law: Callable[[Array], Array] | Controller, d: int, *, rate: float, cutoff: float, order: int = 1
+) -> Controller:
+    """A law or controller of (q, qd) where q alone is measured: rates by differences and a low-pass of first order.
 
     Args:
-        law: (q, qd) in one vector [2 d] -> u.
+        law: (q, qd) in one vector [2 d] -> u, or a controller that is given such.
         d: coordinates.
         rate: of the samples, Hz.
         cutoff: of the low-pass, Hz.
+        order: of the differences; 1 is late by half a sample, 2 is not, and takes more of the encoders' noise.
 
     Raises:
-        InputError: a rate or a cut-off that is not positive.
+        InputError: a rate or a cut-off that is not positive, or another order.
     """
     require_positive(rate=rate, cutoff=cutoff)
+    if order not in (1, 2):
+        raise InputError(f"order is {order}; expected 1 or 2")
     share = -jnp.expm1(-2 * jnp.pi * cutoff / rate)
+    controller = law if isinstance(law, Controller) else stateless(law)
 
-    def act(memory: tuple[Array, Array, Array], t: Array, y: Array) -> tuple[tuple[Array, Array, Array], Array]:
-        before, qd, seen = memory
-        # Of the first sample there is no difference.
-        qd = jnp.where(seen, qd + share * ((y - before) * rate - qd), 0.0)
-        return (y, qd, jnp.ones_like(seen)), law(jnp.concatenate([y, qd]))
+    def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
+        (before, slope, qd, seen), inner = memory
+        newest = y - before
+        # Of the first sample there is no difference, of the second no other.
+        rates = rate * (1.5 * newest - 0.5 * jnp.where(seen > 1, slope, newest) if order == 2 else newest)
+        qd = jnp.where(seen > 0, qd + share * (rates - qd), 0.0)
+        inner, u = controller.act(inner, t, jnp.concatenate([y, qd]))
+        return ((y, newest, qd, jnp.minimum(seen + 1, 2)), inner), u
 
-    return Controller((jnp.zeros(d), jnp.zeros(d), jnp.zeros((), bool)), act)
+    return Controller(((jnp.zeros(d), jnp.zeros(d), jnp.zeros(d), jnp.asarray(0)), controller.start), act)
 
 
 def simulate(
@@ -127,7 +139,7 @@ def simulate(
         of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
         y = measured(lab, x, of_encoder)
         memory, wanted = controller.act(memory, number * dt, y)
-        u, waiting = delivered(lab, waiting, wanted, of_control)
+        u, waiting = delivered(lab, waiting, where_finite(wanted, y), of_control)
         step = runge_kutta(CLASSICAL, lambda t, state: field(state, u))
         x = advance(step, 0.0, x, dt, substeps=substeps)
         return (x, memory, waiting), (x, u, y)
@@ -158,7 +170,7 @@ def measured(laboratory: Laboratory, x: Array, key: Array) -> Array:
 
 def delivered(laboratory: Laboratory, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
     """What drives the plant when a controller wants this, and the controls [delay, m] that are then on their way."""
-    queue = jnp.concatenate([waiting, jnp.clip(wanted, laboratory.least, laboratory.most)[None]])
+    queue = jnp.concatenate([waiting, limited(wanted, laboratory.least, laboratory.most)[None]])
     u = queue[0]
     if _noisy(laboratory):
         u = u + laboratory.control_noise * jax.random.normal(key, u.shape, u.dtype)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from dln_jax.control.finite import where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Scalar, Vector
 
@@ -63,7 +64,7 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
         h = plant.inverse_dynamics(q, qd, jnp.zeros_like(qd))
         coupling = M[np.ix_(active, passive)]
         others = -jnp.linalg.solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
-        return M[np.ix_(active, active)] @ a + coupling @ others + h[active]
+        return where_finite(M[np.ix_(active, active)] @ a + coupling @ others + h[active], q, qd)
 
     return forces
 

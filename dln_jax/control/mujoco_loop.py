@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Laboratory, Run, delivered, measured, noise_of
+from dln_jax.control.finite import where_finite
 from dln_jax.types import InputError, require_positive
 
 INSTALL = "pip install 'dln-jax[robot]'"
@@ -60,7 +61,7 @@ def simulate_in_mujoco(
         of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
         y = measured(laboratory, x, of_encoder)
         memory, wanted = controller.act(memory, number / rate, y)
-        u, waiting = delivered(laboratory, waiting, wanted, of_control)
+        u, waiting = delivered(laboratory, waiting, where_finite(wanted, y), of_control)
         return memory, waiting, u, y
 
     memory, waiting = controller.start, jnp.zeros((laboratory.delay, B.shape[1]))

@@ -6,7 +6,7 @@
 
 with f the inverse dynamics of a model, known or learned, and feedback = P (q* - q) + D (qd* - qd). Computed torque
 trusts the model at the measured state, whatever that is: with a bad model it is worse than feedback alone
-(`trusted`).
+(`trusted`). Of a state that is not finite every torque is NaN.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool
 
+from dln_jax.control.finite import where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import Vector
 
@@ -51,7 +52,7 @@ def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Track
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         rest = jnp.zeros_like(qd)
-        return plant.inverse_dynamics(q, rest, rest) + feedback(gains, q, qd, wanted)
+        return where_finite(plant.inverse_dynamics(q, rest, rest) + feedback(gains, q, qd, wanted), q, qd)
 
     return law
 
@@ -60,7 +61,8 @@ def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
     """The model's torque on the reference, beside feedback; what the state does cannot upset the model."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
-        return plant.inverse_dynamics(wanted.q, wanted.qd, wanted.qdd) + feedback(gains, q, qd, wanted)
+        planned = plant.inverse_dynamics(wanted.q, wanted.qd, wanted.qdd)
+        return where_finite(planned + feedback(gains, q, qd, wanted), q, qd)
 
     return law
 
@@ -72,14 +74,16 @@ def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
     """
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
-        return plant.inverse_dynamics(q, qd, wanted.qdd + feedback(gains, q, qd, wanted))
+        tau = plant.inverse_dynamics(q, qd, wanted.qdd + feedback(gains, q, qd, wanted))
+        return where_finite(tau, q, qd)
 
     return law
 
 
 def limited(tau: Any, least: Any, most: Any) -> Array:
-    """A torque within the motors' limits; one that is not finite stays so, for whoever holds the brake."""
-    return jnp.clip(tau, least, most)
+    """A torque within the motors' limits; one that is not finite is NaN, for whoever holds the brake."""
+    tau = jnp.asarray(tau)
+    return jnp.where(jnp.isfinite(tau), jnp.clip(tau, least, most), jnp.nan)
 
 
 def trusted(

@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
+from dln_jax.control.finite import where_finite
 from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -66,10 +67,10 @@ def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
     return plan._replace(u=u, x=states, cost=cost)
 
 
-def improve(problem: Problem, plan: Plan) -> Plan:
-    """One iteration; the cost never rises."""
+def improve(problem: Problem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
+    """One iteration, the best of some step lengths [L]; the cost never rises."""
     k, K = _backward(problem, plan)
-    lengths = jnp.asarray(STEP_LENGTHS, plan.u.dtype)
+    lengths = jnp.asarray(step_lengths, plan.u.dtype)
     x, u, costs = jax.vmap(lambda length: _follow(problem, plan.x[0], plan._replace(u=plan.u + length * k, K=K)))(
         lengths
     )
@@ -109,7 +110,9 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
     return jax.lax.while_loop(going, iterate, start)[1]
 
 
-def receding(problem: Problem, *, iterations: int = 1) -> Callable[[Array, Plan], tuple[Array, Plan]]:
+def receding(
+    problem: Problem, *, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
+) -> Callable[[Array, Plan], tuple[Array, Plan]]:
     """Model-predictive control: (state, plan) -> (control, plan), the plan moved on by one step and improved.
 
     Start with `first_plan` or `optimise`, whose first control is for its first state.
@@ -117,6 +120,7 @@ def receding(problem: Problem, *, iterations: int = 1) -> Callable[[Array, Plan]
     Args:
         problem: over the horizon.
         iterations: a call, always as many.
+        step_lengths: that an iteration tries [L]; a call from a good plan needs few, and takes less time and memory.
     """
     require_positive(iterations=iterations)
 
@@ -125,11 +129,11 @@ def receding(problem: Problem, *, iterations: int = 1) -> Callable[[Array, Plan]
         states, u, cost = _follow(problem, x, plan)
         now = plan._replace(x=states, u=u, cost=cost)
         for _ in range(iterations):
-            now = improve(problem, now)
+            now = improve(problem, now, step_lengths=step_lengths)
         moved = jnp.concatenate([now.u[1:], now.u[-1:]])
         gains = jnp.concatenate([now.K[1:], now.K[-1:]])
         last = problem.step(now.x[-1], now.u[-1])
-        return now.u[0], now._replace(u=moved, K=gains, x=jnp.concatenate([now.x[1:], last[None]]))
+        return where_finite(now.u[0], x), now._replace(u=moved, K=gains, x=jnp.concatenate([now.x[1:], last[None]]))
 
     return act
 

@@ -32,7 +32,7 @@ from dln_jax.deploy.c.jaxprs import repeated_calls, traced
 from dln_jax.deploy.c.lowering import kind_of, program_of
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
-from dln_jax.types import InputError
+from dln_jax.types import InputError, require_positive
 
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
 """Functions of arrays by name, each with example arguments."""
@@ -63,6 +63,7 @@ def export_c(
     libm: bool = False,
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
+    stack: int = STACK,
     overwrite: bool = False,
 ) -> list[Path]:
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
@@ -78,15 +79,17 @@ def export_c(
             names.
         leave_out_large: leave functions out that would be refused for their stack, or take more than 4,000 lines, which
             compile for seconds each, and of NAME_casadi.c also those that CasADi cannot take; the files name them.
+        stack: bytes that a function may take of it; a plan over many steps may need more than the default.
         overwrite: replace files that exist.
 
     Raises:
-        InputError: what has no C, a name that is none in C, more stack than 256 KiB or source than 10 MB, files that
+        InputError: what has no C, a name that is none in C, more stack than asked for, or source than 10 MB, files that
             exist, or the folder of a run, whose files are never replaced.
     """
     texts = source_files(
-        functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi, leave_out_large=leave_out_large
-    )
+        functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
+        leave_out_large=leave_out_large, stack=stack,
+    )  # fmt: skip
     return write_exports(Path(directory), texts, overwrite=overwrite)
 
 
@@ -98,8 +101,10 @@ def source_files(
     libm: bool = False,
     casadi: bool | Collection[str] = False,
     leave_out_large: bool = False,
+    stack: int = STACK,
 ) -> dict[str, bytes]:
     """Content of each file, by its name."""
+    require_positive(stack=stack)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
     precision = precision or _precision(functions)
@@ -114,7 +119,7 @@ def source_files(
     for key, each in every.items():
         tables, parts = dict(source.tables), dict(source.parts)
         try:
-            signature, text, lines = _function(source, name, key, each, repeated)
+            signature, text, lines = _function(source, name, key, each, repeated, stack)
             if leave_out_large and lines > LINES:
                 raise TooLargeError(f"{key}, of {lines} lines")
         except TooLargeError as error:
@@ -140,7 +145,7 @@ def source_files(
         chosen = {
             key: each for key, each in functions.items() if key in signatures and (casadi is True or key in casadi)
         }
-        files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large)
+        files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large, stack)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
@@ -148,13 +153,13 @@ def source_files(
 
 
 def _for_casadi(
-    functions: Functions, name: str, libm: bool, precision: str, written_by: str, leave_out: bool
+    functions: Functions, name: str, libm: bool, precision: str, written_by: str, leave_out: bool, stack: int
 ) -> dict[str, str]:
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
     with jax.enable_x64(True):
         source, text, left_out = external.external_functions(
-            name, functions, libm=libm, stack=STACK, leave_out=leave_out
+            name, functions, libm=libm, stack=stack, leave_out=leave_out
         )
     absent = "\n".join(f"Left out: {each}" for each in left_out)
     about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
@@ -182,7 +187,7 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
 
 
 def _function(
-    source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str]
+    source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str], stack: int
 ) -> tuple[Signature, str, int]:
     """Signature, C text and lines of one function, those of functions that it calls included."""
     signature = Signature(tuple(each.arguments), tuple(each.results))
@@ -193,9 +198,9 @@ def _function(
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
-    if body.bytes > STACK:
+    if body.bytes > stack:
         raise TooLargeError(
-            f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {STACK // 1024} KiB"
+            f"{key} would take {body.bytes / 1024:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB"
         )
     words = set(re.findall(r"\w+", "\n".join(body.lines)))
     leaves = [*signature.arguments, *(() if signature.returns else signature.results)]

@@ -10,7 +10,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.control import energy_laws, pictures
+from dln_jax.studies.control import energy_laws, laws_in_c, pictures, receding_report, robustness, tracking
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
@@ -86,8 +86,13 @@ def cases(*, quick: bool = False) -> list[Case]:
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
         **equation.CASES,
+        "tracking/seven-axis": tracking.tracking,
+        "robustness/acrobot": functools.partial(robustness.robust, "elbow"),
+        "robustness/pendubot": functools.partial(robustness.robust, "shoulder"),
+        "laws/in-c": laws_in_c.laws,
+        "receding/cart-pole": receding_report.mpc,
     }
-    drawn = pictures.DRAWN
+    drawn = {**pictures.DRAWN, "robustness": robustness.draw}
     return [
         Case(name, in_float64(functools.partial(measure, quick)), draw=drawn.get(name.split("/")[0]))
         for name, measure in measures.items()

@@ -10,7 +10,7 @@ known, and the score is what is asked for.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,44 +77,65 @@ def drawn_laws(count: int, seed: int = 0) -> Law:
     )
 
 
-def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
-    """A law's numbers -> its closed loop on the board."""
+def pumping(motor: Motor) -> Callable[..., Array]:
+    """(x, the gains k1, k2, k3, energy beyond the goal's in J) -> the torque [1] of the swing-up by energy."""
     scene, B = plant(motor)
-    system, joints = dynamics(scene.energies), scene.needs.joints
-    field = field_of(system, B)
-    at = linearise(field, GOAL, holding_controls(system, GOAL[:2], B))
-    regulator = lqr(at.A, at.B, STATE_COST, CONTROL_COST)
-    parts = parts_of(B)
+    system, parts = dynamics(scene.closed_form), parts_of(B)
     forces, (active,), (passive,) = partial_linearisation(system, parts), parts.active, parts.passive
     wanted = system.energy(GOAL[:2], np.zeros(2))
 
+    def far(x: Array, gains: Array, beyond: Any = 0.0) -> Array:
+        (k1, k2, k3), q, qd = gains, x[:2], x[2:]
+        error = system.energy(q, qd) - wanted - beyond
+        a = -k1 * (q[active] - GOAL[active]) - k2 * qd[active] + k3 * qd[passive] * error
+        return jnp.where(jnp.max(jnp.abs(qd)) <= STILL, LIMIT, forces(q, qd, a[None]))
+
+    return far
+
+
+def controllers_by_energy(motor: Motor) -> Callable[[Law], Controller]:
+    """A law's numbers -> what asks for torques, of x = (q, qd)."""
+    scene, B = plant(motor)
+    system, joints, far = dynamics(scene.energies), scene.needs.joints, pumping(motor)
+    at = linearise(field_of(system, B), GOAL, holding_controls(system, GOAL[:2], B))
+    regulator = lqr(at.A, at.B, STATE_COST, CONTROL_COST)
     near, cost = regulated(regulator, GOAL, at.u, joints), value(regulator, GOAL, joints)
-    lab = Laboratory(-LIMIT, LIMIT)
 
-    def run(numbers: Law) -> Run:
-        k1, k2, k3 = numbers.gains
-
-        def far(x: Array) -> Array:
-            q, qd = x[:2], x[2:]
-            a = -k1 * (q[active] - GOAL[active]) - k2 * qd[active] + k3 * qd[passive] * (system.energy(q, qd) - wanted)
-            return jnp.where(jnp.max(jnp.abs(qd)) <= STILL, LIMIT, forces(q, qd, a[None]))
-
-        law = switched(far, near, cost, numbers.level)
+    def controller(numbers: Law) -> Controller:
+        law = switched(lambda x: far(x, numbers.gains), near, cost, numbers.level)
 
         def act(tau: Array, t: Array, y: Array) -> tuple[Array, Array]:
             tau = tau + numbers.share * (jnp.clip(law(y), -numbers.most, numbers.most) - tau)
             return tau, tau
 
-        controller = Controller(jnp.zeros(1), act)
-        return simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, laboratory=lab)
+        return Controller(jnp.zeros(1), act)
 
-    return run
+    return controller
+
+
+def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
+    """A law's numbers -> its closed loop on the board."""
+    scene, B = plant(motor)
+    field, controller = field_of(dynamics(scene.energies), B), controllers_by_energy(motor)
+    lab, settings = Laboratory(-LIMIT, LIMIT), {"seconds": SECONDS, "rate": RATE, "controls": 1}
+    return lambda numbers: simulate(field, controller(numbers), np.zeros(4), laboratory=lab, **settings)
+
+
+def runs_of_drawn_laws(motor: Motor, draws: int) -> list[Criteria]:
+    """Of laws drawn at random."""
+    runs = jax.jit(jax.vmap(runs_by_energy(motor)))(drawn_laws(draws))
+    return [criteria(motor, jax.tree.map(lambda each, index=index: each[index], runs)) for index in range(draws)]
+
+
+def best_law(motor: Motor, draws: int = DRAWS) -> Law:
+    """The one with the best score."""
+    place = int(np.argmax([score(each) for each in runs_of_drawn_laws(motor, draws)]))
+    return jax.tree.map(lambda each: each[place], drawn_laws(draws))
 
 
 def board(motor: Motor, draws: int = DRAWS) -> Findings:
     """The best score of laws drawn at random, and how many succeed."""
-    runs = jax.jit(jax.vmap(runs_by_energy(motor)))(drawn_laws(draws))
-    found = [criteria(motor, jax.tree.map(lambda each, index=index: each[index], runs)) for index in range(draws)]
+    found = runs_of_drawn_laws(motor, draws)
     scores = np.array([score(each) for each in found])
     best = found[int(np.argmax(scores))]
     name = plant(motor)[0].name

@@ -111,7 +111,7 @@ def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None)
     Raises:
         InputError: MuJoCo is missing.
     """
-    mujoco, model, data = _simulator(robot)
+    mujoco, model, data = simulator(robot)
     data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
     # Rates of the simulation are those of its last step, half a step behind its coordinates.
     rates = np.diff(wanted.q, axis=0, prepend=wanted.q[:1]) / STEP
@@ -128,7 +128,7 @@ def follow(robot: Robot, wanted: Motion, feed_forward: np.ndarray | None = None)
 
 def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
     """Torques [T, d] that the arm takes on its references, by MuJoCo's inverse dynamics, dry friction included."""
-    mujoco, model, data = _simulator(robot)
+    mujoco, model, data = simulator(robot)
     tau = []
     for state in zip(*wanted, strict=True):
         data.qpos[:], data.qvel[:], data.qacc[:] = state
@@ -137,7 +137,8 @@ def exact_torque(robot: Robot, wanted: Motion) -> np.ndarray:
     return np.stack(tau)
 
 
-def _simulator(robot: Robot) -> tuple[Any, Any, Any]:
+def simulator(robot: Robot) -> tuple[Any, Any, Any]:
+    """MuJoCo, its model of the arm, and a state; `InputError` where it is missing."""
     try:
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
