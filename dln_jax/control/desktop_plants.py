@@ -57,7 +57,7 @@ def desktop_cart_pole() -> DesktopPlant:
     lab = Laboratory(
         -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
     )
-    return DesktopPlant(with_friction(cart_pole(**sizes), friction, shape), cart_pole, sizes, lab, 500.0, 4, 0.02)
+    return DesktopPlant(with_friction(cart_pole(**sizes), friction, shape), cart_pole, sizes, lab, 500.0, 2, 0.02)
 
 
 def desktop_rotary_pendulum() -> DesktopPlant:
@@ -69,7 +69,7 @@ def desktop_rotary_pendulum() -> DesktopPlant:
         -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
     )
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)
-    return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 4, 0.1)
+    return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 2, 0.1)
 
 
 PLANTS: Mapping[str, Callable[[], DesktopPlant]] = {
