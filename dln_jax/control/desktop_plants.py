@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.control.closed_loop import Laboratory
+from dln_jax.control.energy_shaping import EnergyGains
+from dln_jax.control.swing_up import SwingUpNumbers
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.friction import with_friction
@@ -45,6 +47,8 @@ class DesktopPlant(NamedTuple):
     """Of the controller's samples, Hz."""
     substeps: int
     """Of the integrator in a sample, so many that stiction is resolved."""
+    numbers: SwingUpNumbers
+    """Of its swing-up, chosen by the analytic model (`studies.control.swing_up_gains`)."""
     position: float
     """Standard deviation of the driven coordinate where runs start, m or rad."""
 
@@ -57,7 +61,11 @@ def desktop_cart_pole() -> DesktopPlant:
     lab = Laboratory(
         -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
     )
-    return DesktopPlant(with_friction(cart_pole(**sizes), friction, shape), cart_pole, sizes, lab, 500.0, 2, 0.02)
+    numbers = SwingUpNumbers(
+        EnergyGains(1100.0, 21.0, 4.7), np.diag([10.0, 10.0, 1.0, 0.1]), np.array([[0.1]]), 3.8, smoothing=0.05
+    )
+    scene = with_friction(cart_pole(**sizes), friction, shape)
+    return DesktopPlant(scene, cart_pole, sizes, lab, 500.0, 2, numbers, 0.02)
 
 
 def desktop_rotary_pendulum() -> DesktopPlant:
@@ -68,8 +76,11 @@ def desktop_rotary_pendulum() -> DesktopPlant:
     lab = Laboratory(
         -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
     )
+    numbers = SwingUpNumbers(
+        EnergyGains(4.3e7, 32.0, 11.0), np.diag([1.0, 1.0, 0.01, 0.01]), np.array([[50.0]]), 0.07, smoothing=1.0
+    )
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)
-    return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 2, 0.1)
+    return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 2, numbers, 0.1)
 
 
 PLANTS: Mapping[str, Callable[[], DesktopPlant]] = {

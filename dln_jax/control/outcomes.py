@@ -3,10 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Float
 
 UP = 0.1
@@ -41,16 +38,16 @@ class Outcomes(NamedTuple):
         return float(statistic(reached)) if len(reached) else np.inf
 
 
-def outcomes(off: Any, *, rate: float, up: float = UP) -> Outcomes:
-    """Of the largest angle by which each run is off its goal, [n, N+1] at the samples, the short way round.
+def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
+    """Of a pole's angles from upright [n, N+1], rad, at the samples of each run.
 
     An angle that is no number is not up, and neither is whatever follows it.
     """
-    off = np.asarray(off)
-    near = np.abs(off) < up  # NaN is not
+    angle = np.asarray(angle)
+    near = np.cos(angle) > np.cos(up)  # NaN is not
     stays = near.shape[1] - np.argmin(near[:, ::-1], axis=1)
     stays = np.where(near.all(axis=1), 0, stays)
-    return Outcomes(np.where(near[:, -1], stays / rate, np.inf), ~np.isfinite(off).all(axis=1))
+    return Outcomes(np.where(near[:, -1], stays / rate, np.inf), ~np.isfinite(angle).all(axis=1))
 
 
 def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1) -> Float[np.ndarray, "n 4"]:
@@ -68,7 +65,3 @@ def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1
     x[:, 1] = np.pi + angle * random.normal(size=count)
     return x
 
-
-def angle_off(angle: Array) -> Array:
-    """The short way round, rad."""
-    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))

@@ -127,20 +127,21 @@ def swing_up(
         InputError: a model without energies, with a mass matrix that is not definite, without an equilibrium near the
             goal, one that the limits cannot hold, or that no feedback stabilises.
     """
-    require_usable(model, postures)
     parts, B = parts_of(actuation), np.asarray(actuation, float)
-    conservative = without_friction(model)
-    home = nearest_equilibrium(conservative, goal, parts.passive)
-    controls = holding_controls(conservative, home, B, tolerance=tolerance)
-    if not bool(jnp.all((controls > least) & (controls < most))):
-        raise InputError(
-            f"the limits {least} to {most} do not hold the goal, which takes {np.round(controls, 4).tolist()}; choose "
-            "another goal, or a stronger motor"
-        )
-    x = jnp.concatenate([home, jnp.zeros_like(home)])
-    field = field_of(conservative, B)
-    at = linearise(field, x, controls, tolerance=np.inf)
-    regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
+    # What hangs on the model alone is computed now, also where gains or the level are being traced.
+    with jax.ensure_compile_time_eval():
+        require_usable(model, postures)
+        conservative = without_friction(model)
+        home = nearest_equilibrium(conservative, goal, parts.passive)
+        controls = holding_controls(conservative, home, B, tolerance=tolerance)
+        if not bool(jnp.all((controls > least) & (controls < most))):
+            raise InputError(
+                f"the limits {least} to {most} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
+                "choose another goal, or a stronger motor"
+            )
+        x = jnp.concatenate([home, jnp.zeros_like(home)])
+        at = linearise(field_of(conservative, B), x, controls, tolerance=np.inf)
+        regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
     # Motors are numbered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(B[np.array(parts.active)])
     shaped = energy_shaping(conservative, parts, home, numbers.gains)

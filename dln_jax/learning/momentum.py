@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from dln_jax.data.encoders import smooth
 from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stretches import stretches
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -135,3 +138,34 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
         asked = np.concatenate([np.zeros((int(delay) + 1, data.tau.shape[1])), data.tau[rows]])
         acting[rows] = (asked[: len(rows)] + asked[1 : len(rows) + 1]) / 2
     return data._replace(tau=acting)
+
+
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window: float = WINDOW) -> int:
+    """Samples by which torques are late, with which a model that is linear in its parameters leaves least.
+
+    Args:
+        model: such as `models.make_trigonometric`.
+        recording: q and the torques that were asked for.
+        most: delays that are tried, from 0.
+        window: s.
+
+    Raises:
+        InputError: as `smooth` and `cut_momentum_windows`.
+    """
+    smoothed = smooth(recording)
+    windows = cut_momentum_windows(smoothed.data, window=window)
+    zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, model.init(jax.random.key(0))))
+
+    def left(theta: Array, q: Array, qd: Array) -> Array:
+        return momentum_errors(dynamics(model.energies(unravel(theta))), q, qd, jnp.zeros(q.shape[1]), dt=windows.dt)
+
+    columns = np.asarray(jax.jit(jax.vmap(lambda q, qd: jax.jacrev(left)(zero, q, qd)))(windows.q, windows.qd))
+    unit = np.asarray(torque_scale(smoothed.data))
+    A = (columns / unit[:, None]).reshape(-1, zero.size)
+
+    def misfit(delay: int) -> float:
+        late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
+        b = (cut_momentum_windows(late, window=window).impulse / unit).ravel()
+        return float(np.sum((A @ np.linalg.lstsq(A, b, rcond=None)[0] - b) ** 2))
+
+    return min(range(most + 1), key=misfit)
