@@ -62,7 +62,8 @@ def desktop_cart_pole() -> DesktopPlant:
         -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
     )
     numbers = SwingUpNumbers(
-        EnergyGains(1100.0, 21.0, 4.7), np.diag([10.0, 10.0, 1.0, 0.1]), np.array([[0.1]]), 3.8, smoothing=0.05
+        EnergyGains(1100.0, 21.0, 4.7), np.diag([10.0, 10.0, 1.0, 0.1]), np.array([[0.1]]), 3.8, smoothing=0.05,
+        kick=5.0,
     )
     scene = with_friction(cart_pole(**sizes), friction, shape)
     return DesktopPlant(scene, cart_pole, sizes, lab, 500.0, 2, numbers, 0.02)
@@ -77,7 +78,8 @@ def desktop_rotary_pendulum() -> DesktopPlant:
         -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
     )
     numbers = SwingUpNumbers(
-        EnergyGains(4.3e7, 32.0, 11.0), np.diag([1.0, 1.0, 0.01, 0.01]), np.array([[50.0]]), 0.07, smoothing=1.0
+        EnergyGains(4.3e7, 32.0, 11.0), np.diag([1.0, 1.0, 0.01, 0.01]), np.array([[50.0]]), 0.07, smoothing=1.0,
+        kick=0.025,
     )
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)
     return DesktopPlant(scene, rotary_pendulum, sizes, lab, 500.0, 2, numbers, 0.1)

@@ -4,6 +4,7 @@
 2. Its own equilibrium near the goal is found, for a learned potential is not level at exactly the goal.
 3. Far from it the energy law acts, near it the regulator of the model's linearisation; the regulator's value decides.
 4. A share of the friction of the active joints is added, at the measured rates.
+5. At rest the energy law asks for nothing, and dry friction holds on to that: a kick starts what is still.
 """
 
 from collections.abc import Sequence
@@ -43,6 +44,10 @@ class SwingUpNumbers(NamedTuple):
     """Of friction's compensation, rad/s or m/s."""
     compensation: float = GAIN
     """Share of the active joints' friction that is made up for; 0 for none."""
+    kick: float = 0.0
+    """N m or N, for a plant that is still, far from the goal; towards where the active joints are to be."""
+    still: float = 0.05
+    """1/s or m/s, at and below which all measured rates are those of rest."""
 
 
 class SwingUp(NamedTuple):
@@ -147,7 +152,15 @@ def swing_up(
     shaped = energy_shaping(conservative, parts, home, numbers.gains)
     near = regulated(regulator, x, controls, joints)
     cost = value(regulator, x, joints)
-    law = switched(lambda x: to_controls @ shaped(*jnp.split(x, 2)), near, cost, numbers.level)
+
+    def far(x: Array) -> Array:
+        q, qd = jnp.split(x, 2)
+        active = np.array(parts.active)
+        towards = jnp.where(q[active] > home[active], -numbers.kick, numbers.kick)
+        resting = jnp.max(jnp.abs(qd)) <= numbers.still
+        return to_controls @ jnp.where(resting, towards, shaped(q, qd))
+
+    law = switched(far, near, cost, numbers.level)
     if numbers.compensation == 0:
         return SwingUp(law, x, controls, regulator)
     friction = friction_compensation(
