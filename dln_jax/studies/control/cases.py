@@ -10,7 +10,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.control import energy_laws
+from dln_jax.studies.control import energy_laws, learned
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
@@ -84,4 +84,5 @@ def cases(*, quick: bool = False) -> list[Case]:
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
     }
-    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]
+    found = {name: functools.partial(measure, quick) for name, measure in measures.items()} | learned.cases(quick)
+    return [Case(name, in_float64(measure)) for name, measure in found.items()]
