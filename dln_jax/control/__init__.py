@@ -10,8 +10,11 @@ from dln_jax.control.energy_shaping import (
     parts_of,
     passive_energy,
 )
+from dln_jax.control.friction_compensation import friction_compensation, without_friction
+from dln_jax.control.outcomes import Outcomes, outcomes
 from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.state_space import Linearisation, field_of, holding_controls, linearise
+from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
 from dln_jax.control.tracking import (
     Gains,
     Reference,
@@ -30,6 +33,7 @@ __all__ = [
     "Gains",
     "Laboratory",
     "Linearisation",
+    "Outcomes",
     "Parts",
     "Plan",
     "Problem",
@@ -38,6 +42,8 @@ __all__ = [
     "Regulator",
     "Run",
     "SampledRegulators",
+    "SwingUp",
+    "SwingUpNumbers",
     "Tracker",
     "computed_torque",
     "energy_shaping",
@@ -45,6 +51,7 @@ __all__ = [
     "feed_forward",
     "field_of",
     "first_plan",
+    "friction_compensation",
     "gravity_compensation",
     "holding_controls",
     "improve",
@@ -52,6 +59,7 @@ __all__ = [
     "linearise",
     "lqr",
     "optimise",
+    "outcomes",
     "partial_linearisation",
     "parts_of",
     "passive_energy",
@@ -61,9 +69,11 @@ __all__ = [
     "sampled_lqr",
     "simulate",
     "stateless",
+    "swing_up",
     "switched",
     "time_varying_lqr",
     "trusted",
     "value",
     "with_differences",
+    "without_friction",
 ]

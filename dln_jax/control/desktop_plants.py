@@ -58,11 +58,13 @@ def desktop_cart_pole() -> DesktopPlant:
     sizes = {"cart_mass": 0.57, "pole_mass": 0.127, "length": 0.16825}
     friction = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
     shape = FrictionShape(velocity_scale=(0.005, 0.01), stribeck_velocity=(0.05, 0.1))
-    lab = Laboratory(
-        -10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False
-    )
+    lab = Laboratory(-10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False)
     numbers = SwingUpNumbers(
-        EnergyGains(1100.0, 21.0, 4.7), np.diag([10.0, 10.0, 1.0, 0.1]), np.array([[0.1]]), 3.8, smoothing=0.05,
+        EnergyGains(1100.0, 21.0, 4.7),
+        np.diag([10.0, 10.0, 1.0, 0.1]),
+        np.array([[0.1]]),
+        3.8,
+        smoothing=0.05,
         kick=5.0,
     )
     scene = with_friction(cart_pole(**sizes), friction, shape)
@@ -74,11 +76,13 @@ def desktop_rotary_pendulum() -> DesktopPlant:
     sizes = {"arm_mass": 0.095, "arm_length": 0.085, "pole_mass": 0.024, "pole_length": 0.129}
     friction = FrictionCoefficients(viscous=(1e-4, 1e-5), coulomb=(1.5e-3, 5e-5), stribeck=(5e-4, 2e-5))
     shape = FrictionShape(velocity_scale=(0.01, 0.01), stribeck_velocity=(0.1, 0.1))
-    lab = Laboratory(
-        -0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False
-    )
+    lab = Laboratory(-0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False)
     numbers = SwingUpNumbers(
-        EnergyGains(4.3e7, 32.0, 11.0), np.diag([1.0, 1.0, 0.01, 0.01]), np.array([[50.0]]), 0.07, smoothing=1.0,
+        EnergyGains(4.3e7, 32.0, 11.0),
+        np.diag([1.0, 1.0, 0.01, 0.01]),
+        np.array([[50.0]]),
+        0.07,
+        smoothing=1.0,
         kick=0.025,
     )
     scene = with_friction(rotary_pendulum(**sizes), friction, shape)

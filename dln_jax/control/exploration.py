@@ -77,7 +77,11 @@ def commands(controller: Controller, run: Run, laboratory: Laboratory) -> Float[
 
 
 def explore(
-    plant: DesktopPlant, gains: EnergyGains, excitation: Excitation = Excitation(), *, seed: int = 0  # noqa: B008
+    plant: DesktopPlant,
+    gains: EnergyGains,
+    excitation: Excitation = Excitation(),  # noqa: B008
+    *,
+    seed: int = 0,
 ) -> tuple[Trajectories, Run]:
     """A recording of q and of the torques asked for, t and no rates; and the true runs, for who wants to judge by them.
 
@@ -97,9 +101,7 @@ def explore(
     random = np.random.default_rng([seed, 17])
     needs, rate, lab = plant.scene.needs, plant.rate, plant.laboratory
     B = np.asarray(needs.actuation)
-    sizes = {
-        name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()
-    }
+    sizes = {name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()}
     rough = dynamics(plant.makers(**sizes).energies)
     parts = parts_of(B)
     lift = passive_energy(rough, parts, jnp.zeros(2))(jnp.array([0.0, np.pi]), jnp.zeros(2))

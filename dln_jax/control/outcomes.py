@@ -64,4 +64,3 @@ def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1
     x[:, 0] = position * random.normal(size=count)
     x[:, 1] = np.pi + angle * random.normal(size=count)
     return x
-

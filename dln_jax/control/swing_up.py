@@ -163,7 +163,5 @@ def swing_up(
     law = switched(far, near, cost, numbers.level)
     if numbers.compensation == 0:
         return SwingUp(law, x, controls, regulator)
-    friction = friction_compensation(
-        model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation
-    )
+    friction = friction_compensation(model, parts.active, smoothing=numbers.smoothing, gain=numbers.compensation)
     return SwingUp(lambda x: law(x) + to_controls @ friction(*jnp.split(x, 2)), x, controls, regulator)

@@ -92,8 +92,8 @@ def prepare(recording: Trajectories, *, delay: int | None = None, validation: in
     present = np.unique(recording.trajectory)
     if recording.needs is None or len(present) < 2:
         raise InputError(
-            f"the recording has {len(present)} episode(s){'' if recording.needs else ', and states no needs'}; expected "
-            "at least 2, one of them to select by, and needs: record more, or cut it"
+            f"the recording has {len(present)} episode(s){'' if recording.needs else ', and states no needs'}; "
+            "expected at least 2, one of them to select by, and needs: record more, or cut it"
         )
     held_out = int(present[len(present) // 2] if validation is None else validation)
     if held_out not in present:
@@ -182,4 +182,3 @@ def _of_size(parameters: Any, size: float, *, torque: float) -> Any:
 
 def _inverse_softplus(value: float) -> float:
     return float(np.log(np.expm1(value)))
-

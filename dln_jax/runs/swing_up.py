@@ -112,7 +112,8 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
         print(f"{given.model}: learned in {got.seconds:.0f} s; {late}")
     print(
         f"nMSE of motions not seen: torque {metrics['torque_nmse']:.2e}, acceleration "
-        f"{metrics['acceleration_nmse']:.2e}; the model's equilibrium is {metrics['equilibrium_offset_rad']:.2g} rad off"
+        f"{metrics['acceleration_nmse']:.2e}; the model's equilibrium is "
+        f"{metrics['equilibrium_offset_rad']:.2g} rad off"
     )
     failed = f", {metrics['not_finite']:.0f} not finite" if metrics["not_finite"] else ""
     print(

@@ -39,7 +39,9 @@ def by_model(name: str, model: str, quick: bool) -> Findings:
         rows += [
             Row(case, f"{quantity}_{kind}", float(of(values))) for kind, of in (("median", np.median), ("worst", max))
         ]
-    rows.append(Row(case, "equilibrium_offset_worst", max(law_of(plant, got.dynamics).offset for got, *_ in found), "rad"))
+    rows.append(
+        Row(case, "equilibrium_offset_worst", max(law_of(plant, got.dynamics).offset for got, *_ in found), "rad")
+    )
     rows.append(Row(case, "learning_seconds_median", float(np.median([got.seconds for got, *_ in found])), "s"))
     return Findings(rows)
 

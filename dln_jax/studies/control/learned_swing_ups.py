@@ -1,4 +1,4 @@
-"""A desktop plant explored, learned from its encoders, and swung up by what was learned: the steps, one after another."""
+"""A desktop plant explored, learned from its encoders, and swung up by what was learned: step by step."""
 
 import time
 from collections.abc import Callable, Mapping
