@@ -53,8 +53,8 @@ def smooth_noise(
     return noise / noise.std(axis=0)
 
 
-def with_noise(law: Law, noise: Float[Array, "N m"], *, rate: float, cutoff: float) -> Controller:
-    """A law of (q, qd), whose rates are differences of q, with noise added sample by sample."""
+def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controller:
+    """A law of (q, qd), whose rates are differences of q, with noise [N, m] added sample by sample."""
     # The noise is a part of the memory, so that a batch of controllers is a batch of memories.
     inner = with_differences(law, 2, rate=rate, cutoff=cutoff)
 
@@ -134,7 +134,7 @@ def explore(
 def recording(runs: Run, tau: Float[np.ndarray, "E N d"], plant: DesktopPlant) -> Trajectories:
     """Episodes as one log of q and torques, with the needs of the plant's makers: no friction is promised."""
     episodes, samples, d = runs.y.shape
-    q = runs.y.reshape(-1, d)
+    q = np.asarray(runs.y).reshape(-1, d)
     absent = np.full_like(q, np.nan)
     return Trajectories(
         t=np.tile(np.arange(samples) / plant.rate, episodes),

@@ -78,7 +78,7 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
     def pull(angles: Array) -> Array:
         return plant.inverse_dynamics(goal.at[free].set(angles), rest, rest)[free]
 
-    def step(_: int, angles: Array) -> Array:
+    def step(_: Any, angles: Array) -> Array:
         return angles - jnp.linalg.solve(jax.jacfwd(pull)(angles), pull(angles))
 
     angles = jax.jit(lambda first: jax.lax.fori_loop(0, NEWTON_STEPS, step, first))(goal[free])
@@ -91,8 +91,8 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
     return goal.at[free].set(angles)
 
 
-def require_usable(plant: Dynamics | PlainDynamics, postures: Any) -> None:
-    """Raises `InputError` for a model without energies, or whose mass matrix is not definite in some posture [n, d]."""
+def usable(plant: Dynamics | PlainDynamics, postures: Any) -> Dynamics:
+    """The model itself; `InputError` for one without energies, or whose mass matrix is not definite in some posture [n, d]."""
     if not isinstance(plant, Dynamics):
         raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
     fine = np.asarray(jax.jit(jax.vmap(lambda q: definite(plant, q)))(jnp.asarray(postures, float)))
@@ -101,6 +101,7 @@ def require_usable(plant: Dynamics | PlainDynamics, postures: Any) -> None:
             f"the model's mass matrix is not positive definite in {np.mean(~fine):.1%} of the postures that a swing-up "
             "goes through; learn one that is by construction, such as a structured DeLaN, or from more motions"
         )
+    return plant
 
 
 def swing_up(
@@ -135,7 +136,7 @@ def swing_up(
     parts, B = parts_of(actuation), np.asarray(actuation, float)
     # What hangs on the model alone is computed now, also where gains or the level are being traced.
     with jax.ensure_compile_time_eval():
-        require_usable(model, postures)
+        model = usable(model, postures)
         conservative = without_friction(model)
         home = nearest_equilibrium(conservative, goal, parts.passive)
         controls = holding_controls(conservative, home, B, tolerance=tolerance)

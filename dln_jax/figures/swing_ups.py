@@ -78,8 +78,8 @@ def _without_jumps(degrees: np.ndarray) -> np.ndarray:
 def write_swing_up_gif(
     path: Path,
     kind: str,
-    t: Float[np.ndarray, " N+1"],
-    q: Float[np.ndarray, "N+1 2"],
+    t: Float[np.ndarray, " T"],
+    q: Float[np.ndarray, "T 2"],
     control: Float[np.ndarray, " N"],
     *,
     limit: float,
@@ -94,7 +94,7 @@ def write_swing_up_gif(
         kind: "cart-pole" or "rotary-pendulum".
         t: s, at equal steps.
         q: driven coordinate and angle from upright.
-        control: N or N m.
+        control: N or N m, at all times but the last.
         limit: of it.
         arm: length of the rotary pendulum's arm, m.
         pole: that of the pole, m.
@@ -107,7 +107,7 @@ def write_swing_up_gif(
     if kind not in drawings:
         raise InputError(f"a film of {kind!r:.40} is unknown; choose from {', '.join(drawings)}")
     figure = style.blank(height=3.6, width=4.2, dpi=DPI)
-    above, below = figure.subfigures(2, 1, height_ratios=[6, 1])
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[6, 1])[:, 0]
     show_plant = drawings[kind](above, q, arm, pole, max(1, round(TAIL / (t[1] - t[0]))))
     bar = below.subplots()
     style.prepare(bar)

@@ -101,7 +101,7 @@ def prepare(recording: Trajectories, *, delay: int | None = None, validation: in
     if delay is None:
         delay = delay_of_torques(build(_linear(recording.needs)), recording, most=MOST_DELAY)
     chosen = smooth(driven_torques(recording, delay=delay))
-    rest = [index for index in present if index != held_out]
+    rest = np.setdiff1d(present, held_out)
     return Prepared(select(chosen.data, rest), select(chosen.data, [held_out]), delay, chosen.cutoff)
 
 
@@ -119,10 +119,10 @@ def identified(data: Trajectories, needs: Needs) -> Fitted:
     description = _linear(needs)
     model, windows = build(description), cut_momentum_windows(data)
     unit = np.asarray(torque_scale(data))
-    found = None
-    for _ in range(ROUNDS):
+    found = fit_momentum(model, data, noise=unit)
+    for _ in range(ROUNDS - 1):
+        unit = deviations(Fitted(description, found.parameters).dynamics, windows)
         found = fit_momentum(model, data, noise=unit)
-        unit = deviations(dynamics(model.energies(found.parameters)), windows)
     return Fitted(description, found.parameters)
 
 

@@ -128,21 +128,22 @@ def draw(given: Asked, model: Dynamics, folder: Path, *, figures: bool, gif: boo
     count = min(given.starts, SHOWN + 1)
     runs = some_runs(plant, model, count, given.seed)
     limit = float(np.max(plant.laboratory.most))
+    t, x, u = np.asarray(runs.t[0]), np.asarray(runs.x), np.asarray(runs.u)
     if figures:
         parts = parts_of(plant.scene.needs.actuation)
         energy = passive_energy(without_friction(model), parts, np.zeros(2))
-        energies = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
+        energies = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(x))
         traces = Traces(
-            runs.t[0], runs.x[..., 0], runs.x[..., 1], runs.u[..., 0], np.asarray(energies), limit, UNITS[given.name]
+            t, x[..., 0], x[..., 1], u[..., 0], np.asarray(energies), limit, UNITS[given.name]
         )
         title = f"{given.name} by {given.model}, from {given.excitation.seconds:g} s of data"
         write_figure(folder / "swing-ups.png", traces_figure(traces, title=title, up=UP))
     if gif:
         sizes: Any = plant.sizes
         pole = sizes.get("pole_length", sizes.get("length"))
-        last = np.searchsorted(runs.t[0], 4.0)
+        last = int(np.searchsorted(t, 4.0))
         write_swing_up_gif(
-            folder / "swing-up.gif", given.name, runs.t[0][: last + 1], runs.x[0, : last + 1, :2], runs.u[0, :last, 0],
+            folder / "swing-up.gif", given.name, t[: last + 1], x[0, : last + 1, :2], u[0, :last, 0],
             limit=limit, arm=sizes.get("arm_length", 0.0), pole=pole,
         )  # fmt: skip
 

