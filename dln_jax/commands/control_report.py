@@ -1,4 +1,5 @@
-"""Measure controllers: swing-ups from many starts, and a public board's acrobot and pendubot by energy and by plan.
+"""Measure controllers: swing-ups from many starts, a public board's acrobot and pendubot by energy and by plan, and
+swing-ups by models that were learned from thirty seconds of a plant's motions.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
 figures.
@@ -13,7 +14,7 @@ from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.control.cases import cases
 
-SUBJECTS = ("swing-up", "starts", "board", "equation", "tracking", "robustness", "laws", "receding")
+SUBJECTS = ("swing-up", "starts", "board", "learned", "equation", "tracking", "robustness", "laws", "receding")
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,12 @@ from dln_jax.control.energy_shaping import (
     passive_energy,
 )
 from dln_jax.control.finite import where_finite
+from dln_jax.control.friction_compensation import friction_compensation, without_friction
+from dln_jax.control.outcomes import Outcomes, outcomes
 from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.shooting import Shooting, shoot
 from dln_jax.control.state_space import Linearisation, field_of, holding_controls, integrated, linearise
+from dln_jax.control.swing_up import SwingUp, SwingUpNumbers, swing_up
 from dln_jax.control.tracking import (
     Gains,
     Reference,
@@ -33,6 +36,7 @@ __all__ = [
     "Gains",
     "Laboratory",
     "Linearisation",
+    "Outcomes",
     "Parts",
     "Plan",
     "Problem",
@@ -42,6 +46,8 @@ __all__ = [
     "Run",
     "SampledRegulators",
     "Shooting",
+    "SwingUp",
+    "SwingUpNumbers",
     "Tracker",
     "computed_torque",
     "energy_shaping",
@@ -49,6 +55,7 @@ __all__ = [
     "feed_forward",
     "field_of",
     "first_plan",
+    "friction_compensation",
     "gravity_compensation",
     "holding_controls",
     "improve",
@@ -57,6 +64,7 @@ __all__ = [
     "linearise",
     "lqr",
     "optimise",
+    "outcomes",
     "partial_linearisation",
     "parts_of",
     "passive_energy",
@@ -67,6 +75,7 @@ __all__ = [
     "shoot",
     "simulate",
     "stateless",
+    "swing_up",
     "switched",
     "time_varying_lqr",
     "trusted",
@@ -74,4 +83,5 @@ __all__ = [
     "where_finite",
     "with_differences",
     "with_prediction",
+    "without_friction",
 ]

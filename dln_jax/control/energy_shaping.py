@@ -83,7 +83,12 @@ def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector
 
 
 def energy_shaping(
-    plant: Dynamics | PlainDynamics, parts: Parts, goal: Sequence[float] | Array, gains: EnergyGains
+    plant: Dynamics | PlainDynamics,
+    parts: Parts,
+    goal: Sequence[float] | Array,
+    gains: EnergyGains,
+    *,
+    surplus: Any = 0.0,
 ) -> Callable[[Vector, Vector], Array]:
     """(q, qd) -> forces of the active joints that bring the passive ones to the energy of the goal, and theirs home.
 
@@ -92,6 +97,7 @@ def energy_shaping(
         parts: which joints are driven.
         goal: posture [d].
         gains: of the accelerations.
+        surplus: J above the goal's energy that the passive joints are driven to, which makes up for what they lose.
 
     Raises:
         InputError: a model without energies.
@@ -104,7 +110,7 @@ def energy_shaping(
 
     def law(q: Vector, qd: Vector) -> Array:
         coupling = plant.mass_matrix(q)[np.ix_(active, passive)]
-        pumping = gains.energy * energy(q, qd) * (coupling @ qd[passive])
+        pumping = gains.energy * (energy(q, qd) - surplus) * (coupling @ qd[passive])
         a = pumping - gains.proportional * (q[active] - home) - gains.derivative * qd[active]
         return forces(q, qd, a)
 

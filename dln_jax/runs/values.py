@@ -107,7 +107,9 @@ def train(plant: ValuePlant, family: Family, method: str, seed: int, *, report: 
             plant.problem, network, seed=seed, numbers=settings,
             report=lambda at: report(at.iteration, settings.iterations, f"cost and misfit {at.validation:.4g}"),
         )  # fmt: skip
-        return Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
+        return Trained(
+            fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds
+        )
     if method != "residual":
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     of_parameters, of_samples = jax.random.split(jax.random.key(seed))

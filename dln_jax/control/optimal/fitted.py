@@ -191,9 +191,7 @@ def _fit(
     for number in range(numbers.iterations):
         grown = number / max(numbers.iterations - 1, 1)
         memory = numbers.first_memory ** (1 - grown) * numbers.memory**grown
-        parameters, state, loss = iterate(
-            parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory)
-        )
+        parameters, state, loss = iterate(parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory))
         now = float(score(parameters))
         if now < least:
             best, least = parameters, now

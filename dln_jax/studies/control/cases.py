@@ -10,7 +10,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.control import energy_laws, laws_in_c, pictures, receding_report, robustness, tracking
+from dln_jax.studies.control import energy_laws, laws_in_c, learned, pictures, receding_report, robustness, tracking
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
@@ -92,8 +92,6 @@ def cases(*, quick: bool = False) -> list[Case]:
         "laws/in-c": laws_in_c.laws,
         "receding/cart-pole": receding_report.mpc,
     }
+    found = {name: functools.partial(measure, quick) for name, measure in measures.items()} | learned.cases(quick)
     drawn = {**pictures.DRAWN, "robustness": robustness.draw}
-    return [
-        Case(name, in_float64(functools.partial(measure, quick)), draw=drawn.get(name.split("/")[0]))
-        for name, measure in measures.items()
-    ]
+    return [Case(name, in_float64(measure), draw=drawn.get(name.split("/")[0])) for name, measure in found.items()]

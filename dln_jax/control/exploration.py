@@ -1,0 +1,149 @@
+"""Motions to learn a plant from, in its laboratory: an energy law by a rough model, and smooth noise beside it.
+
+What is recorded is what a laboratory has: the encoders' readings and the torques that were asked for, which came late
+and with noise. Rates and accelerations are for `data.encoders` to find.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.control.balance import Law
+from dln_jax.control.closed_loop import Controller, Laboratory, Run, simulate, with_differences
+from dln_jax.control.desktop_plants import DesktopPlant
+from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of, passive_energy
+from dln_jax.control.outcomes import hanging_starts
+from dln_jax.control.state_space import field_of
+from dln_jax.data.encoders import low_pass
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.types import require_positive, require_seed
+
+
+class Excitation(NamedTuple):
+    """How a plant is explored."""
+
+    seconds: float = 30.0
+    """Of all episodes together."""
+    episodes: int = 5
+    wrong: float = 0.25
+    """Relative deviation of the rough model's sizes from the true ones, up or down at random."""
+    surplus: tuple[float, float] = (-0.5, 1.0)
+    """Energies that the first and the last episode drive the pole to, above that of the goal, as shares of what lifts
+    it from hanging by the rough model; those between are in between."""
+    noise: float = 0.3
+    """Standard deviation of the smooth noise, as a share of the limits."""
+    bandwidth: float = 3.0
+    """Of it, Hz."""
+    share: float = 0.8
+    """Of the limits, that is used at most."""
+    cutoff: float = 50.0
+    """Of the rates that the law is given, Hz."""
+
+
+def smooth_noise(
+    shape: tuple[int, ...], *, rate: float, bandwidth: float, random: np.random.Generator
+) -> Float[np.ndarray, "N m"]:
+    """Normal noise of unit deviation below a frequency, [N, m] at a rate in Hz."""
+    noise = low_pass(random.normal(size=shape), rate=rate, cutoff=bandwidth)
+    return noise / noise.std(axis=0)
+
+
+def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controller:
+    """A law of (q, qd), whose rates are differences of q, with noise [N, m] added sample by sample."""
+    # The noise is a part of the memory, so that a batch of controllers is a batch of memories.
+    inner = with_differences(law, 2, rate=rate, cutoff=cutoff)
+
+    def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
+        before, noise = memory
+        after, u = inner.act(before, t, y)
+        return (after, noise), u + noise[jnp.round(t * rate).astype(int)]
+
+    return Controller((inner.start, noise), act)
+
+
+def commands(controller: Controller, run: Run, laboratory: Laboratory) -> Float[Array, "N m"]:
+    """What the controller asked for in a run, within the limits: it is asked again, by what it was given."""
+
+    def ask(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
+        memory, wanted = controller.act(memory, *now)
+        return memory, jnp.clip(wanted, laboratory.least, laboratory.most)
+
+    return jax.lax.scan(ask, controller.start, (run.t[:-1], run.y))[1]
+
+
+def explore(
+    plant: DesktopPlant,
+    gains: EnergyGains,
+    excitation: Excitation = Excitation(),  # noqa: B008
+    *,
+    seed: int = 0,
+) -> tuple[Trajectories, Run]:
+    """A recording of q and of the torques asked for, t and no rates; and the true runs, for who wants to judge by them.
+
+    Args:
+        plant: in its laboratory; also the true one, whose friction the rough model knows nothing of.
+        gains: of the energy law, whose goal is the upright pole.
+        excitation: how long and how.
+        seed: of the rough model, the noise, the starts and the laboratory.
+
+    Raises:
+        InputError: settings out of range.
+    """
+    require_seed(seed)
+    require_positive(
+        seconds=excitation.seconds, episodes=excitation.episodes, bandwidth=excitation.bandwidth, share=excitation.share
+    )
+    random = np.random.default_rng([seed, 17])
+    needs, rate, lab = plant.scene.needs, plant.rate, plant.laboratory
+    B = np.asarray(needs.actuation)
+    sizes = {name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()}
+    rough = dynamics(plant.makers(**sizes).energies)
+    parts = parts_of(B)
+    lift = passive_energy(rough, parts, jnp.zeros(2))(jnp.array([0.0, np.pi]), jnp.zeros(2))
+    surplus = -lift * jnp.linspace(*excitation.surplus, excitation.episodes)
+    most = excitation.share * np.broadcast_to(lab.most, B.shape[1])
+    inside = lab._replace(least=-most, most=most)
+    episodes, samples = excitation.episodes, round(excitation.seconds / excitation.episodes * rate)
+    noise = smooth_noise((samples, episodes), rate=rate, bandwidth=excitation.bandwidth, random=random)
+    field = field_of(dynamics(plant.scene.energies), B)
+
+    @jax.jit
+    @jax.vmap
+    def episode(x: Array, surplus: Array, noise: Array, key: Array) -> tuple[Run, Array]:
+        law = energy_shaping(rough, parts, jnp.zeros(2), gains, surplus=surplus)
+        controller = with_noise(
+            lambda x: law(x[:2], x[2:]), excitation.noise * most * noise[:, None], rate=rate, cutoff=excitation.cutoff
+        )
+        run = simulate(
+            field, controller, x, seconds=samples / rate, rate=rate, controls=B.shape[1], laboratory=inside, key=key,
+            substeps=plant.substeps,
+        )  # fmt: skip
+        return run, commands(controller, run, inside)
+
+    starts = hanging_starts(episodes, int(random.integers(2**31)), position=plant.position)
+    keys = jax.random.split(jax.random.key(int(random.integers(2**31))), episodes)
+    runs, asked = jax.tree.map(np.asarray, episode(starts, surplus, noise.T, keys))
+    return recording(runs, asked @ B.T, plant), runs
+
+
+def recording(runs: Run, tau: Float[np.ndarray, "E N d"], plant: DesktopPlant) -> Trajectories:
+    """Episodes as one log of q and torques, with the needs of the plant's makers: no friction is promised."""
+    episodes, samples, d = runs.y.shape
+    q = np.asarray(runs.y).reshape(-1, d)
+    absent = np.full_like(q, np.nan)
+    return Trajectories(
+        t=np.tile(np.arange(samples) / plant.rate, episodes),
+        q=q,
+        qd=absent,
+        qdd=absent,
+        tau=tau.reshape(-1, d),
+        trajectory=np.repeat(np.arange(episodes), samples),
+        label=np.array([f"episode-{number}" for number in range(episodes)]),
+        needs=plant.scene.needs,
+        estimated=("qd", "qdd"),
+    )

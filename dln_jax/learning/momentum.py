@@ -1,0 +1,171 @@
+"""Any energies fitted to q, qd and tau in weak form: `learning.weak_forms` for models not linear in their parameters.
+
+    r_w = [integral w (s - tau) dt - integral w' p dt] / unit_w,   p = M(q) qd,   s = tau(q, qd, 0) - dM/dt qd
+
+for each window w, which is zero at both its ends: the change of momentum under the forces that were measured. There
+are no accelerations in it, and torques that jump, held between samples, are no harder than smooth ones.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from dln_jax.data.encoders import smooth
+from dln_jax.data.magnitudes import on_device
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import stretches
+from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
+from dln_jax.learning.objectives import torque_scale
+from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.types import InputError, Scalar, require_positive
+
+
+class MomentumWindows(NamedTuple):
+    """W windows of S steps each."""
+
+    q: Float[np.ndarray, "W S+1 d"]
+    qd: Float[np.ndarray, "W S+1 d"]
+    impulse: Float[np.ndarray, "W d"]
+    """Integral of w tau dt, N m or N: of a window whose integral is 1, a mean torque."""
+    dt: float
+
+
+def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> MomentumWindows:
+    """Overlapping windows of a length in s, within stretches without a gap.
+
+    Raises:
+        InputError: no stretch is as long as a window.
+    """
+    require_positive(window=window)
+    pieces = stretches(data.t, data.trajectory)
+    dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))
+    steps = max(FEWEST, round(window / dt))
+    rows = [
+        piece[first : first + steps + 1]
+        for piece in pieces
+        for first in range(0, len(piece) - steps, max(1, steps // OVERLAP))
+    ]
+    if not rows:
+        raise InputError(f"no stretch of the data is as long as a window of {window:g} s; give a shorter one")
+    chosen = np.stack(rows)
+    w, _ = window_weights(steps, dt)
+    return MomentumWindows(data.q[chosen], data.qd[chosen], np.einsum("s,wsd->wd", w, data.tau[chosen]), dt)
+
+
+def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
+    """What is left of one window's equations [d], in N m or N."""
+    w, slope = (jnp.asarray(each) for each in window_weights(q.shape[0] - 1, dt))
+    p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
+    return w @ rest - slope @ p - impulse
+
+
+def deviations(plant: Dynamics, windows: MomentumWindows) -> Float[np.ndarray, " d"]:
+    """Root mean square over windows of what a model leaves of each joint's equation, N m or N."""
+    left = jax.jit(jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt)))(*windows[:3])
+    return np.sqrt(np.mean(np.asarray(left) ** 2, axis=0))
+
+
+def momentum_problem(
+    model: Model,
+    parameters: Parameters,
+    windows: MomentumWindows,
+    validation: MomentumWindows,
+    *,
+    unit: Sequence[float] | Float[np.ndarray, " d"],
+    seed: int = 0,
+) -> Problem:
+    """The fit of a model's parameters to windows, selected by validation windows, in float64.
+
+    Args:
+        model: of energies in coordinates and velocities.
+        parameters: to start from.
+        windows: to fit.
+        validation: to select by.
+        unit: of each joint's residual [d], N m or N, such as what another model leaves (`deviations`).
+        seed: of the order of the windows.
+
+    Raises:
+        InputError: a unit that is not positive, or windows of another length for validation.
+    """
+    for size in unit:
+        require_positive(unit=float(size))
+    if windows.q.shape[1] != validation.q.shape[1]:
+        raise InputError(
+            f"windows have {windows.q.shape[1]} samples, those for validation {validation.q.shape[1]}; cut both alike"
+        )
+    sizes = jnp.asarray(unit)
+    fitted, held_out = (
+        tuple(on_device(key, getattr(each, key), jnp.float64) for key in ("q", "qd", "impulse"))
+        for each in (windows, validation)
+    )
+
+    def residual(parameters: Parameters, *window: Array) -> Array:
+        return momentum_errors(dynamics(model.energies(parameters)), *window, dt=windows.dt) / sizes
+
+    def score(parameters: Parameters) -> tuple[Scalar, Scalar]:
+        return unmonitored(mean_square(lambda *window: residual(parameters, *window), held_out))
+
+    return Problem(residual, parameters, fitted, score, seed)
+
+
+def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
+    """Torques as they act at the samples, of those that were asked for: late by whole samples, and held in between.
+
+    A torque that is held over a step has at a sample the mean of what was held before it and after it. The first
+    torques of a trajectory, before anything was asked for, are zero.
+
+    Args:
+        data: torques asked for at each sample.
+        delay: samples for which they were on their way.
+
+    Raises:
+        InputError: a delay that is no whole number, or negative.
+    """
+    if delay < 0 or delay != int(delay):
+        raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
+    acting = np.zeros_like(data.tau)
+    for index in np.unique(data.trajectory):
+        rows = np.flatnonzero(data.trajectory == index)
+        asked = np.concatenate([np.zeros((int(delay) + 1, data.tau.shape[1])), data.tau[rows]])
+        acting[rows] = (asked[: len(rows)] + asked[1 : len(rows) + 1]) / 2
+    return data._replace(tau=acting)
+
+
+def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window: float = WINDOW) -> int:
+    """Samples by which torques are late, with which a model that is linear in its parameters leaves least.
+
+    Args:
+        model: such as `models.make_trigonometric`.
+        recording: q and the torques that were asked for.
+        most: delays that are tried, from 0.
+        window: s.
+
+    Raises:
+        InputError: as `smooth` and `cut_momentum_windows`.
+    """
+    smoothed = smooth(recording)
+    windows = cut_momentum_windows(smoothed.data, window=window)
+    zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, model.init(jax.random.key(0))))
+
+    def left(theta: Array, q: Array, qd: Array) -> Array:
+        return momentum_errors(dynamics(model.energies(unravel(theta))), q, qd, jnp.zeros(q.shape[1]), dt=windows.dt)
+
+    columns = np.asarray(jax.jit(jax.vmap(lambda q, qd: jax.jacrev(left)(zero, q, qd)))(windows.q, windows.qd))
+    unit = np.asarray(torque_scale(smoothed.data))
+    A = (columns / unit[:, None]).reshape(-1, zero.size)
+
+    def misfit(delay: int) -> float:
+        late = smooth(driven_torques(recording, delay=delay), smoothed.cutoff).data
+        b = (cut_momentum_windows(late, window=window).impulse / unit).ravel()
+        return float(np.sum((A @ np.linalg.lstsq(A, b, rcond=None)[0] - b) ** 2))
+
+    return min(range(most + 1), key=misfit)

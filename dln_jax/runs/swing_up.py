@@ -1,0 +1,153 @@
+"""From a desktop plant to its swing-up by a model that was learned from its motions: explore, learn, close the loop."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.command_line.progress import progress
+from dln_jax.control import parts_of, passive_energy
+from dln_jax.control.closed_loop import Run
+from dln_jax.control.desktop_plants import NAMES, DesktopPlant, desktop_plant
+from dln_jax.control.exploration import Excitation, explore
+from dln_jax.control.friction_compensation import without_friction
+from dln_jax.control.outcomes import UP, hanging_starts
+from dln_jax.control.swing_up_runs import SECONDS, Tried, law_of, motion_of, try_starts
+from dln_jax.data import schema
+from dln_jax.figures.swing_ups import SHOWN, Traces, traces_figure, write_swing_up_gif
+from dln_jax.files import write_figure, write_json
+from dln_jax.learning.recordings import STEPS
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.studies.control.learned_swing_ups import MODELS, Obtained, errors_along, obtain, test_motions
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.run import save
+
+EPISODE = 6.0
+"""s, of an episode, about."""
+LEAST_SECONDS = 4.0
+"""Of data: two episodes, of which one is to select by."""
+UNITS = {"cart-pole": ("m", "N"), "rotary-pendulum": ("rad", "N m")}
+
+
+class Asked(NamedTuple):
+    """What is to be done, checked."""
+
+    plant: DesktopPlant
+    name: str
+    model: str
+    excitation: Excitation
+    starts: int
+    seed: int
+
+
+def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> Asked:
+    """The arguments of a command, refused in one line before anything is written."""
+    found = desktop_plant(plant)
+    if model not in MODELS:
+        raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
+    require_positive(starts=starts)
+    require_seed(seed)
+    if not LEAST_SECONDS <= seconds_of_data < np.inf:
+        raise InputError(
+            f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: two episodes, one of them "
+            "to select by"
+        )
+    episodes = max(2, round(seconds_of_data / EPISODE))
+    return Asked(found, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed)
+
+
+def swing_up(given: Asked, folder: Path, *, figures: bool, gif: bool) -> dict[str, float]:
+    """Explores, learns, swings up, and writes what came of it; gives the metrics."""
+    plant = given.plant
+    recording, _ = explore(plant, plant.numbers.gains, given.excitation, seed=given.seed)
+    schema.save(folder / "data.npz", recording)
+    print(f"{given.name}: {given.excitation.seconds:g} s of q and torques in {given.excitation.episodes} episodes")
+    with progress(STEPS) as show:
+        got = obtain(
+            plant, given.model, recording, seed=given.seed,
+            report=lambda at: show(min(int(at.step), STEPS), f"loss {float(at.loss):.3g}"),
+        )  # fmt: skip
+    store(folder, got)
+    errors = errors_along(plant, got.dynamics, test_motions(plant, seed=given.seed))
+    law = law_of(plant, got.dynamics)
+    tried = try_starts(plant, got.dynamics, starts=given.starts, seed=given.seed)
+    metrics = {
+        "learning_seconds": got.seconds,
+        "torque_nmse": errors.torque_nmse,
+        "acceleration_nmse": errors.acceleration_nmse,
+        "equilibrium_offset_rad": law.offset,
+        **metrics_of(tried),
+    }
+    write_json(folder / "metrics.json", metrics)
+    say(given, got, metrics)
+    if figures or gif:
+        draw(given, got.dynamics, folder, figures=figures, gif=gif)
+    return metrics
+
+
+def metrics_of(tried: Tried) -> dict[str, float]:
+    """Of swing-ups from many starts."""
+    found = tried.outcomes
+    return {
+        "success_share": found.share,
+        "not_finite": float(found.failed.sum()),
+        "median_seconds": found.median,
+        "worst_seconds": found.worst,
+        "farthest": float(np.max(tried.farthest)),
+    }
+
+
+def store(folder: Path, got: Obtained) -> None:
+    """Writes the model, if it was learned."""
+    if got.fitted is not None:
+        save(folder, *got.fitted)
+
+
+def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
+    """Prints what came of it."""
+    if got.prepared is not None:
+        late = f"torques {got.prepared.delay} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
+        print(f"{given.model}: learned in {got.seconds:.0f} s; {late}")
+    print(
+        f"nMSE of motions not seen: torque {metrics['torque_nmse']:.2e}, acceleration "
+        f"{metrics['acceleration_nmse']:.2e}; the model's equilibrium is "
+        f"{metrics['equilibrium_offset_rad']:.2g} rad off"
+    )
+    failed = f", {metrics['not_finite']:.0f} not finite" if metrics["not_finite"] else ""
+    print(
+        f"{metrics['success_share']:.1%} of {given.starts} starts up after {SECONDS:g} s{failed}: median "
+        f"{metrics['median_seconds']:.2f} s, worst {metrics['worst_seconds']:.2f} s"
+    )
+
+
+def draw(given: Asked, model: Dynamics, folder: Path, *, figures: bool, gif: bool) -> None:
+    """Writes the figure of some runs, and the film of the first."""
+    plant = given.plant
+    count = min(given.starts, SHOWN + 1)
+    runs = some_runs(plant, model, count, given.seed)
+    limit = float(np.max(plant.laboratory.most))
+    t, x, u = np.asarray(runs.t[0]), np.asarray(runs.x), np.asarray(runs.u)
+    if figures:
+        parts = parts_of(plant.scene.needs.actuation)
+        energy = passive_energy(without_friction(model), parts, np.zeros(2))
+        energies = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(x))
+        traces = Traces(t, x[..., 0], x[..., 1], u[..., 0], np.asarray(energies), limit, UNITS[given.name])
+        title = f"{given.name} by {given.model}, from {given.excitation.seconds:g} s of data"
+        write_figure(folder / "swing-ups.png", traces_figure(traces, title=title, up=UP))
+    if gif:
+        sizes: Any = plant.sizes
+        pole = sizes.get("pole_length", sizes.get("length"))
+        last = int(np.searchsorted(t, 4.0))
+        write_swing_up_gif(
+            folder / "swing-up.gif", given.name, t[: last + 1], x[0, : last + 1, :2], u[0, :last, 0],
+            limit=limit, arm=sizes.get("arm_length", 0.0), pole=pole,
+        )  # fmt: skip
+
+
+def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> Run:
+    """The first of the runs that were tried, [count, N]."""
+    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
+    found = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
+    return jax.tree.map(np.asarray, found)

@@ -1,0 +1,90 @@
+"""How the gains of the desktop plants' swing-ups were chosen: drawn at random, by the analytic model alone.
+
+Each draw swings the plant up by two models, the analytic one with friction and the maker's without; kept are those that
+come up from every start by both, and the best of these from more starts. Starts and noise have seeds that no report
+uses, and what comes out is the same for every model, learned ones too.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control import EnergyGains
+from dln_jax.control.desktop_plants import DesktopPlant
+from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
+from dln_jax.control.swing_up import SwingUpNumbers
+from dln_jax.control.swing_up_runs import model_of_maker, model_of_plant, motion_of
+from dln_jax.mechanics.dynamics import Dynamics
+
+SEED = 1_000_000
+"""Of starts and noise, where reports have theirs below 1000."""
+DECADES = {"energy": (-1.0, 1.0), "proportional": (0.7, 1.8), "derivative": (0.0, 1.3), "level": (-1.5, 0.5)}
+"""Around the numbers of a first guess for the energy's gain and the level; of 1/s² and 1/s for the others."""
+
+
+class Candidate(NamedTuple):
+    """Numbers, and what came of them."""
+
+    numbers: SwingUpNumbers
+    share: float
+    """Of starts that are up, by the worse of two models."""
+    worst: float
+    """s, likewise."""
+    farthest: float
+    """m or rad, of the driven coordinate in any run."""
+
+
+def choose(
+    plant: DesktopPlant, *, draws: int = 100, starts: int = 8, finalists: int = 8, more: int = 100, farthest: float
+) -> list[Candidate]:
+    """The finalists, the best first: all starts up, within the room that the driven joint has, and soonest."""
+    random = np.random.default_rng(SEED)
+    drawn = {name: 10 ** random.uniform(*decades, draws) for name, decades in DECADES.items()}
+    first = plant.numbers
+    numbers = [
+        first._replace(
+            gains=EnergyGains(first.gains.energy * energy, proportional, derivative), level=first.level * level
+        )
+        for energy, proportional, derivative, level in zip(*drawn.values(), strict=True)
+    ]
+    found = sorted(_tried(plant, numbers, starts, SEED), key=lambda each: _rank(each, farthest))[:finalists]
+    again = _tried(plant, [each.numbers for each in found], more, SEED + 1)
+    return sorted(again, key=lambda each: _rank(each, farthest))
+
+
+def _rank(candidate: Candidate, farthest: float) -> tuple[float, float, float]:
+    return -candidate.share, max(candidate.farthest - farthest, 0.0), candidate.worst
+
+
+def _tried(plant: DesktopPlant, numbers: list[SwingUpNumbers], starts: int, seed: int) -> list[Candidate]:
+    models = (model_of_plant(plant), model_of_maker(plant))
+    results = [_of_model(plant, model, numbers, starts, seed) for model in models]
+    return [
+        Candidate(
+            each,
+            min(found[place][0].share for found in results),
+            max(found[place][0].worst for found in results),
+            max(found[place][1] for found in results),
+        )
+        for place, each in enumerate(numbers)
+    ]
+
+
+def _of_model(
+    plant: DesktopPlant, model: Dynamics, numbers: list[SwingUpNumbers], starts: int, seed: int
+) -> list[tuple[Outcomes, float]]:
+    gains = jax.tree.map(lambda *each: jnp.asarray(each), *(each.gains for each in numbers))
+    levels = jnp.asarray([each.level for each in numbers])
+    x = hanging_starts(starts, seed, position=plant.position)
+    keys = jax.random.split(jax.random.key(seed), starts)
+
+    def one(gains: EnergyGains, level: Array, x: Array, key: Array) -> tuple[Array, Array]:
+        run = motion_of(plant, model, plant.numbers._replace(gains=gains, level=level))(x, key)
+        return run.x[:, 1], jnp.max(jnp.abs(run.x[:, 0]))
+
+    of_starts = jax.vmap(one, in_axes=(None, None, 0, 0))
+    angles, far = jax.jit(jax.vmap(of_starts, in_axes=(0, 0, None, None)))(gains, levels, x, keys)
+    return [(outcomes(each, rate=plant.rate), float(jnp.max(most))) for each, most in zip(angles, far, strict=True)]

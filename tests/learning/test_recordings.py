@@ -1,0 +1,68 @@
+"""What is learned from encoders and late torques is the plant, in weak form, by linear and by learned energies."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control.desktop_plants import desktop_plant
+from dln_jax.control.exploration import Excitation, explore
+from dln_jax.control.swing_up_runs import model_of_plant
+from dln_jax.learning.momentum import cut_momentum_windows, deviations, driven_torques, momentum_problem
+from dln_jax.learning.recordings import identified, learned, prepare
+from dln_jax.types import InputError
+
+PLANT = desktop_plant("rotary-pendulum")
+TRUTH = model_of_plant(PLANT)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return explore(PLANT, PLANT.numbers.gains, Excitation(seconds=6.0, episodes=3), seed=0)[0]
+
+
+@pytest.fixture(scope="module")
+def prepared(recording):
+    return prepare(recording)
+
+
+def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
+    assert prepared.delay == PLANT.laboratory.delay
+    assert len(np.unique(prepared.train.trajectory)) == 2 and len(np.unique(prepared.validation.trajectory)) == 1
+    left = deviations(TRUTH, cut_momentum_windows(prepared.train))
+    assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()
+
+
+def test_identified_inertias_and_friction_are_the_plant_s(prepared):
+    found = identified(prepared.train, PLANT.scene.needs).dynamics
+    q, qd = jnp.array([0.0, 0.7]), jnp.array([2.0, 3.0])
+    np.testing.assert_allclose(found.mass_matrix(q), TRUTH.mass_matrix(q), rtol=0.03)
+    np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.1)
+
+
+def test_a_network_comes_close_in_a_few_iterations(prepared):
+    found = learned(prepared, PLANT.scene.needs, steps=10, width=4, depth=1)
+    left = deviations(found.dynamics, cut_momentum_windows(prepared.train))
+    assert (left < 0.1 * prepared.train.tau[:, 0].std()).all()
+    assert np.linalg.eigvalsh(jax.vmap(found.dynamics.mass_matrix)(jnp.zeros((1, 2)))).min() > 0
+
+
+def test_torques_come_late_and_are_held(recording):
+    tau = np.arange(1.0, 6.0)[:, None] * np.ones(2)
+    few = recording._replace(t=np.arange(5) / 500, tau=tau, trajectory=np.zeros(5, int))
+    np.testing.assert_allclose(driven_torques(few, delay=0).tau[:, 0], [0.5, 1.5, 2.5, 3.5, 4.5])
+    np.testing.assert_allclose(driven_torques(few, delay=2).tau[:, 1], [0, 0, 0.5, 1.5, 2.5])
+
+
+def test_mistakes_are_one_line(recording, prepared):
+    with pytest.raises(InputError, match=r"delay is 0\.5"):
+        driven_torques(recording, delay=0.5)
+    with pytest.raises(InputError, match="states no needs"):
+        prepare(recording._replace(needs=None))
+    with pytest.raises(InputError, match="validation is 7"):
+        prepare(recording, delay=1, validation=7)
+    windows = cut_momentum_windows(prepared.validation)
+    with pytest.raises(InputError, match="unit is 0"):
+        momentum_problem(None, None, windows, windows, unit=[0.0, 1.0])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="cut both alike"):
+        momentum_problem(None, None, windows, cut_momentum_windows(prepared.train, window=0.3), unit=[1.0, 1.0])  # type: ignore[arg-type]
