@@ -175,7 +175,7 @@ def _angles(axis: Axes, side: Any = None) -> None:
         axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
 
 
-def _ellipse(S: np.ndarray, level: float) -> np.ndarray:
+def _ellipse(S: Any, level: float) -> np.ndarray:
     """The curve xᵀ S x = level [2, 100]."""
     turn = np.linspace(0, 2 * np.pi, 100)
     sizes, axes = np.linalg.eigh(np.asarray(S))
