@@ -89,9 +89,9 @@ def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
 def write_closed_loop_gif(
     path: Path,
     drawing: Drawing,
-    t: Float[np.ndarray, " times"],
-    q: Float[np.ndarray, "times d"],
-    u: Float[np.ndarray, " times"],
+    t: Any,
+    q: Any,
+    u: Any,
     *,
     limits: tuple[float, float] = (-np.inf, np.inf),
     unit: str = "N",
@@ -103,9 +103,9 @@ def write_closed_loop_gif(
     Args:
         path: of the GIF.
         drawing: of the machine, such as `cart_pole_drawing(length)`.
-        t: times, s, of any spacing below that of the frames.
-        q: coordinates.
-        u: the control, held from each time on.
+        t: times [T], s, of any spacing below that of the frames.
+        q: coordinates [T, d].
+        u: the control [T], held from each time on.
         limits: of the control, in red.
         unit: of the control.
         title: above the picture.

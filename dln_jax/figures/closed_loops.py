@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -27,7 +26,7 @@ def closed_loop_traces(
     goal: Any = None,
     limits: tuple[Any, Any] = (-np.inf, np.inf),
     unit: str = "N or N m",
-    energy: Float[np.ndarray, "K T"] | None = None,
+    energy: Any = None,
     goal_energy: float | None = None,
 ) -> Figure:
     """Coordinates, controls between their limits, and energy of some runs over time; the first run is in colour.
@@ -39,7 +38,7 @@ def closed_loop_traces(
         goal: state [2 d], dashed; none by default.
         limits: of the controls, [m] or one for all, in red.
         unit: of the controls.
-        energy: along the runs, J.
+        energy: along the runs [K, T], J.
         goal_energy: J, dashed.
 
     Raises:
@@ -83,18 +82,18 @@ def closed_loop_traces(
 
 
 def phase_portrait(
-    angle: Float[np.ndarray, "K T"],
-    rate: Float[np.ndarray, "K T"],
+    angle: Any,
+    rate: Any,
     *,
-    energy: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    energy: tuple[Any, Any, Any] | None = None,
     goal_energy: float | None = None,
-    caught: tuple[np.ndarray, float] | None = None,
+    caught: tuple[Any, float] | None = None,
 ) -> Figure:
     """Closed loops in the plane of an angle off upright and its rate, over the energy, with what a regulator catches.
 
     Args:
-        angle: of the runs, rad; drawn from -pi to pi.
-        rate: rad/s.
+        angle: of the runs [K, T], rad; drawn from -pi to pi.
+        rate: likewise, rad/s.
         energy: angles [a], rates [b] and the energy [b, a] there, whose levels are drawn.
         goal_energy: whose level, on which the pole comes up by itself, is dashed.
         caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
@@ -126,14 +125,14 @@ def phase_portrait(
 
 
 def success_over_starts(
-    starts: Float[np.ndarray, "K 2"],
-    seconds: Float[np.ndarray, " K"],
+    starts: Any,
+    seconds: Any,
     *,
     labels: tuple[str, str] = ("angle from upright, rad", "rate, rad/s"),
 ) -> Figure:
-    """Starts in the plane of two of their coordinates, coloured by the time to the goal; a cross failed.
+    """Starts [K, 2] in the plane of two of their coordinates, coloured by the time to the goal; a cross failed.
 
-    `seconds` are infinite, or no number, where the goal was not reached.
+    `seconds` [K] are infinite, or no number, where the goal was not reached.
     """
     starts, seconds = np.asarray(starts), np.asarray(seconds)
     good = np.isfinite(seconds)
@@ -176,7 +175,7 @@ def _angles(axis: Axes, side: Any = None) -> None:
         axis.set_ylim(-1.05 * np.pi, 1.05 * np.pi)
 
 
-def _ellipse(S: np.ndarray, level: float) -> np.ndarray:
+def _ellipse(S: Any, level: float) -> np.ndarray:
     """The curve xᵀ S x = level [2, 100]."""
     turn = np.linspace(0, 2 * np.pi, 100)
     sizes, axes = np.linalg.eigh(np.asarray(S))

@@ -71,7 +71,7 @@ assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 
 folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
 write_closed_loop_gif(
-    folder / "rotary-pendulum.gif", rotary_pendulum_drawing(0.085, 0.129), t, np.asarray(runs.x[0, :-1, :2]), torque[0],
+    folder / "rotary-pendulum.gif", rotary_pendulum_drawing(0.085, 0.129), t, runs.x[0, :-1, :2], torque[0],
     limits=(-LIMIT, LIMIT), unit="N m", frames_per_second=FRAMES_PER_SECOND,
 )  # fmt: skip
 angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)

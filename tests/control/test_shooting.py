@@ -1,4 +1,4 @@
-"""Multiple shooting against Riccati's recursion, single shooting and finite differences, and integrators for stiff plants."""
+"""Multiple shooting against Riccati's recursion, single shooting and finite differences, by implicit steps too."""
 
 import functools
 
