@@ -213,9 +213,16 @@ def widened(problem: ControlProblem, factor: float) -> ControlProblem:
 
 
 def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
-    """States uniform in the box."""
-    low, high = (jnp.asarray(each, float) for each in (problem.low, problem.high))
-    return low + (high - low) * jax.random.uniform(key, (count, len(low)))
+    """States of which half are uniform in the box, and half in boxes that are shrunk, by a share that is uniform too.
+
+    Angles on a circle are uniform in both. In a box of several dimensions nearly all states are far from rest, where
+    few motions ever are.
+    """
+    of_box, of_share = jax.random.split(key)
+    low, high, goal = (jnp.asarray(each, float) for each in (problem.low, problem.high, problem.goal))
+    x = low + (high - low) * jax.random.uniform(of_box, (count, len(low)))
+    share = jnp.where(jnp.arange(count) % 2 == 0, 1.0, jax.random.uniform(of_share, (count,)))
+    return jnp.where(circles(problem), x, goal + share[:, None] * (x - goal))
 
 
 def _iterate(
