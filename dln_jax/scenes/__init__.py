@@ -3,6 +3,7 @@
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.scenes.pendulum import pendulum
@@ -21,6 +22,7 @@ __all__ = [
     "chain",
     "closed_form_forward_dynamics",
     "double_pendulum",
+    "flexible_cart_pole",
     "henon_heiles",
     "joint_angles",
     "mass_spring",

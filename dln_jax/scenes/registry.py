@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.scenes.n_body import n_body
 from dln_jax.scenes.oscillators import henon_heiles, mass_spring
 from dln_jax.scenes.pendulum import pendulum
@@ -20,6 +21,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "pendulum": pendulum,
     "double-pendulum": double_pendulum,
     "cart-pole": cart_pole,
+    "flexible-cart-pole": flexible_cart_pole,
     "rotary-pendulum": rotary_pendulum,
     "acrobot": lambda: two_link_pendulum("elbow"),
     "pendubot": lambda: two_link_pendulum("shoulder"),

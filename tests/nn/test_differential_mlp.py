@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dln_jax.nn import activations, differential_mlp, ensembles, haiku_layers
-from dln_jax.nn.differential_mlp import value, value_and_jacobian, value_jacobian_and_hessian
+from dln_jax.nn.differential_mlp import value, value_and_jacobian, value_and_pull_back, value_jacobian_and_hessian
 from dln_jax.types import InputError
 
 PLAIN = {
@@ -278,3 +278,11 @@ def test_wrong_layers_and_sizes():
     for sizes in ((), (2,), (2, 0, 1)):
         with pytest.raises(InputError, match="sizes are"):
             differential_mlp.init(jax.random.key(0), sizes)
+
+
+def test_a_pull_back_is_the_jacobian_transposed():
+    layers, x = random_network((3, 5, 4, 6))
+    w = jnp.arange(1.0, 7.0)
+    y, pull_back = value_and_pull_back(layers, x, activation=TANH)
+    expected, jacobian = value_and_jacobian(layers, x, activation=TANH)
+    assert_close((y, pull_back(w)), (expected, w @ jacobian))

@@ -9,6 +9,7 @@ from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.double_pendulum import double_pendulum
+from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import actuation_matrix
 from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
@@ -54,6 +55,17 @@ CARTESIAN = {
                 jnp.stack([q[0] + 0.6 * jnp.sin(q[1]), 0.6 * jnp.cos(q[1])]),
             ],
             [1.2, 0.3],
+        ),
+    ),
+    "flexible-cart-pole": (
+        flexible_cart_pole(stiffness=0.0, length=0.6),
+        *point_masses(
+            lambda q: [
+                jnp.stack([q[0], 0 * q[0]]),
+                jnp.stack([q[0] + q[1], 0 * q[0]]),
+                jnp.stack([q[0] + q[1] + 0.6 * jnp.sin(q[2]), 0.6 * jnp.cos(q[2])]),
+            ],
+            [0.57, 0.375, 0.127],
         ),
     ),
     **{f"chain-{d}": (chain(d), *rod_energy(d)) for d in (1, 3, 12)},

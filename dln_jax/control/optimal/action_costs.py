@@ -48,7 +48,7 @@ def quadratic(R: Any) -> ActionCost:
     inverse = np.linalg.inv(R) if R.ndim else np.asarray(1 / R)
 
     def times(matrix: np.ndarray, vector: Array) -> Array:
-        return matrix @ vector if matrix.ndim else matrix * vector
+        return jnp.asarray(matrix) @ vector if matrix.ndim else float(matrix) * vector
 
     return ActionCost(
         lambda u: 0.5 * jnp.sum(u * times(R, u)),

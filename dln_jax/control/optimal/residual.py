@@ -10,6 +10,7 @@ the problem's own (continuation: Lutter, Belousov et al. 2019). The samples of e
 are chosen by samples that no fit has seen.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.solvers import levenberg_marquardt
@@ -71,7 +73,7 @@ def fit_residual(
     key: Array,
     *,
     discounts: Sequence[float] | None = None,
-    samples: int = 2048,
+    samples: int = 4096,
     validation: int = 2048,
     iterations: int = 20,
     rounds: int = 10,
@@ -114,7 +116,7 @@ def fit_residual(
             left -= disturbance(x, slope, optimal_control(problem, x, slope)) @ slope
         return left / unit
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=quick_compilation())
     def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array, Array]:
         arrays = (x, jnp.full(len(x), discount))
         state = levenberg_marquardt.run(residual, levenberg_marquardt.init(parameters), arrays, iterations)

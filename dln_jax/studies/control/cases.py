@@ -14,6 +14,7 @@ from dln_jax.studies.control import energy_laws
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
+from dln_jax.studies.control.values import equation
 from dln_jax.studies.report import Row, expect
 
 TURN = 2 * np.pi / 2048
@@ -83,5 +84,6 @@ def cases(*, quick: bool = False) -> list[Case]:
         "board/pendubot-energy": functools.partial(by_energy, "shoulder"),
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
+        **equation.CASES,
     }
     return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]

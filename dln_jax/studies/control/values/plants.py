@@ -108,7 +108,7 @@ def _problem(
     a, B = from_plant(closed_form.dynamics(plant), actuation)
     circular = [number < len(joints) and joints[number] == "revolute" for number in range(len(box))]
 
-    def ways(x: Sequence[Any]) -> list[Any]:
+    def ways(x: Any) -> list[Any]:
         return [math.pi * jnp.sin(each / 2) if turns else each for each, turns in zip(x, circular, strict=True)]
 
     def state_cost(x: Array) -> Scalar:

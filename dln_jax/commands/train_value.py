@@ -1,0 +1,143 @@
+"""Train a value function: the cost to go of a plant as a network, whose slope is the best control in closed form.
+
+Trains by fitted value iteration, or on the residual of the Hamilton-Jacobi-Bellman equation, prints how long that took
+and what the law costs in the published evaluation (100 starts), and writes a run folder: value.safetensors and
+value.json (load them with dln_jax.runs.values.load_value), metrics.json and config.json.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from dln_jax.command_line.arguments import Unstated, choice, require_positive_if_given
+from dln_jax.command_line.options import Folder
+from dln_jax.command_line.progress import progress
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import finite, write_json
+from dln_jax.precision import with_float64
+from dln_jax.runs.results import print_numbers
+from dln_jax.runs.values import (
+    METHODS,
+    Family,
+    Trained,
+    ValueRun,
+    family_of,
+    load_value,
+    measured,
+    plant_named,
+    save_value,
+    train,
+)
+from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
+from dln_jax.types import InputError, require_positive, require_seed
+
+WIDTHS = {"fitted": 64, "residual": 24}
+DEPTHS = {"fitted": 2, "residual": 2}
+
+
+@dataclass(frozen=True)
+class Arguments(Folder):
+    """What to train a value function of, how, and where it goes."""
+
+    plant: Annotated[str, choice(PLANTS)] = "pendulum"
+    """The plant and its costs."""
+    method: Annotated[str, choice(METHODS)] = "fitted"
+    """fitted: value iteration along trajectories of the model; residual: the equation itself, by Gauss-Newton."""
+    goal: Unstated[str] = None
+    """Posture to hold, rad or m, separated by commas (default: upright)."""
+    width: Unstated[int] = None
+    """Of the hidden layers (default: 64; residual: 24)."""
+    depth: Unstated[int] = None
+    """Hidden layers (default: 2)."""
+    members: Unstated[int] = None
+    """Networks, of which V is the mean (default: 1)."""
+    iterations: Unstated[int] = None
+    """Of value iteration, or of Gauss-Newton for each discount (default: those of the method)."""
+    seed: int = 0
+    """Of parameters and states."""
+    seeds: int = 1
+    """Trainings, of which the one with the best validation is kept."""
+    starts: int = 100
+    """Of the evaluation, hanging and anywhere each."""
+    stored: Unstated[Path] = None
+    """Folder of a run whose value function is evaluated; nothing is trained (default: train one)."""
+
+
+def main(given: Arguments) -> None:
+    """Trains, evaluates, and writes the run folder."""
+    require_positive(seeds=given.seeds, starts=given.starts)
+    require_seed(given.seed, given.seeds)
+    require_positive_if_given(given, ("width", "depth", "members", "iterations"))
+    if given.method not in METHODS:
+        raise InputError(f"--method: '{given.method}' is unknown; choose from {', '.join(METHODS)}")
+    if given.stored is not None:
+        run = load_value(given.stored)
+        with command_folder(given, "train_value") as folder:
+            finish(folder, ValueRun(run.plant, run.network, with_float64(run.parameters)), given, {})
+        return
+    goal = posture(given.goal)
+    plant = plant_named(given.plant, goal)
+    width, depth = given.width or WIDTHS[given.method], given.depth or DEPTHS[given.method]
+    family = Family((width,) * depth, given.members or 1)
+    network = family_of(plant, family)
+    with command_folder(given, "train_value", family=family._asdict()) as folder:
+        print(f"{given.plant}: {given.method}, {family.members} x {depth} layers of {width}")
+        trained = [trained_one(plant, family, given, given.seed + number) for number in range(given.seeds)]
+        best = min(trained, key=lambda each: each.validation)
+        save_value(folder, given.plant, goal, family, best.parameters)
+        numbers = {"train_seconds": best.train_seconds, "validation": best.validation}
+        if len(trained) > 1:
+            numbers |= over_seeds(trained)
+        finish(folder, ValueRun(plant, network, with_float64(best.parameters)), given, numbers)
+
+
+def trained_one(plant: ValuePlant, family: Family, given: Arguments, seed: int) -> Trained:
+    """The training of a seed, with its progress."""
+    numbers: dict[str, Any] = {} if given.iterations is None else {"iterations": given.iterations}
+    shown: list[Any] = []
+
+    def report(done: int, total: int, text: str) -> None:
+        if not shown:
+            shown.append(bar := progress(total, "iterations"))
+            shown.append(bar.__enter__())
+        shown[1](done, text)
+
+    try:
+        return train(plant, family, given.method, seed, report=report, **numbers)
+    finally:
+        if shown:
+            shown[0].__exit__(None, None, None)
+
+
+def over_seeds(trained: list[Trained]) -> dict[str, float]:
+    """Medians and the worst of several."""
+    validation = [each.validation for each in trained]
+    return {
+        "validation_median": float(np.median(validation)),
+        "validation_worst": float(np.max(validation)),
+        "train_seconds_median": float(np.median([each.train_seconds for each in trained])),
+    }
+
+
+def finish(folder: Path, run: ValueRun, given: Arguments, numbers: dict[str, float]) -> None:
+    """Evaluates a value function, prints and writes the numbers."""
+    numbers = numbers | measured(run.plant, run.law, count=given.starts)
+    write_json(folder / "metrics.json", {key: finite(value) for key, value in numbers.items()})
+    rows = [[key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else ""] for key, value in numbers.items()]
+    print_numbers(rows, title=f"returns from {given.starts} starts hanging, and anywhere")
+    print(f"run folder: {folder}")
+
+
+def posture(text: str | None) -> tuple[float, ...] | None:
+    """The coordinates of --goal; `InputError` for what are no numbers."""
+    if text is None:
+        return None
+    try:
+        goal = tuple(float(each) for each in text.split(","))
+    except ValueError:
+        raise InputError(f"--goal is {text!r:.60}; expected numbers, separated by commas") from None
+    if not np.isfinite(goal).all():
+        raise InputError(f"--goal is {text!r:.60}; expected finite numbers")
+    return goal

@@ -1,0 +1,176 @@
+"""Value functions of published plants into run folders, and back from them."""
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control.balance import Law
+from dln_jax.control.optimal.fitted import Iteration, fit_value
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
+from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.nn.activations import activation
+from dln_jax.studies.control.values.evaluation import evaluate, starts
+from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
+from dln_jax.types import InputError
+from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
+
+VALUE = "value"
+"""Name of the file pair in a run's folder that holds the value function."""
+OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
+METHODS = ("fitted", "residual")
+Report = Callable[[int, int, str], None]
+"""(iterations done, of how many, what they came to)."""
+
+
+class Family(NamedTuple):
+    """What `value_network` is given beside a problem, as JSON values."""
+
+    widths: tuple[int, ...]
+    members: int
+    activation: str = "tanh"
+    floor: float = 1e-3
+    scale: float = 30.0
+
+
+class Trained(NamedTuple):
+    """A value function of one seed."""
+
+    parameters: Any
+    validation: float
+    train_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ValueRun:
+    """A value function from its folder."""
+
+    plant: ValuePlant
+    network: ValueNetwork
+    parameters: Any
+
+    @property
+    def problem(self) -> ControlProblem:
+        """What is controlled, at which cost."""
+        return self.plant.problem
+
+    @functools.cached_property
+    def value_and_gradient(self) -> ValueAndGradient:
+        """x [n] -> V and V_x [n], jitted."""
+        return jax.jit(lambda x: self.network.value_and_gradient(self.parameters, x))
+
+    @functools.cached_property
+    def law(self) -> Law:
+        """x [n] -> u [m], jitted; NaN for a state that is not finite."""
+        return jax.jit(hjb_policy(self.value_and_gradient, self.problem))
+
+
+def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
+    """The plant of a name, with a posture [d] other than upright as its goal.
+
+    Raises:
+        InputError: unknown names, which lists those that there are, or a goal that cannot be held.
+    """
+    name = OTHER_NAMES.get(name, name)
+    if name not in PLANTS:
+        raise InputError(f"plant '{name}' is unknown; choose from {', '.join(PLANTS)}")
+    plant = PLANTS[name]()
+    if goal is None:
+        return plant
+    d = len(plant.problem.goal) // 2
+    if len(goal) != d:
+        raise InputError(f"the goal has {len(goal)} coordinates; expected the posture of {name}, which has {d}")
+    return plant._replace(problem=at_goal(plant.problem, [*goal, *np.zeros(d)]))
+
+
+def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
+    """The networks of a family for a plant."""
+    return value_network(plant.problem, **{**family._asdict(), "activation": activation(family.activation)})
+
+
+def train(plant: ValuePlant, family: Family, method: str, seed: int, *, report: Report, **numbers: Any) -> Trained:
+    """A value function by one of `METHODS`; numbers are those of `fitted.Iteration`, or of `fit_residual`."""
+    network = family_of(plant, family)
+    if method == "fitted":
+        settings = Iteration(**numbers)
+        fit = fit_value(
+            plant.problem, network, seed=seed, numbers=settings,
+            report=lambda at: report(at.iteration, settings.iterations, f"cost and misfit {at.validation:.4g}"),
+        )  # fmt: skip
+        return Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds)
+    if method != "residual":
+        raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
+    of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+    discounts = discounts_down_to(plant.problem.discount)
+    total, done = len(discounts) - 1 + numbers.get("rounds", 10), []
+
+    def told(stage: Any) -> None:
+        done.append(stage)
+        report(len(done), total, f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}")
+
+    began = time.perf_counter()
+    parameters = network.init(of_parameters)
+    found = fit_residual(
+        plant.problem, network.value_and_gradient, parameters, of_samples, discounts=discounts, report=told, **numbers
+    )
+    return Trained(found.parameters, found.validation, time.perf_counter() - began)
+
+
+def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) -> dict[str, float]:
+    """Returns of a law in the published evaluation, from both kinds of starts; a start that fails counts as NaN."""
+    numbers: dict[str, float] = {}
+    for where in ("down", "uniform"):
+        found = evaluate(plant, law, starts(plant, where, count, seed))
+        numbers |= {
+            f"{where}_return_mean": float(np.mean(found.returns)),
+            f"{where}_return_median": float(np.median(found.returns)),
+            f"{where}_return_worst": float(np.min(found.returns)),
+            f"{where}_up_share": float(np.mean(np.isfinite(found.settled))),
+            f"{where}_settled_median_seconds": float(np.median(found.settled)),
+            f"{where}_control_most": found.most,
+        }
+    return numbers
+
+
+def save_value(folder: Path, plant: str, goal: Sequence[float] | None, family: Family, parameters: Any) -> None:
+    """Writes value.json and value.safetensors."""
+    facts = {
+        "plant": OTHER_NAMES.get(plant, plant),
+        "goal": None if goal is None else list(goal),
+        "network": {**family._asdict(), "widths": list(family.widths)},
+        "dtype": str(jax.tree.leaves(parameters)[0].dtype),
+    }
+    save_tree(folder, VALUE, parameters, facts)
+
+
+def load_value(folder: str | Path) -> ValueRun:
+    """The value function that a run of train_value left in its folder.
+
+    Raises:
+        InputError: there is none, or its files are damaged or of another release.
+    """
+    folder = Path(folder)
+    facts = load_manifest(folder, VALUE)
+    try:
+        plant = plant_named(facts["plant"], facts["goal"])
+        family = Family(**{**facts["network"], "widths": tuple(facts["network"]["widths"])})
+        network, dtype = family_of(plant, family), jnp.dtype(facts["dtype"])
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder}: {VALUE}.json does not say what its value function is ({error}); {REMEDY}"
+        ) from None
+
+    def parameters(key: Array) -> Any:
+        return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
+
+    like = jax.eval_shape(parameters, jax.random.key(0))
+    return ValueRun(plant, network, load_tree(folder, VALUE, like))
