@@ -36,21 +36,22 @@ def value_figure(
     """
     figure, axes = style.figure(2, 3, height=4.9, width=9.6)
     highest = float(np.max(values[1]))
+    heights, torques = Normalize(0, highest), Normalize(-limit, limit)
     for axis, V, name in zip(axes[0], values, ("fitted value", "value on a grid"), strict=False):
-        shown = _surface(axis, nodes, V, Normalize(0, highest), "YlGnBu")
+        _surface(axis, nodes, V, heights, "YlGnBu")
         axis.contour(*_sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
         _paths(axis, paths)
         style.title(axis, name)
-    _bar(figure, shown, axes[0, 1], "V")
+    _bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
     off = np.clip(np.abs(values[0] - values[1]) / np.maximum(values[1], 0.01 * highest), LEAST_ERROR, MOST_ERROR)
     shown = _surface(axes[0, 2], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
     style.title(axes[0, 2], f"relative error, median {np.median(off):.1e}")
     _bar(figure, shown, axes[0, 2], "|V - V*| / V*")
     for axis, u, name in zip(axes[1], controls, ("fitted policy", "policy on a grid"), strict=False):
-        shown = _surface(axis, nodes, u, Normalize(-limit, limit), "RdBu_r")
+        _surface(axis, nodes, u, torques, "RdBu_r")
         _paths(axis, paths)
         style.title(axis, name)
-    _bar(figure, shown, axes[1, 1], "u, N m")
+    _bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
     for axis in (*axes[0], *axes[1, :2]):
         axis.set(xticks=list(TICKS), xticklabels=list(TICKS.values()), xlim=(-np.pi, np.pi))
         axis.set_ylim(nodes[0, 0, 1], nodes[0, -1, 1])

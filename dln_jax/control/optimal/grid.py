@@ -102,9 +102,7 @@ def solve_on_grid(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _iterate(
-    step: Flow, grid: Grid, discount: Any, V: Array, most: Any, tolerance: Any
-) -> tuple[Array, Array, Array]:
+def _iterate(step: Flow, grid: Grid, discount: Any, V: Array, most: Any, tolerance: Any) -> tuple[Array, Array, Array]:
     nodes = jnp.asarray(grid.nodes)
     over = lambda function: jax.vmap(jax.vmap(function))  # noqa: E731
     listed = jnp.linspace(-most, most, CONTROLS)
@@ -146,7 +144,8 @@ def _iterate(
         return number + 1, V, u, change
 
     start = (jnp.asarray(0), V, jnp.zeros_like(V), jnp.asarray(jnp.inf))
-    return jax.lax.while_loop(going, iterate, start)[1:]
+    _, V, u, change = jax.lax.while_loop(going, iterate, start)
+    return V, u, change
 
 
 def interpolated(grid: Grid, values: Array, x: Any) -> Array:

@@ -85,8 +85,8 @@ def mean_value(values: Sequence[ValueAndGradient]) -> ValueAndGradient:
     """The mean of several values, and of their slopes."""
 
     def mean(x: Array) -> tuple[Array, Array]:
-        each = [value(x) for value in values]
-        return sum(V for V, _ in each) / len(each), sum(slope for _, slope in each) / len(each)
+        each, slopes = zip(*(value(x) for value in values), strict=True)
+        return jnp.mean(jnp.stack(each)), jnp.mean(jnp.stack(slopes), axis=0)
 
     return mean
 
