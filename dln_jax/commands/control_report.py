@@ -12,7 +12,7 @@ from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.control.cases import cases
 
-SUBJECTS = ("swing-up", "board", "equation")
+SUBJECTS = ("swing-up", "board", "equation", "value")
 
 
 @dataclass(frozen=True)

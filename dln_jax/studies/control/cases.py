@@ -14,7 +14,7 @@ from dln_jax.studies.control import energy_laws
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
-from dln_jax.studies.control.values import equation
+from dln_jax.studies.control.values import equation, fits
 from dln_jax.studies.report import Row, expect
 
 TURN = 2 * np.pi / 2048
@@ -85,5 +85,10 @@ def cases(*, quick: bool = False) -> list[Case]:
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
         **equation.CASES,
+        **fits.CASES,
     }
-    return [Case(name, in_float64(functools.partial(measure, quick))) for name, measure in measures.items()]
+    draw = fits.DRAWINGS
+    return [
+        Case(name, in_float64(functools.partial(measure, quick)), draw=draw.get(name))
+        for name, measure in measures.items()
+    ]
