@@ -34,6 +34,9 @@ def value_figure(
         limit: of the control.
         seconds: of the paths.
     """
+    # The circle closes: its first nodes are its last too.
+    nodes = np.concatenate([nodes, nodes[:1] + [2 * np.pi, 0]])
+    values, controls = (tuple(np.concatenate([each, each[:1]]) for each in pair) for pair in (values, controls))
     figure, axes = style.figure(2, 3, height=4.9, width=9.6)
     highest = float(np.max(values[1]))
     heights, torques = Normalize(0, highest), Normalize(-limit, limit)

@@ -150,10 +150,10 @@ def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
 
 
 def beside_ridge(found: GridValue, nodes: np.ndarray, limit: float, *, distance: float = 0.1) -> np.ndarray:
-    """Whether the best control changes by half the limit within a small share of the box, in each direction."""
+    """Whether the best control changes by half the limit within a distance, in rad, and 2.5 of it in rad/s."""
     near = [nodes + distance * np.array([i, 2.5 * j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     controls = np.stack([np.asarray(interpolated(found.grid, found.u, each)) for each in near])
-    return np.ptp(controls, axis=0) > limit
+    return np.ptp(controls, axis=0) > 0.5 * limit
 
 
 def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None = None) -> GridValue:
