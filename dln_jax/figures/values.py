@@ -36,22 +36,22 @@ def value_figure(
     """
     # The circle closes: its first nodes are its last too.
     nodes = np.concatenate([nodes, nodes[:1] + np.array([2 * np.pi, 0])])
-    values, controls = (tuple(np.concatenate([each, each[:1]]) for each in pair) for pair in (values, controls))
+    fitted, true, u, best = (np.concatenate([each, each[:1]]) for each in (*values, *controls))
     figure, axes = style.figure(2, 3, height=4.9, width=9.6)
-    highest = float(np.max(values[1]))
+    highest = float(np.max(true))
     heights, torques = Normalize(0, highest), Normalize(-limit, limit)
-    for axis, V, name in zip(axes[0], values, ("fitted value", "value on a grid"), strict=False):
+    for axis, V, name in zip(axes[0], (fitted, true), ("fitted value", "value on a grid"), strict=False):
         _surface(axis, nodes, V, heights, "YlGnBu")
         axis.contour(*_sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
         _paths(axis, paths)
         style.title(axis, name)
     _bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
-    off = np.clip(np.abs(values[0] - values[1]) / np.maximum(values[1], 0.01 * highest), LEAST_ERROR, MOST_ERROR)
+    off = np.clip(np.abs(fitted - true) / np.maximum(true, 0.01 * highest), LEAST_ERROR, MOST_ERROR)
     shown = _surface(axes[0, 2], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
     style.title(axes[0, 2], f"relative error, median {np.median(off):.1e}")
     _bar(figure, shown, axes[0, 2], "|V - V*| / V*")
-    for axis, u, name in zip(axes[1], controls, ("fitted policy", "policy on a grid"), strict=False):
-        _surface(axis, nodes, u, torques, "RdBu_r")
+    for axis, torque, name in zip(axes[1], (u, best), ("fitted policy", "policy on a grid"), strict=False):
+        _surface(axis, nodes, torque, torques, "RdBu_r")
         _paths(axis, paths)
         style.title(axis, name)
     _bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
