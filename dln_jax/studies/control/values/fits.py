@@ -36,7 +36,7 @@ class Fit(NamedTuple):
 
 
 FITS = {
-    "pendulum": Fit((64, 64, 64), Iteration(iterations=36)),
+    "pendulum": Fit((96, 96, 96), Iteration(iterations=48, starts=1536, kept=6, slope_weight=0.1, floor=0.01)),
     "cart-pole": Fit(
         (96, 96, 96),
         Iteration(
