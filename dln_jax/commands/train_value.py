@@ -51,13 +51,13 @@ class Arguments(Folder):
     goal: Unstated[str] = None
     """Posture to hold, rad or m, separated by commas (default: upright)."""
     width: Unstated[int] = None
-    """Of the hidden layers (default: 64 or 96 by the plant; residual: 24)."""
+    """Of the hidden layers (default: 96; residual: 24)."""
     depth: Unstated[int] = None
     """Hidden layers (default: 3; residual: 2)."""
     members: Unstated[int] = None
     """Networks, of which V is the mean (default: 1)."""
     iterations: Unstated[int] = None
-    """Of value iteration, or of Gauss-Newton for each discount (default: 36 or 40; residual: 15)."""
+    """Of value iteration, or of Gauss-Newton for each discount (default: 48 or 40 by the plant; residual: 15)."""
     seed: int = 0
     """Of parameters and states."""
     seeds: int = 1
