@@ -14,7 +14,9 @@ from dln_jax.command_line.running import command_folder
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.control.cases import cases
 
-SUBJECTS = ("swing-up", "starts", "board", "learned", "equation", "tracking", "robustness", "laws", "receding")
+SUBJECTS = (
+    "swing-up", "starts", "board", "learned", "equation", "value", "tracking", "robustness", "laws", "receding",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

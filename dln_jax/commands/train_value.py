@@ -5,9 +5,11 @@ and what the law costs in the published evaluation (100 starts), and writes a ru
 value.json (load them with dln_jax.runs.values.load_value), metrics.json and config.json.
 """
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -15,26 +17,27 @@ from dln_jax.command_line.arguments import Unstated, choice, require_positive_if
 from dln_jax.command_line.options import Folder
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
+from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.files import finite, write_json
 from dln_jax.precision import with_float64
 from dln_jax.runs.results import print_numbers
 from dln_jax.runs.values import (
+    ITERATIONS,
     METHODS,
     Family,
     Trained,
     ValueRun,
+    by_equation,
+    by_iteration,
     family_of,
     load_value,
     measured,
     plant_named,
     save_value,
-    train,
+    usual,
 )
 from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
 from dln_jax.types import InputError, require_positive, require_seed
-
-WIDTHS = {"fitted": 64, "residual": 24}
-DEPTHS = {"fitted": 2, "residual": 2}
 
 
 @dataclass(frozen=True)
@@ -48,13 +51,13 @@ class Arguments(Folder):
     goal: Unstated[str] = None
     """Posture to hold, rad or m, separated by commas (default: upright)."""
     width: Unstated[int] = None
-    """Of the hidden layers (default: 64; residual: 24)."""
+    """Of the hidden layers (default: 96; residual: 24)."""
     depth: Unstated[int] = None
-    """Hidden layers (default: 2)."""
+    """Hidden layers (default: 3; residual: 2)."""
     members: Unstated[int] = None
     """Networks, of which V is the mean (default: 1)."""
     iterations: Unstated[int] = None
-    """Of value iteration, or of Gauss-Newton for each discount (default: those of the method)."""
+    """Of value iteration, or of Gauss-Newton for each discount (default: 48 or 40 by the plant; residual: 15)."""
     seed: int = 0
     """Of parameters and states."""
     seeds: int = 1
@@ -70,8 +73,6 @@ def main(given: Arguments) -> None:
     require_positive(seeds=given.seeds, starts=given.starts)
     require_seed(given.seed, given.seeds)
     require_positive_if_given(given, ("width", "depth", "members", "iterations"))
-    if given.method not in METHODS:
-        raise InputError(f"--method: '{given.method}' is unknown; choose from {', '.join(METHODS)}")
     if given.stored is not None:
         run = load_value(given.stored)
         with command_folder(given, "train_value") as folder:
@@ -79,36 +80,36 @@ def main(given: Arguments) -> None:
         return
     goal = posture(given.goal)
     plant = plant_named(given.plant, goal)
-    width, depth = given.width or WIDTHS[given.method], given.depth or DEPTHS[given.method]
-    family = Family((width,) * depth, given.members or 1)
-    network = family_of(plant, family)
+    fit = usual(given.plant, given.method)
+    width, depth = given.width or fit.widths[0], given.depth or len(fit.widths)
+    family = Family((width,) * depth, given.members or 1, scale=fit.scale)
     with command_folder(given, "train_value", family=family._asdict()) as folder:
         print(f"{given.plant}: {given.method}, {family.members} x {depth} layers of {width}")
-        trained = [trained_one(plant, family, given, given.seed + number) for number in range(given.seeds)]
+        trained = train(given, plant, family, fit.numbers)
         best = min(trained, key=lambda each: each.validation)
         save_value(folder, given.plant, goal, family, best.parameters)
         numbers = {"train_seconds": best.train_seconds, "validation": best.validation}
         if len(trained) > 1:
             numbers |= over_seeds(trained)
-        finish(folder, ValueRun(plant, network, with_float64(best.parameters)), given, numbers)
+        finish(folder, ValueRun(plant, family_of(plant, family), with_float64(best.parameters)), given, numbers)
 
 
-def trained_one(plant: ValuePlant, family: Family, given: Arguments, seed: int) -> Trained:
-    """The training of a seed, with its progress."""
-    numbers: dict[str, Any] = {} if given.iterations is None else {"iterations": given.iterations}
-    shown: list[Any] = []
+def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteration) -> list[Trained]:
+    """The trainings of all seeds, with their progress."""
+    seeds = range(given.seed, given.seed + given.seeds)
+    with contextlib.ExitStack() as stack:
+        show: list[Callable[[int, str], None]] = []
 
-    def report(done: int, total: int, text: str) -> None:
-        if not shown:
-            shown.append(bar := progress(total, "iterations"))
-            shown.append(bar.__enter__())
-        shown[1](done, text)
+        def report(done: int, total: int, text: str) -> None:
+            if not show:
+                show.append(stack.enter_context(progress(total, "iterations")))
+            show[0](done, text)
 
-    try:
-        return train(plant, family, given.method, seed, report=report, **numbers)
-    finally:
-        if shown:
-            shown[0].__exit__(None, None, None)
+        if given.method == "residual":
+            return by_equation(plant, family, given.iterations or ITERATIONS, seeds, report)
+        return by_iteration(
+            plant, family, numbers._replace(iterations=given.iterations or numbers.iterations), seeds, report
+        )
 
 
 def over_seeds(trained: list[Trained]) -> dict[str, float]:

@@ -1,8 +1,9 @@
 """Value functions of published plants into run folders, and back from them."""
 
 import functools
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,13 +14,14 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.balance import Law
-from dln_jax.control.optimal.fitted import Iteration, fit_value
+from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
-from dln_jax.control.optimal.residual import discounts_down_to, fit_residual
+from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.nn.activations import activation
 from dln_jax.studies.control.values.evaluation import evaluate, starts
+from dln_jax.studies.control.values.fits import FITS, Fit
 from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
@@ -28,6 +30,10 @@ VALUE = "value"
 """Name of the file pair in a run's folder that holds the value function."""
 OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
 METHODS = ("fitted", "residual")
+ROUNDS = 6
+"""Of new samples at the problem's own discount."""
+ITERATIONS = 15
+"""Of Gauss-Newton for each discount."""
 Report = Callable[[int, int, str], None]
 """(iterations done, of how many, what they came to)."""
 
@@ -98,34 +104,52 @@ def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
     return value_network(plant.problem, **{**family._asdict(), "activation": activation(family.activation)})
 
 
-def train(plant: ValuePlant, family: Family, method: str, seed: int, *, report: Report, **numbers: Any) -> Trained:
-    """A value function by one of `METHODS`; numbers are those of `fitted.Iteration`, or of `fit_residual`."""
-    network = family_of(plant, family)
-    if method == "fitted":
-        settings = Iteration(**numbers)
-        fit = fit_value(
-            plant.problem, network, seed=seed, numbers=settings,
-            report=lambda at: report(at.iteration, settings.iterations, f"cost and misfit {at.validation:.4g}"),
-        )  # fmt: skip
-        return Trained(
-            fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds
-        )
-    if method != "residual":
+def usual(name: str, method: str) -> Fit:
+    """Network and numbers that a plant is trained with unless others are asked for."""
+    if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
-    of_parameters, of_samples = jax.random.split(jax.random.key(seed))
-    discounts = discounts_down_to(plant.problem.discount)
-    total, done = len(discounts) - 1 + numbers.get("rounds", 10), []
+    if method == "residual":
+        return Fit((24, 24), Iteration(), 30.0)
+    return FITS.get(OTHER_NAMES.get(name, name), FITS["cart-pole"])
 
-    def told(stage: Any) -> None:
-        done.append(stage)
-        report(len(done), total, f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}")
 
-    began = time.perf_counter()
-    parameters = network.init(of_parameters)
-    found = fit_residual(
-        plant.problem, network.value_and_gradient, parameters, of_samples, discounts=discounts, report=told, **numbers
-    )
-    return Trained(found.parameters, found.validation, time.perf_counter() - began)
+def by_iteration(
+    plant: ValuePlant, family: Family, numbers: Iteration, seeds: Sequence[int], report: Report
+) -> list[Trained]:
+    """Values by fitted value iteration, one for each seed."""
+    done, total = itertools.count(1), len(seeds) * numbers.iterations
+
+    def told(at: Progress) -> None:
+        report(next(done), total, f"cost and misfit {at.validation:.4g}")
+
+    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, report=told)
+    return [
+        Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
+        for fit in fits
+    ]
+
+
+def by_equation(
+    plant: ValuePlant, family: Family, iterations: int, seeds: Sequence[int], report: Report
+) -> list[Trained]:
+    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed."""
+    network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
+    each = len(discounts) - 1 + ROUNDS
+    trained: list[Trained] = []
+    for place, seed in enumerate(seeds):
+        of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+        done, began = itertools.count(1 + place * each), time.perf_counter()
+
+        def told(stage: Stage, done: Iterator[int] = done) -> None:
+            text = f"discount {stage.discount:.3g}/s, residual {stage.validation:.2e}"
+            report(next(done), len(seeds) * each, text)
+
+        found = fit_residual(
+            plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
+            discounts=discounts, iterations=iterations, rounds=ROUNDS, report=told,
+        )  # fmt: skip
+        trained.append(Trained(found.parameters, found.validation, time.perf_counter() - began))
+    return trained
 
 
 def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) -> dict[str, float]:

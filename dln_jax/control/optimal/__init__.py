@@ -3,6 +3,8 @@
 from dln_jax.control.optimal import action_costs
 from dln_jax.control.optimal.action_costs import ActionCost
 from dln_jax.control.optimal.adversaries import Bounds, adversary
+from dln_jax.control.optimal.fitted import Fitted, Iteration, fit_value, fit_values
+from dln_jax.control.optimal.grid import GridValue, interpolated, solve_on_grid
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import (
     Affine,
@@ -23,6 +25,9 @@ __all__ = [
     "Affine",
     "Bounds",
     "ControlProblem",
+    "Fitted",
+    "GridValue",
+    "Iteration",
     "ResidualFit",
     "Stage",
     "ValueNetwork",
@@ -32,11 +37,15 @@ __all__ = [
     "checked",
     "discounts_down_to",
     "fit_residual",
+    "fit_value",
+    "fit_values",
     "from_field",
     "from_plant",
     "hjb_policy",
     "hjb_residual",
+    "interpolated",
     "optimal_control",
     "rates",
+    "solve_on_grid",
     "value_network",
 ]

@@ -15,9 +15,10 @@ of what the policy is off, and the iteration is Howard's of policies, which conv
 short one they are the value's of n-step returns, which needs no good policy.
 """
 
+import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -32,29 +33,32 @@ from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, op
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.types import InputError, require_positive
 
+VALIDATED = 256
+"""States from which the policy's cost is compared between iterations."""
+
 
 class Iteration(NamedTuple):
     """Numbers of fitted value iteration."""
 
-    iterations: int = 40
+    iterations: int = 36
     starts: int = 1024
     """States that are drawn in an iteration."""
     seconds: float = 3.0
     """For which the policy is followed from each."""
     dt: float = 0.02
     """s, of a step."""
-    memory: float = 1.0
+    memory: float = 3.0
     """s, in the last iteration; infinite for the policy's own cost."""
-    first_memory: float = 0.2
+    first_memory: float = 0.3
     """s, in the first."""
     kept: int = 8
     """States of a trajectory that are fitted: the first, and others ever less densely."""
     steps: int = 200
     """Of Adam in an iteration."""
     batch: int = 1024
-    learning_rate: float = 3e-3
+    learning_rate: float = 1e-2
     """The largest; falls by a cosine over all iterations."""
-    slope_weight: float = 0.3
+    slope_weight: float = 0.05
     """Of the slopes' misfit, in units of the box, beside that of the values."""
     floor: float = 0.02
     """Share of the largest target that is added to a target to make a misfit relative."""
@@ -158,41 +162,76 @@ def fit_value(
     Raises:
         InputError: numbers out of range, or a value that was never finite.
     """
+    (found,) = fit_values(
+        problem, network, (seed,), numbers=numbers, parameters=parameters, double=double, report=report
+    )
+    return found
+
+
+def fit_values(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    seeds: Sequence[int],
+    *,
+    numbers: Iteration = Iteration(),  # noqa: B008
+    parameters: Any = None,
+    double: bool = False,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> list[Fitted]:
+    """As `fit_value` for several seeds, one after the other, by a program that is compiled once."""
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
+    problem = widened(problem, numbers.margin)
     with jax.enable_x64(double):
-        return _fit(widened(problem, numbers.margin), network, seed, numbers, parameters, report)
+        began = time.perf_counter()
+        programs = _compiled(problem, network, numbers, parameters)
+        compile_seconds = time.perf_counter() - began
+        return [_fit(programs, seed, numbers, parameters, report, compile_seconds) for seed in seeds]
+
+
+class _Programs(NamedTuple):
+    begin: Callable[[Array, Any], tuple[Any, ...]]
+    """(key, parameters or none) -> parameters, state of the optimiser, validation states."""
+    iterate: Callable[..., tuple[Any, Any, Array]]
+    score: Callable[[Any, Array], Array]
+
+
+def _compiled(problem: ControlProblem, network: ValueNetwork, numbers: Iteration, parameters: Any) -> _Programs:
+    rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
+    adam = optax.adam(rate, b2=0.99)
+
+    def begin(key: Array, parameters: Any) -> tuple[Any, ...]:
+        if parameters is None:
+            parameters = network.init(jax.random.fold_in(key, 0))
+        parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
+        return parameters, adam.init(parameters), drawn(problem, jax.random.fold_in(key, 1), VALIDATED)
+
+    key = jax.random.key(0)
+    parameters, state, validated = begin(key, parameters)
+    iterate = jax.jit(functools.partial(_iterate, problem, network, numbers, adam))
+    score = jax.jit(functools.partial(_score, problem, network, numbers))
+    return _Programs(
+        begin,
+        iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile(),
+        score.lower(parameters, validated).compile(),
+    )
 
 
 def _fit(
-    problem: ControlProblem,
-    network: ValueNetwork,
+    programs: _Programs,
     seed: int,
     numbers: Iteration,
     parameters: Any,
     report: Callable[[Progress], None],
+    compile_seconds: float,
 ) -> Fitted:
-    key = jax.random.key(seed)
-    if parameters is None:
-        parameters = network.init(jax.random.fold_in(key, 0))
-    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
-    rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
-    adam = optax.adam(rate, b2=0.99)
-    state = adam.init(parameters)
-    validated = drawn(problem, jax.random.fold_in(key, 1), 256)
-
-    began = time.perf_counter()
-    iterate = jax.jit(lambda *given: _iterate(problem, network, numbers, adam, *given))
-    iterate = iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile()
-    score = jax.jit(lambda parameters: _score(problem, network, numbers, parameters, validated))
-    score = score.lower(parameters).compile()
-    compile_seconds, began = time.perf_counter() - began, time.perf_counter()
-
+    began, key = time.perf_counter(), jax.random.key(seed)
+    parameters, state, validated = programs.begin(key, parameters)
     best, least, history = parameters, math.inf, []
     for number in range(numbers.iterations):
         grown = number / max(numbers.iterations - 1, 1)
-        memory = numbers.first_memory ** (1 - grown) * numbers.memory**grown
-        parameters, state, loss = iterate(parameters, state, jax.random.fold_in(key, 2 + number), jnp.asarray(memory))
-        now = float(score(parameters))
+        memory = jnp.asarray(numbers.first_memory ** (1 - grown) * numbers.memory**grown)
+        parameters, state, loss = programs.iterate(parameters, state, jax.random.fold_in(key, 2 + number), memory)
+        now = float(programs.score(parameters, validated))
         if now < least:
             best, least = parameters, now
         history.append(Progress(number + 1, float(loss), now, time.perf_counter() - began))
@@ -211,9 +250,16 @@ def widened(problem: ControlProblem, factor: float) -> ControlProblem:
 
 
 def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
-    """States uniform in the box."""
-    low, high = (jnp.asarray(each, float) for each in (problem.low, problem.high))
-    return low + (high - low) * jax.random.uniform(key, (count, len(low)))
+    """States of which half are uniform in the box, and half in boxes that are shrunk, by a share that is uniform too.
+
+    Angles on a circle are uniform in both. In a box of several dimensions nearly all states are far from rest, where
+    few motions ever are.
+    """
+    of_box, of_share = jax.random.split(key)
+    low, high, goal = (jnp.asarray(each, float) for each in (problem.low, problem.high, problem.goal))
+    x = low + (high - low) * jax.random.uniform(of_box, (count, len(low)))
+    share = jnp.where(jnp.arange(count) % 2 == 0, 1.0, jax.random.uniform(of_share, (count,)))
+    return jnp.where(circles(problem), x, goal + share[:, None] * (x - goal))
 
 
 def _iterate(

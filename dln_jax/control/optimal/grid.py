@@ -4,8 +4,8 @@
 
 A semi-Lagrangian scheme (Falcone and Ferretti 2014): the feet x(dt) of characteristics are found by the classical
 Runge-Kutta method with held controls, and V there by bicubic interpolation that is limited to the values of the four
-corners around (Bermejo and Staniforth 1992), without which it would overshoot at ridges. Policies and values are improved
-in turn (Howard 1960): controls are the best of a list, refined by a parabola. Coarse grids start fine ones.
+corners around (Bermejo and Staniforth 1992), without which it would overshoot at ridges. Policies and values are
+improved in turn (Howard 1960): controls are the best of a list, refined by a parabola. Coarse grids start fine ones.
 """
 
 import math
@@ -66,6 +66,7 @@ def solve_on_grid(
     most: float,
     dt: float = 0.02,
     tolerance: float = 1e-7,
+    start: GridValue | None = None,
 ) -> GridValue:
     """The value on the last of some grids, each of so many points a side, the coarsest first.
 
@@ -78,6 +79,7 @@ def solve_on_grid(
         most: size of the largest control, where its cost is finite.
         dt: s. Controls are held for it, which costs O(dt²).
         tolerance: of V, relative to its largest, in a sweep.
+        start: a solution on a coarser grid.
 
     Raises:
         InputError: another number of states, or settings out of range.
@@ -88,7 +90,7 @@ def solve_on_grid(
     require_positive(most=most, dt=dt, tolerance=tolerance, least_points=min(points) - 4)
     circle = tuple(bool(each) for each in circles(problem))
     step = flow(problem, dt)
-    found = None
+    found = start
     for count in points:
         shape = tuple(count - 1 if round_ else count for round_ in circle)
         grid = Grid(tuple(low.tolist()), tuple(((high - low) / (count - 1)).tolist()), shape, circle)
@@ -100,9 +102,7 @@ def solve_on_grid(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _iterate(
-    step: Flow, grid: Grid, discount: float, V: Array, most: float, tolerance: float
-) -> tuple[Array, Array, Array]:
+def _iterate(step: Flow, grid: Grid, discount: Any, V: Array, most: Any, tolerance: Any) -> tuple[Array, Array, Array]:
     nodes = jnp.asarray(grid.nodes)
     over = lambda function: jax.vmap(jax.vmap(function))  # noqa: E731
     listed = jnp.linspace(-most, most, CONTROLS)
@@ -144,7 +144,8 @@ def _iterate(
         return number + 1, V, u, change
 
     start = (jnp.asarray(0), V, jnp.zeros_like(V), jnp.asarray(jnp.inf))
-    return jax.lax.while_loop(going, iterate, start)[1:]
+    _, V, u, change = jax.lax.while_loop(going, iterate, start)
+    return V, u, change
 
 
 def interpolated(grid: Grid, values: Array, x: Any) -> Array:
@@ -153,14 +154,14 @@ def interpolated(grid: Grid, values: Array, x: Any) -> Array:
 
 
 class _Places(NamedTuple):
-    """Where to read in the grid: nodes around each state, and their weights."""
+    """Where to read in the grid: nodes about each state with their weights, and those of the cell that it is in."""
 
     rows: Array
     columns: Array
     row_weights: Array
     column_weights: Array
-    between: Array
-    """Whether the two nodes in the middle of each are around the state, and not beside it at an edge."""
+    cell_rows: Array
+    cell_columns: Array
 
 
 def _at(grid: Grid, values: Array, x: Array) -> Array:
@@ -168,20 +169,22 @@ def _at(grid: Grid, values: Array, x: Array) -> Array:
 
 
 def _places(grid: Grid, x: Array) -> _Places:
-    shape = grid.shape
-    read = [_cubic(x[..., i], grid.low[i], grid.steps[i], shape[i], grid.circle[i]) for i in range(2)]
-    return _Places(read[0][0], read[1][0], read[0][1], read[1][1], read[0][2] & read[1][2])
+    sides = zip(grid.low, grid.steps, grid.shape, grid.circle, strict=True)
+    (rows, row_weights, cell_rows), (columns, column_weights, cell_columns) = (
+        _cubic(x[..., i], *side) for i, side in enumerate(sides)
+    )
+    return _Places(rows, columns, row_weights, column_weights, cell_rows, cell_columns)
 
 
-def _cubic(x: Array, low: Array, step: Array, count: int, circle: bool) -> tuple[Array, Array, Array]:
-    """Four nodes [4, ...] about x on an axis, the weights of Lagrange's polynomial, whether x is in their middle."""
+def _cubic(x: Array, low: float, step: float, count: int, circle: bool) -> tuple[Array, Array, Array]:
+    """Four nodes [4, ...] about x on a side, the weights of Lagrange's polynomial, and the two nodes around x."""
     place = (x - low) / step
+    cell = jnp.floor(place)
     if not circle:
         place = jnp.clip(place, 0.0, count - 1.0)
-    first = jnp.floor(place)
-    if not circle:
-        # At an edge the same cell is read from its side.
-        first = jnp.clip(first, 1.0, count - 3.0)
+        cell = jnp.clip(cell, 0.0, count - 2.0)
+    # At an edge the four nodes are to one side of the cell.
+    first = cell if circle else jnp.clip(cell, 1.0, count - 3.0)
     s = place - first
     weights = jnp.stack(
         [
@@ -192,18 +195,14 @@ def _cubic(x: Array, low: Array, step: Array, count: int, circle: bool) -> tuple
         ]
     )
     nodes = first.astype(jnp.int32) + jnp.arange(-1, 3).reshape(4, *[1] * x.ndim)
-    return jnp.mod(nodes, count) if circle else nodes, weights, (s >= 0) & (s <= 1)
+    around = cell.astype(jnp.int32) + jnp.arange(2).reshape(2, *[1] * x.ndim)
+    return (jnp.mod(nodes, count), weights, jnp.mod(around, count)) if circle else (nodes, weights, around)
 
 
 def _read(values: Array, at: _Places) -> Array:
     total = jnp.zeros(at.rows.shape[1:], values.dtype)
-    least, most = jnp.full_like(total, jnp.inf), jnp.full_like(total, -jnp.inf)
     for i in range(4):
-        row = jnp.zeros_like(total)
-        for j in range(4):
-            each = values[at.rows[i], at.columns[j]]
-            row += at.column_weights[j] * each
-            if i in (1, 2) and j in (1, 2):
-                least, most = jnp.minimum(least, each), jnp.maximum(most, each)
+        row = sum(at.column_weights[j] * values[at.rows[i], at.columns[j]] for j in range(4))
         total += at.row_weights[i] * row
-    return jnp.where(at.between, jnp.clip(total, least, most), total)
+    corners = jnp.stack([values[row, column] for row in at.cell_rows for column in at.cell_columns])
+    return jnp.clip(total, jnp.min(corners, axis=0), jnp.max(corners, axis=0))

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from dln_jax.studies.control import energy_laws, laws_in_c, learned, pictures, r
 from dln_jax.studies.control.board import Motor, criteria, plant, play
 from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
 from dln_jax.studies.control.planned import Weights, follower, search
-from dln_jax.studies.control.values import equation
+from dln_jax.studies.control.values import equation, fits
 from dln_jax.studies.report import Row, expect
 
 TURN = 2 * np.pi / 2048
@@ -86,6 +87,7 @@ def cases(*, quick: bool = False) -> list[Case]:
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
         "board/pendubot-planned": functools.partial(by_plan, "shoulder"),
         **equation.CASES,
+        **fits.CASES,
         "tracking/seven-axis": tracking.tracking,
         "robustness/acrobot": functools.partial(robustness.robust, "elbow"),
         "robustness/pendubot": functools.partial(robustness.robust, "shoulder"),
@@ -94,4 +96,8 @@ def cases(*, quick: bool = False) -> list[Case]:
     }
     found = {name: functools.partial(measure, quick) for name, measure in measures.items()} | learned.cases(quick)
     drawn = {**pictures.DRAWN, "robustness": robustness.draw}
-    return [Case(name, in_float64(measure), draw=drawn.get(name.split("/")[0])) for name, measure in found.items()]
+
+    def drawing(name: str) -> Callable[..., Any] | None:
+        return fits.DRAWINGS.get(name, drawn.get(name.split("/")[0]))
+
+    return [Case(name, in_float64(measure), draw=drawing(name)) for name, measure in found.items()]

@@ -24,6 +24,7 @@ from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.flexible_cart_pole import flexible_cart_pole
 from dln_jax.studies.case import Findings
+from dln_jax.studies.control.values import robust
 from dln_jax.studies.control.values.evaluation import evaluate, starts
 from dln_jax.studies.control.values.plants import PLANTS
 from dln_jax.studies.report import Row, expect, largest, unit_of
@@ -175,5 +176,6 @@ CASES: dict[str, Callable[[bool], Findings]] = {
     "equation/line": line,
     "equation/flexible-cart-pole": linear,
     "equation/pendulum": published,
+    "equation/robust": robust.pendulum,
 }
 """Of the report of control."""

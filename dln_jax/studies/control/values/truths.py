@@ -5,7 +5,8 @@ with the discount: A - rho/2 in place of A. Several guesses are improved, and th
 from above and is V where one of the guesses leads to the best trajectory.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -40,56 +41,57 @@ def regulator_value(problem: ControlProblem) -> Callable[[Array], Scalar]:
 def direct_values(
     problem: ControlProblem,
     x: Any,
+    guesses: Any,
     *,
     limit: float,
-    seconds: float = 4.0,
-    dt: float = 0.02,
-    guesses: Sequence[Callable[[np.ndarray], np.ndarray]] = (),
-    iterations: int = 100,
+    dt: float,
+    iterations: int = 60,
     tolerance: float = 1e-7,
-) -> tuple[Float[np.ndarray, "G N"], Float[np.ndarray, "G N K"]]:
-    """Costs from states x [N, n], of each guess, and its controls, of problems with one control.
+) -> Float[np.ndarray, "G N"]:
+    """Costs from states x [N, n], of each guess, of problems with one control.
+
+    The integral of the state's cost is by the trapezoidal rule, whose error, as that of held controls, is of dt².
 
     Args:
         problem: what is controlled.
         x: the starts.
+        guesses: controls [G, N, K] of the horizon's K steps.
         limit: of the control.
-        seconds: horizon.
-        dt: s.
-        guesses: t [K] -> controls [K]; by default waves of three periods, to either side, and none.
+        dt: s, of a step.
         iterations: of the optimisation, at most.
         tolerance: relative change of the cost at which it ends.
     """
-    steps = round(seconds / dt)
-    t = dt * np.arange(steps)
-    begin = np.stack([guess(t) for guess in guesses or waves(limit)])
-    move, discount, tail = flow(problem, dt, substeps=2), np.exp(-problem.discount * dt), regulator_value(problem)
+    move, tail = flow(problem, dt), regulator_value(problem)
+    discount, half = math.exp(-problem.discount * dt), math.exp(-problem.discount * dt / 2)
 
     def step(state: Array, u: Array) -> Array:
         return jnp.append(move(state[:-1], u)[0], state[-1] * discount)
 
-    planned = Problem(
-        step,
-        lambda state, u: state[-1] * move(state[:-1], u)[1],
-        lambda state: state[-1] * tail(state[:-1]),
-        -limit,
-        limit,
-    )
+    def cost(state: Array, u: Array) -> Scalar:
+        return state[-1] * dt * (problem.state_cost(state[:-1]) + half * problem.action_cost.cost(u))
 
-    def best(x: Array, u: Array) -> tuple[Array, Array]:
+    def final(state: Array) -> Scalar:
+        return state[-1] * (tail(state[:-1]) + 0.5 * dt * problem.state_cost(state[:-1]))
+
+    planned = Problem(step, cost, final, -limit, limit)
+
+    def best(x: Array, u: Array) -> Array:
         plan = optimise(planned, jnp.append(x, 1.0), u[:, None], iterations=iterations, tolerance=tolerance)
-        return plan.cost, plan.u[:, 0]
+        return plan.cost - 0.5 * dt * problem.state_cost(x)
 
     # One guess after the other: a batch takes as long as its slowest.
-    of_all = jax.jit(lambda u: jax.vmap(lambda x: best(x, u))(jnp.asarray(x, float)))
-    found = [of_all(u) for u in begin]
-    return np.stack([cost for cost, _ in found]), np.stack([u for _, u in found])
+    of_all = jax.jit(jax.vmap(best))
+    return np.stack([of_all(jnp.asarray(x, float), jnp.asarray(u, float)) for u in guesses])
 
 
-def waves(limit: float) -> list[Callable[[np.ndarray], np.ndarray]]:
-    """A half of the limit at three periods, fading within a second, to either side."""
-    return [
-        lambda t, period=period, side=side: side * 0.5 * limit * np.sin(2 * np.pi * t / period) * np.exp(-t)
-        for period in (0.5, 0.8, 1.2)
-        for side in (-1.0, 1.0)
-    ]
+def followed(
+    problem: ControlProblem, law: Callable[[Array], Array], x: Any, *, dt: float, steps: int
+) -> Float[np.ndarray, "N K"]:
+    """The controls of a law of one control from states x [N, n], as guesses."""
+    move = flow(problem, dt)
+
+    def step(x: Array, _: Any) -> tuple[Array, Array]:
+        u = law(x)
+        return move(x, u)[0], u[0]
+
+    return np.asarray(jax.jit(jax.vmap(lambda x: jax.lax.scan(step, x, length=steps)[1]))(jnp.asarray(x, float)))

@@ -1,0 +1,105 @@
+"""Pictures of the cost to go of a pendulum: level sets and the paths that descend them, policies, and errors."""
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from dln_jax.figures import style
+
+LEVELS = 16
+LEAST_ERROR, MOST_ERROR = 1e-4, 1.0
+"""Relative errors that are drawn apart."""
+TICKS = {-np.pi: "-π", -np.pi / 2: "-π/2", 0.0: "0", np.pi / 2: "π/2", np.pi: "π"}
+
+
+def value_figure(
+    nodes: Float[np.ndarray, "A B 2"],
+    values: tuple[np.ndarray, np.ndarray],
+    controls: tuple[np.ndarray, np.ndarray],
+    paths: Float[np.ndarray, "N T 2"],
+    *,
+    limit: float,
+    seconds: float,
+) -> Figure:
+    """A fitted value and policy beside true ones, the error between, and the closed loop from downward starts.
+
+    Args:
+        nodes: states, the first coordinate an angle that is zero upright.
+        values: V there [A, B], fitted and true.
+        controls: likewise.
+        paths: of the closed loop with the fitted policy.
+        limit: of the control.
+        seconds: of the paths.
+    """
+    # The circle closes: its first nodes are its last too.
+    nodes = np.concatenate([nodes, nodes[:1] + np.array([2 * np.pi, 0])])
+    fitted, true, u, best = (np.concatenate([each, each[:1]]) for each in (*values, *controls))
+    figure, axes = style.figure(2, 3, height=4.9, width=9.6)
+    highest = float(np.max(true))
+    heights, torques = Normalize(0, highest), Normalize(-limit, limit)
+    for axis, V, name in zip(axes[0], (fitted, true), ("fitted value", "value on a grid"), strict=False):
+        _surface(axis, nodes, V, heights, "YlGnBu")
+        axis.contour(*_sides(nodes), V.T, np.linspace(0, highest, LEVELS), colors="0.25", linewidths=0.35)
+        _paths(axis, paths)
+        style.title(axis, name)
+    _bar(figure, ScalarMappable(heights, "YlGnBu"), axes[0, 1], "V")
+    off = np.clip(np.abs(fitted - true) / np.maximum(true, 0.01 * highest), LEAST_ERROR, MOST_ERROR)
+    shown = _surface(axes[0, 2], nodes, off, LogNorm(LEAST_ERROR, MOST_ERROR), "inferno")
+    style.title(axes[0, 2], f"relative error, median {np.median(off):.1e}")
+    _bar(figure, shown, axes[0, 2], "|V - V*| / V*")
+    for axis, torque, name in zip(axes[1], (u, best), ("fitted policy", "policy on a grid"), strict=False):
+        _surface(axis, nodes, torque, torques, "RdBu_r")
+        _paths(axis, paths)
+        style.title(axis, name)
+    _bar(figure, ScalarMappable(torques, "RdBu_r"), axes[1, 1], "u, N m")
+    for axis in (*axes[0], *axes[1, :2]):
+        axis.set(xticks=list(TICKS), xticklabels=list(TICKS.values()), xlim=(-np.pi, np.pi))
+        axis.set_ylim(nodes[0, 0, 1], nodes[0, -1, 1])
+    for axis in axes[:, 0]:
+        axis.set_ylabel("rate, rad/s")
+    for axis in (axes[0, 2], *axes[1, :2]):
+        axis.set_xlabel("angle from upright, rad")
+    _over_time(axes[1, 2], paths, seconds)
+    return figure
+
+
+def _sides(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return nodes[:, 0, 0], nodes[0, :, 1]
+
+
+def _surface(axis: Axes, nodes: np.ndarray, values: np.ndarray, norm: Normalize, colours: str) -> ScalarMappable:
+    axis.grid(False)
+    return axis.pcolormesh(*_sides(nodes), values.T, norm=norm, cmap=colours, shading="gouraud", rasterized=True)
+
+
+def _bar(figure: Figure, shown: ScalarMappable, axis: Axes, label: str) -> None:
+    bar = figure.colorbar(shown, ax=axis, pad=0.02, aspect=28)
+    bar.set_label(label, fontsize=style.SMALL)
+    bar.ax.tick_params(labelsize=style.SMALL)
+    bar.outline.set_visible(False)
+
+
+def _paths(axis: Axes, paths: np.ndarray) -> None:
+    """On the circle, with gaps where an angle goes round."""
+    for path in paths:
+        angle = np.arctan2(np.sin(path[:, 0]), np.cos(path[:, 0]))
+        angle[1:][np.abs(np.diff(angle)) > np.pi] = np.nan
+        axis.plot(angle, path[:, 1], color=style.VERMILLION, linewidth=0.8, alpha=0.8)
+    axis.plot(0, 0, "o", color="white", markeredgecolor="black", markersize=4.5)
+
+
+def _over_time(axis: Axes, paths: np.ndarray, seconds: float) -> None:
+    t = np.linspace(0, seconds, paths.shape[1])
+    for path in paths:
+        # Upright is whichever turn the pole comes to.
+        turns = 2 * np.pi * np.round(path[-1, 0] / (2 * np.pi))
+        axis.plot(t, path[:, 0] - turns, color=style.VERMILLION, linewidth=0.9, alpha=0.8)
+    axis.axhline(0, color="0.4", linewidth=0.7)
+    low, high = (np.round(edge / np.pi) for edge in (axis.get_ylim()[0], axis.get_ylim()[1]))
+    marks = np.pi * np.arange(low, high + 1)
+    axis.set(xlim=(0, seconds), xlabel="t, s", yticks=marks)
+    axis.set_yticklabels([f"{round(mark / np.pi)}π" if mark else "0" for mark in marks])
+    style.title(axis, "angle from upright, closed loop")

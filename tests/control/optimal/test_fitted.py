@@ -1,0 +1,87 @@
+"""Targets are costs along trajectories, with their slopes; iterations find the value that is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.control import lqr
+from dln_jax.control.optimal.action_costs import limited_atan, quadratic
+from dln_jax.control.optimal.fitted import Iteration, drawn, fit_value, fit_values, targets, widened
+from dln_jax.control.optimal.flow import flow
+from dln_jax.control.optimal.problem import ControlProblem, optimal_control
+from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.types import InputError
+
+PENDULUM = ControlProblem(
+    lambda x: jnp.stack([x[1], 10 * jnp.sin(x[0])]),
+    lambda x: jnp.array([[0.0], [3.0]]),
+    lambda x: 4 * jnp.sin(x[0] / 2) ** 2 + 0.1 * x[1] ** 2,
+    limited_atan(2.5, 2.0),
+    0.1,
+    [-np.pi, -8.0],
+    [np.pi, 8.0],
+    ("revolute",),
+    [0.0, 0.0],
+)
+LINE = ControlProblem(
+    lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.2, [-2.0], [2.0], (), [0.0]
+)
+NETWORK = value_network(PENDULUM, widths=(8,), scale=10.0)
+
+
+def value_of(network, seed=0):
+    parameters = network.init(jax.random.key(seed))
+    return lambda x: network.value_and_gradient(parameters, x)
+
+
+def test_targets_are_weighted_returns_and_their_slopes():
+    value, x, steps, dt = value_of(NETWORK), jnp.array([2.0, 1.0]), 4, 0.02
+    step, discount = flow(PENDULUM, dt, clipped=True), np.exp(-0.1 * dt)
+
+    def weighted_returns(x, memory):
+        """The sum over n of weights times the return of n steps, as it is printed."""
+        w = jnp.exp(-dt / memory)
+        weights = jnp.append((1 - w) * w ** jnp.arange(steps - 1), w ** (steps - 1))
+
+        def onwards(carry, n):
+            x, total = carry
+            after, cost = step(x, optimal_control(PENDULUM, x, value(x)[1]))
+            total = total + discount**n * cost
+            return (after, total), total + discount ** (n + 1) * value(after)[0]
+
+        return weights @ jax.lax.scan(onwards, (x, jnp.asarray(0.0)), jnp.arange(steps))[1]
+
+    found = jax.jit(lambda memory: targets(PENDULUM, value, x, steps=steps, dt=dt, memory=memory))
+    expected = jax.jit(jax.value_and_grad(weighted_returns))
+    for memory in (0.05, 1e9):
+        assert found(memory).V[0] == pytest.approx(float(expected(x, memory)[0]), rel=1e-12)
+    # With all of the memory the slope is that of the return.
+    np.testing.assert_allclose(found(1e9).slope[0], expected(x, 1e9)[1], rtol=1e-7)
+    np.testing.assert_allclose(found(0.05).x[0], x)
+
+
+def test_the_value_of_a_line():
+    numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.05, steps=40, batch=64, kept=2, learning_rate=0.05)
+    network = value_network(LINE, widths=())
+    found = fit_value(LINE, network, numbers=numbers, double=True)
+    S = lqr([[0.9]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
+    V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))
+    assert pytest.approx(float(S) * 1.5**2, rel=5e-3) == V and slope[0] == pytest.approx(3.0 * float(S), rel=5e-3)
+    assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)
+
+
+def test_seeds_are_what_each_is_alone_and_states_are_of_the_wide_box():
+    numbers = Iteration(iterations=1, starts=8, seconds=0.1, steps=2, batch=8, kept=2)
+    both, again = (fit_values(LINE, value_network(LINE, widths=()), seeds, numbers=numbers) for seeds in ((0, 1), (1,)))
+    alone = again[0]
+    jax.tree.map(np.testing.assert_array_equal, both[1].parameters, alone.parameters)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(alone.parameters))
+    wide = widened(PENDULUM, 1.25)
+    x = drawn(wide, jax.random.key(0), 500)
+    assert wide.high.tolist() == [np.pi, 10.0] and np.abs(x[:, 1]).max() > 9 and np.abs(x[:, 0]).max() <= np.pi
+
+
+def test_numbers_out_of_range():
+    with pytest.raises(InputError, match="dt"):
+        fit_value(LINE, value_network(LINE, widths=()), numbers=Iteration(dt=0.0))
