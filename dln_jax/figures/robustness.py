@@ -36,7 +36,9 @@ def shares(tables: Mapping[str, Mapping[str, Mapping[str, float]]], *, ours: str
             )  # fmt: skip
         own = sum(name.startswith(ours) for name in table)
         axis.axhline(own - 0.5, color="black", linewidth=1.0)
-        axis.set_yticks(range(len(table)), [name.replace("-", " ") for name in table])
+        axis.set_yticks(
+            range(len(table)), [name.replace("-", " ") if name.startswith(ours) else name for name in table]
+        )
         axis.set_xticks(range(len(criteria)), [key.replace("_", " ") for key in criteria])
         axis.tick_params(length=0)
         axis.set_title(f"{plant}: successes, %", loc="left", fontsize=style.TEXT)

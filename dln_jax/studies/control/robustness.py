@@ -43,7 +43,7 @@ HORIZON, DRAWS = 1.6, 300
 # likewise, but are not those of the table.
 RECOVERIES: dict[Motor, Recovery] = {
     "elbow": Recovery(Law(jnp.array([2.89, 17.1, 41.5]), jnp.array(313.0), jnp.array(1.0), jnp.array(6.0)), 0.2, 1.5),
-    "shoulder": Recovery(Law(jnp.array([29.4, 3.37, 3.22]), jnp.array(84.8), jnp.array(1.0), jnp.array(6.0)), 0.4, 0.5),
+    "shoulder": Recovery(Law(jnp.array([47.8, 2.15, 3.44]), jnp.array(63.9), jnp.array(1.0), jnp.array(6.0)), 0.2, 1.0),
 }
 CONTROL_COSTS: dict[Motor, float] = {"elbow": 1.0, "shoulder": 10.0}
 """Of the regulators that they fall back to."""

@@ -1,8 +1,7 @@
-"""A seven-axis arm that follows references in closed loop at 1 kHz, by models that are known, identified and learned.
+"""A seven-axis arm that follows references in closed loop, by models that are known, identified and learned.
 
 The arm is that of the report of robots (`studies.robots.arm`), with dry friction, in MuJoCo; where that is missing, by
-our own equations with a smooth law of friction. Torques are limited and a sample late; angles alone are read, by
-encoders of 14 bits on the motors' side of a gear of 100, and rates are their differences through a low-pass.
+our own equations with a smooth law of friction. The loop is in `arm_loop`.
 """
 
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Gains, Reference, Tracker, computed_torque, feed_forward, limited, trusted, where_finite
+from dln_jax.control import Gains, computed_torque, feed_forward, trusted
 from dln_jax.control.tracking import feedback
 from dln_jax.data.encoders import smooth
 from dln_jax.data.robots import Robot
@@ -27,26 +26,18 @@ from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.suited import suited_network
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.mechanics.friction import joint_dissipation
-from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.studies.case import Findings
+from dln_jax.studies.control.arm_loop import Plant, Tracked, friction_of, in_equations, in_mujoco, track
 from dln_jax.studies.report import Row
-from dln_jax.studies.robots.arm import DAMPING, STEP, STIFFNESS, D, Motion, arm, measured, motion, simulator
-from dln_jax.studies.robots.known_kinematics import DECIMATE, LAWS, USUAL_SCALE, logs, rough
+from dln_jax.studies.robots.arm import DAMPING, STIFFNESS, D, arm, measured, motion
+from dln_jax.studies.robots.known_kinematics import DECIMATE, LAWS, logs, rough
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe
 
-RATE = 1 / STEP
-LIMITS = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
-"""N m."""
-ENCODER_STEP = 2 * np.pi / (2**14 * 100)
-"""rad."""
-CUTOFF = 100.0
-"""Hz, of the rates' low-pass."""
 COMPUTED = Gains(np.full(D, 400.0), np.full(D, 40.0))
 """1/s² and 1/s, critically damped at 20 rad/s."""
 AHEAD = Gains(STIFFNESS, DAMPING)
@@ -54,9 +45,6 @@ FEW = 2
 """Motions that the bad network is trained on."""
 STEPS = 30
 """Of Gauss-Newton, for a network."""
-
-Plant = Callable[[Motion], tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]]
-"""A motion -> the first angles, and what gives the next ones for a torque."""
 
 
 class Effort(NamedTuple):
@@ -72,88 +60,6 @@ class Effort(NamedTuple):
 
 FULL = Effort(3, 15, 2, 4000, Search(seconds=40.0))
 QUICK = Effort(1, 4, 1, 400, Search(starts=2, iterations=5))
-
-
-class Tracked(NamedTuple):
-    """Of one law and one motion."""
-
-    rms: float
-    """mrad; NaN for a run that is no number."""
-    trusted: float = np.nan
-    """Share of the samples at which the model was used, for a law that may fall back."""
-
-
-def in_mujoco(robot: Robot) -> Plant:
-    """The arm with dry friction as a constraint; `InputError` where MuJoCo is missing."""
-    mujoco, model, data = simulator(robot)
-
-    def start(wanted: Motion) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = wanted.q[0], wanted.qd[0]
-
-        def step(tau: np.ndarray) -> np.ndarray:
-            data.ctrl[:] = tau
-            mujoco.mj_step(model, data)
-            return np.array(data.qpos)
-
-        return np.array(data.qpos), step
-
-    return start
-
-
-def in_equations(robot: Robot) -> Plant:
-    """The same tree with a smooth law of dry friction, by the classical Runge-Kutta method."""
-    system = dynamics(tree_system(robot.tree, friction_of(robot)))
-
-    @jax.jit
-    def after(x: Any, tau: Any) -> Any:
-        field = lambda t, x: jnp.concatenate([x[D:], system.forward_dynamics(x[:D], x[D:], tau)])  # noqa: E731
-        return runge_kutta(CLASSICAL, field)(0.0, x, STEP)
-
-    def start(wanted: Motion) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-        x = np.concatenate([wanted.q[0], wanted.qd[0]])
-
-        def step(tau: np.ndarray) -> np.ndarray:
-            nonlocal x
-            x = np.asarray(after(x, tau))
-            return x[:D]
-
-        return x[:D], step
-
-    return start
-
-
-def friction_of(robot: Robot) -> Any:
-    """That of the joints, dry friction smooth."""
-    return joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE)
-
-
-def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, samples: int | None = None) -> Tracked:
-    """A closed loop along a motion, in the laboratory of the head of this file."""
-
-    @jax.jit
-    def asked(q: Any, qd: Any, now: Reference) -> Any:
-        found = law(q, qd, now)
-        tau, usable = found if isinstance(found, tuple) else (found, jnp.asarray(True))
-        return limited(where_finite(tau, q, qd), -LIMITS, LIMITS), usable
-
-    q, step = plant(wanted)
-    count = len(wanted.q) if samples is None else samples
-    share = -np.expm1(-2 * np.pi * CUTOFF * STEP)
-    qd, before, late, off, used = np.zeros(D), None, np.asarray(np.zeros(D)), [], 0
-    for number in range(count):
-        seen = ENCODER_STEP * np.round(q / ENCODER_STEP)
-        qd = qd if before is None else qd + share * ((seen - before) / STEP - qd)
-        before = seen
-        tau, usable = asked(seen, qd, Reference(*(each[number] for each in wanted)))
-        off.append(q - wanted.q[number])
-        used += bool(usable)
-        # A sample late, as are the torques of the start, which hold the arm.
-        now, late = (np.asarray(tau) if number == 0 else late), np.asarray(tau)
-        q = step(now)
-        if not np.isfinite(q).all():
-            return Tracked(np.nan, used / (number + 1))
-    return Tracked(1e3 * float(np.sqrt(np.mean(np.square(off)))), used / count)
 
 
 def models(robot: Robot, seed: int, effort: Effort, random: np.random.Generator) -> dict[str, tuple[Dynamics, Any]]:

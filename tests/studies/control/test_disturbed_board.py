@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dln_jax.control import Controller, field_of, stateless
-from dln_jax.figures.robustness import shares
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.two_link_pendulum import Links
 from dln_jax.studies.control import board
@@ -77,12 +76,6 @@ def test_printed_means_are_those_of_printed_shares():
     for table in PUBLISHED.values():
         for name, (*each, mean) in table.items():
             assert np.mean(each) / 100 == pytest.approx(mean, abs=6e-4), name
-
-
-def test_the_map_has_a_panel_for_each_plant():
-    row: dict[str, float] = dict.fromkeys([*CRITERIA, "mean"], 0.5)
-    figure = shares({"acrobot": {"ours": row, "other": row}, "pendubot": {"ours": row}})
-    assert len(figure.axes) == 2
 
 
 def test_a_controller_that_fails_has_no_last_state():

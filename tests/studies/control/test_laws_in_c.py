@@ -10,7 +10,7 @@ from dln_jax.deploy.c.load import load_c
 from dln_jax.deploy.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
-from dln_jax.studies.control import laws_in_c, receding, tracking
+from dln_jax.studies.control import arm_loop, laws_in_c, receding, tracking
 from dln_jax.studies.robots.arm import Motion
 
 
@@ -65,10 +65,10 @@ def test_a_loop_has_its_limits_its_delay_and_its_failures():
     def law(q, qd, now):
         return 2000.0 * (now.q - q) - 200.0 * qd
 
-    found = tracking.track(plant, law, wanted)
-    assert (asked[0] == np.minimum(200.0, tracking.LIMITS)).all() and (asked[1] == asked[0]).all()
+    found = arm_loop.track(plant, law, wanted)
+    assert (asked[0] == np.minimum(200.0, arm_loop.LIMITS)).all() and (asked[1] == asked[0]).all()
     assert 10 < found.rms < 100 and found.trusted == 1
-    failing = tracking.track(plant, lambda q, qd, now: jnp.full(7, jnp.nan), wanted)
+    failing = arm_loop.track(plant, lambda q, qd, now: jnp.full(7, jnp.nan), wanted)
     assert np.isnan(failing.rms)
     rows = {row.quantity: row.value for row in tracking.rows_of("any", [found, failing])}
     assert rows["failures"] == 1 and rows["rms_mrad_worst"] == pytest.approx(found.rms)
