@@ -92,7 +92,11 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
 
 
 def usable(plant: Dynamics | PlainDynamics, postures: Any) -> Dynamics:
-    """The model itself; `InputError` for one without energies, or whose mass matrix is not definite in some posture [n, d]."""
+    """The model itself.
+
+    Raises:
+        InputError: one without energies, or whose mass matrix is not definite in some posture [n, d].
+    """
     if not isinstance(plant, Dynamics):
         raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
     fine = np.asarray(jax.jit(jax.vmap(lambda q: definite(plant, q)))(jnp.asarray(postures, float)))

@@ -133,9 +133,7 @@ def draw(given: Asked, model: Dynamics, folder: Path, *, figures: bool, gif: boo
         parts = parts_of(plant.scene.needs.actuation)
         energy = passive_energy(without_friction(model), parts, np.zeros(2))
         energies = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(x))
-        traces = Traces(
-            t, x[..., 0], x[..., 1], u[..., 0], np.asarray(energies), limit, UNITS[given.name]
-        )
+        traces = Traces(t, x[..., 0], x[..., 1], u[..., 0], np.asarray(energies), limit, UNITS[given.name])
         title = f"{given.name} by {given.model}, from {given.excitation.seconds:g} s of data"
         write_figure(folder / "swing-ups.png", traces_figure(traces, title=title, up=UP))
     if gif:
