@@ -102,7 +102,7 @@ def explore(
     needs, rate, lab = plant.scene.needs, plant.rate, plant.laboratory
     B = np.asarray(needs.actuation)
     sizes = {name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()}
-    rough = dynamics(plant.makers(**sizes).energies)
+    rough = dynamics(plant.makers(**sizes).closed_form)
     parts = parts_of(B)
     lift = passive_energy(rough, parts, jnp.zeros(2))(jnp.array([0.0, np.pi]), jnp.zeros(2))
     surplus = -lift * jnp.linspace(*excitation.surplus, excitation.episodes)
@@ -110,7 +110,7 @@ def explore(
     inside = lab._replace(least=-most, most=most)
     episodes, samples = excitation.episodes, round(excitation.seconds / excitation.episodes * rate)
     noise = smooth_noise((samples, episodes), rate=rate, bandwidth=excitation.bandwidth, random=random)
-    field = field_of(dynamics(plant.scene.energies), B)
+    field = field_of(dynamics(plant.scene.closed_form), B)
 
     @jax.jit
     @jax.vmap

@@ -92,7 +92,11 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
 
 
 def usable(plant: Dynamics | PlainDynamics, postures: Any) -> Dynamics:
-    """The model itself; `InputError` for one without energies, or whose mass matrix is not definite in some posture [n, d]."""
+    """The model itself.
+
+    Raises:
+        InputError: one without energies, or whose mass matrix is not definite in some posture [n, d].
+    """
     if not isinstance(plant, Dynamics):
         raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
     fine = np.asarray(jax.jit(jax.vmap(lambda q: definite(plant, q)))(jnp.asarray(postures, float)))
@@ -138,15 +142,18 @@ def swing_up(
     with jax.ensure_compile_time_eval():
         model = usable(model, postures)
         conservative = without_friction(model)
-        home = nearest_equilibrium(conservative, goal, parts.passive)
-        controls = holding_controls(conservative, home, B, tolerance=tolerance)
+        # Operation by operation, these take longer than compiled.
+        inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
+        whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
+        home = nearest_equilibrium(whole, goal, parts.passive)
+        controls = holding_controls(whole, home, B, tolerance=tolerance)
         if not bool(jnp.all((controls > least) & (controls < most))):
             raise InputError(
                 f"the limits {least} to {most} do not hold the goal, which takes {np.round(controls, 4).tolist()}; "
                 "choose another goal, or a stronger motor"
             )
         x = jnp.concatenate([home, jnp.zeros_like(home)])
-        at = linearise(field_of(conservative, B), x, controls, tolerance=np.inf)
+        at = linearise(field_of(whole, B), x, controls, tolerance=np.inf)
         regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
     # Motors are numbered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(B[np.array(parts.active)])

@@ -34,12 +34,12 @@ class Tried(NamedTuple):
 
 def model_of_plant(plant: DesktopPlant) -> Dynamics:
     """What nobody has: the plant itself, with its friction."""
-    return dynamics(plant.scene.energies)
+    return dynamics(plant.scene.closed_form)
 
 
 def model_of_maker(plant: DesktopPlant) -> Dynamics:
     """The maker's sizes, without friction."""
-    return dynamics(plant.makers(**plant.sizes).energies)
+    return dynamics(plant.makers(**plant.sizes).closed_form)
 
 
 def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories
@@ -169,7 +168,7 @@ def _size_of_factor(data: Trajectories) -> float:
 def _of_size(parameters: Any, size: float, *, torque: float) -> Any:
     """Initial parameters whose networks give what is typical of the plant: outputs of theirs are of order 1 else."""
 
-    def scaled(path: Any, leaf: Float[np.ndarray, "..."]) -> Any:
+    def scaled(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path)
         last = f"linear_{depth}"
         if "coefficients" in name:

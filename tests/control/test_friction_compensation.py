@@ -16,7 +16,8 @@ from dln_jax.scenes.pendulum import pendulum
 from dln_jax.types import InputError
 
 SCENE = desktop_cart_pole().scene
-PLANT = dynamics(SCENE.energies)
+PLANT = dynamics(SCENE.closed_form)
+FRICTION = jax.jit(PLANT.friction)
 
 
 def test_it_does_no_work_at_rest_and_is_friction_s_share_away_from_it():
@@ -25,21 +26,21 @@ def test_it_does_no_work_at_rest_and_is_friction_s_share_away_from_it():
     assert float(jnp.abs(forces(q, jnp.array([0.0, 3.0]))[0])) < 1e-15
     for rate in (-2.0, 2.0):
         qd = jnp.array([rate, 3.0])
-        assert float(forces(q, qd)[0]) == pytest.approx(0.9 * float(PLANT.friction(q, qd)[0]), rel=1e-3)
+        assert float(forces(q, qd)[0]) == pytest.approx(0.9 * float(FRICTION(q, qd)[0]), rel=1e-3)
     # Never more than what friction takes, so that no joint is driven by it.
     rates = np.linspace(-0.3, 0.3, 61)
     given = np.array([forces(q, jnp.array([rate, 0.0]))[0] for rate in rates])
-    taken = np.array([PLANT.friction(q, jnp.array([rate, 0.0]))[0] for rate in rates])
+    taken = np.array([FRICTION(q, jnp.array([rate, 0.0]))[0] for rate in rates])
     assert (given * rates <= taken * rates + 1e-12).all()
 
 
 def test_what_is_left_without_friction_is_the_frictionless_plant():
     makers = desktop_cart_pole()
-    bare = dynamics(makers.makers(**makers.sizes).energies)
+    bare = dynamics(makers.makers(**makers.sizes).closed_form)
     state = jnp.array([0.1, 2.0]), jnp.array([0.4, -3.0]), jnp.array([0.5, 0.2])
     left = without_friction(PLANT)
-    np.testing.assert_allclose(left.inverse_dynamics(*state), bare.inverse_dynamics(*state), rtol=1e-10)
-    np.testing.assert_allclose(left.forward_dynamics(*state), bare.forward_dynamics(*state), rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(left.inverse_dynamics)(*state), bare.inverse_dynamics(*state), rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(left.forward_dynamics)(*state), bare.forward_dynamics(*state), rtol=1e-10)
 
 
 def test_it_makes_errors_of_tracking_smaller():
