@@ -37,6 +37,7 @@ from dln_jax.scenes.chain import chain
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Findings
 from dln_jax.studies.control.receding_calls import STACK, first_state, one_call
+from dln_jax.studies.control.values.laws import drawn_law
 from dln_jax.studies.report import Row, expect
 from dln_jax.studies.robots.arm import DAMPING, STIFFNESS, D, arm
 from dln_jax.studies.speed.calls_in_c import Times, compiled, evicting, programs, timed
@@ -93,6 +94,11 @@ def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
     return _tracking(computed_torque(system, Gains(np.full(d, 400.0), np.full(d, 40.0))), d)
 
 
+def value_policy() -> Law:
+    """The optimal control by a value network of two layers of 64, a cart-pole."""
+    return Law(drawn_law("cart-pole"), (np.zeros(4),))
+
+
 def one_iteration() -> Law:
     """A call of `receding` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
     return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
@@ -104,6 +110,7 @@ LAWS: dict[str, Callable[[], Law]] = {
     "tree_feed_forward": tree_by_feed_forward,
     "tree_computed_torque": tree_by_computed_torque,
     "network_computed_torque": network_by_computed_torque,
+    "value_policy": value_policy,
     "one_iteration": one_iteration,
 }
 """Controllers by name."""
