@@ -6,10 +6,10 @@ backwards, costs are added up with exponential weights (Lutter et al. 2021, arXi
     G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
 
 so that every state on the way has a target, and not the first alone. So has its slope p_k = dG_k/dx, by the chain rule
-through the closed loop, policy and all: with the controls held instead, as in the costate of Pontryagin's principle, slopes
-of an unstable plant would grow backwards wherever the controls are not yet best. With a long memory the targets are the
-policy's own cost, which is above the best by the square of what the policy is off, and the iteration is Howard's of
-policies, which converges as Newton's method does. With a short one they are the value's of n-step returns, which needs no
+through the closed loop, policy and all: with the controls held instead, as in the costate of Pontryagin's principle,
+slopes of an unstable plant would grow backwards wherever the controls are not yet best. With a long memory the targets
+are the policy's own cost, which is above the best by the square of what the policy is off, and the iteration is Howard's
+of policies, which converges as Newton's method does. With a short one they are those of n-step returns, which need no
 good policy.
 """
 

@@ -163,7 +163,7 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
 
 
 def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
-    """The least cost that optimisation finds from the controls of each value's policy: of all, the best way near one."""
+    """The least cost that optimisation finds from the controls of each value's policy."""
     dt = 0.0125
     guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
     found = direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations)
