@@ -5,14 +5,12 @@ backwards, costs are added up with exponential weights (Lutter et al. 2021, arXi
 
     G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
 
-so that every state on the way has a target, and not the first alone. So has its slope,
-
-    p_k = dc_k/dx + (dx_{k+1}/dx)ᵀ e^(-rho dt) [(1 - w) V_x(x_{k+1}) + w p_{k+1}]
-
-with the controls held, which is the costate of Pontryagin's principle: where they are best, a change of theirs costs
-nothing, and p = dG/dx. With a long memory the targets are the policy's own cost, which is above the best by the square
-of what the policy is off, and the iteration is Howard's of policies, which converges as Newton's method does. With a
-short one they are the value's of n-step returns, which needs no good policy.
+so that every state on the way has a target, and not the first alone. So has its slope p_k = dG_k/dx, by the chain rule
+through the closed loop, policy and all: with the controls held instead, as in the costate of Pontryagin's principle,
+slopes of an unstable plant would grow backwards wherever the controls are not yet best. With a long memory the targets
+are the policy's own cost, which is above the best by the square of what the policy is off, and the iteration is Howard's
+of policies, which converges as Newton's method does. With a short one they are those of n-step returns, which need no
+good policy.
 """
 
 import functools
@@ -28,8 +26,9 @@ import optax
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.flow import Flow, circles, flow
-from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, optimal_control
+from dln_jax.control.optimal.flow import circles, flow
+from dln_jax.control.optimal.problem import ControlProblem, optimal_control
+from dln_jax.control.optimal.targets import Targets, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.types import InputError, require_positive
 
@@ -67,14 +66,6 @@ class Iteration(NamedTuple):
     alone counts what its edges do."""
 
 
-class Targets(NamedTuple):
-    """Of the states of trajectories."""
-
-    x: Float[Array, "N n"]
-    V: Float[Array, " N"]
-    slope: Float[Array, "N n"]
-
-
 class Progress(NamedTuple):
     """Of an iteration."""
 
@@ -94,48 +85,6 @@ class Fitted(NamedTuple):
     history: list[Progress]
     train_seconds: float
     compile_seconds: float
-
-
-def targets(
-    problem: ControlProblem,
-    value: ValueAndGradient,
-    x: Array,
-    *,
-    steps: int,
-    dt: float,
-    memory: Any,
-) -> Targets:
-    """Targets at all states of the trajectory from x [n], the last of which is not among them.
-
-    Args:
-        problem: what is controlled.
-        value: the present one.
-        x: the start.
-        steps: N.
-        dt: s.
-        memory: of the weights, s.
-    """
-    step: Flow = flow(problem, dt, clipped=True)
-    share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)
-
-    def closed(x: Array) -> tuple[Array, Array]:
-        return step(x, optimal_control(problem, x, value(x)[1]))
-
-    def forward(x: Array, _: Any) -> tuple[Array, Array]:
-        return closed(x)[0], x
-
-    last, states = jax.lax.scan(forward, x, length=steps)
-
-    def back(carry: tuple[Array, ...], x: Array) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        V_next, slope_next, G, p = carry
-        (_, cost), pull_back = jax.vjp(closed, x)
-        G = cost + discount * ((1 - share) * V_next + share * G)
-        (p,) = pull_back((discount * ((1 - share) * slope_next + share * p), jnp.ones_like(cost)))
-        return (*value(x), G, p), (G, p)
-
-    V_end, slope_end = value(last)
-    _, (G, p) = jax.lax.scan(back, (V_end, slope_end, V_end, slope_end), states, reverse=True)
-    return Targets(states, G, p)
 
 
 def fit_value(

@@ -7,9 +7,10 @@ import pytest
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.fitted import Iteration, drawn, fit_value, fit_values, targets, widened
+from dln_jax.control.optimal.fitted import Iteration, drawn, fit_value, fit_values, widened
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
+from dln_jax.control.optimal.targets import targets
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.types import InputError
 

@@ -131,7 +131,7 @@ def cart_pole(quick: bool) -> Findings:
         fit = fit._replace(widths=(24, 24), numbers=numbers)
     found = trained(plant, fit, seeds)
     x = starts(plant, "uniform", 4 if quick else 100)
-    truth = _direct(plant, mean_value(found.values), x, iterations=5 if quick else 40)
+    truth = _direct(plant, found.values, x, iterations=5 if quick else 25)
     of_all = [np.asarray(_V(value)(x)) for value in found.values]
     case = "value/cart-pole"
     rows = [*_returns(case, plant, found), *_errors(case, of_all, truth, truth > LEAST * truth.max())]
@@ -162,11 +162,10 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
     return solve_on_grid(plant.problem, points, low=[-angle, -EDGE], high=[angle, EDGE], most=plant.limit, start=start)
 
 
-def _direct(plant: ValuePlant, value: ValueAndGradient, x: np.ndarray, *, iterations: int) -> np.ndarray:
-    """The least cost that optimisation finds from the policy's controls, from there and from beside."""
-    dt, law = 0.0125, _law(plant, value)
-    beside = [np.zeros(4), np.array([0, 0.4, 0, 0]), np.array([0, -0.4, 0, 0])]
-    guesses = np.stack([followed(plant.problem, law, x + off, dt=dt, steps=200) for off in beside])
+def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
+    """The least cost that optimisation finds from the controls of each value's policy."""
+    dt = 0.0125
+    guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
     found = direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations)
     return np.min(found, axis=0)
 
