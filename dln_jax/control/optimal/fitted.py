@@ -8,9 +8,9 @@ backwards, costs are added up with exponential weights (Lutter et al. 2021, arXi
 so that every state on the way has a target, and not the first alone. So has its slope p_k = dG_k/dx, by the chain rule
 through the closed loop, policy and all: with the controls held instead, as in the costate of Pontryagin's principle,
 slopes of an unstable plant would grow backwards wherever the controls are not yet best. With a long memory the targets
-are the policy's own cost, which is above the best by the square of what the policy is off, and the iteration is Howard's
-of policies, which converges as Newton's method does. With a short one they are those of n-step returns, which need no
-good policy.
+are the policy's own cost, above the best by the square of what the policy is off, and the iteration is Howard's of
+policies, which converges as Newton's method does. With a short one they are those of n-step returns, which need no good
+policy.
 """
 
 import functools
