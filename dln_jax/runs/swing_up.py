@@ -1,7 +1,7 @@
 """From a desktop plant to its swing-up by a model that was learned from its motions: explore, learn, close the loop."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,11 @@ from dln_jax.control.closed_loop import Run
 from dln_jax.control.desktop_plants import NAMES, DesktopPlant, desktop_plant
 from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.friction_compensation import without_friction
-from dln_jax.control.outcomes import UP, hanging_starts
+from dln_jax.control.outcomes import hanging_starts
 from dln_jax.control.swing_up_runs import SECONDS, Tried, law_of, motion_of, try_starts
 from dln_jax.data import schema
-from dln_jax.figures.swing_ups import SHOWN, Traces, traces_figure, write_swing_up_gif
+from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
@@ -28,7 +29,8 @@ EPISODE = 6.0
 """s, of an episode, about."""
 LEAST_SECONDS = 4.0
 """Of data: two episodes, of which one is to select by."""
-UNITS = {"cart-pole": ("m", "N"), "rotary-pendulum": ("rad", "N m")}
+UNITS = {"cart-pole": "N", "rotary-pendulum": "N m"}
+"""Of the control."""
 
 
 class Asked(NamedTuple):
@@ -124,25 +126,29 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
 
 def draw(given: Asked, model: Dynamics, folder: Path, *, figures: bool, gif: bool) -> None:
     """Writes the figure of some runs, and the film of the first."""
-    plant = given.plant
-    count = min(given.starts, SHOWN + 1)
-    runs = some_runs(plant, model, count, given.seed)
-    limit = float(np.max(plant.laboratory.most))
-    t, x, u = np.asarray(runs.t[0]), np.asarray(runs.x), np.asarray(runs.u)
+    plant, lab = given.plant, given.plant.laboratory
+    runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
+    unit, limits = UNITS[given.name], (lab.least, lab.most)
     if figures:
         parts = parts_of(plant.scene.needs.actuation)
         energy = passive_energy(without_friction(model), parts, np.zeros(2))
-        energies = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(x))
-        traces = Traces(t, x[..., 0], x[..., 1], u[..., 0], np.asarray(energies), limit, UNITS[given.name])
-        title = f"{given.name} by {given.model}, from {given.excitation.seconds:g} s of data"
-        write_figure(folder / "swing-ups.png", traces_figure(traces, title=title, up=UP))
+        of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
+        figure = closed_loop_traces(
+            runs, plant.scene.needs.joints, names=("driven", "pole"), limits=limits, unit=unit,
+            energy=np.asarray(of_pole), goal_energy=0.0,
+        )  # fmt: skip
+        write_figure(folder / "swing-ups.png", figure)
     if gif:
-        sizes: Any = plant.sizes
-        pole = sizes.get("pole_length", sizes.get("length"))
+        sizes = plant.sizes
+        if "arm_length" in sizes:
+            drawing = rotary_pendulum_drawing(sizes["arm_length"], sizes["pole_length"])
+        else:
+            drawing = cart_pole_drawing(sizes["length"])
+        t = np.asarray(runs.t[0])
         last = int(np.searchsorted(t, 4.0))
-        write_swing_up_gif(
-            folder / "swing-up.gif", given.name, t[: last + 1], x[0, : last + 1, :2], u[0, :last, 0],
-            limit=limit, arm=sizes.get("arm_length", 0.0), pole=pole,
+        write_closed_loop_gif(
+            folder / "swing-up.gif", drawing, t[:last], runs.x[0, :last, :2], runs.u[0, :last, 0],
+            limits=limits, unit=unit,
         )  # fmt: skip
 
 

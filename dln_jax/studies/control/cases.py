@@ -13,10 +13,10 @@ from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.control import energy_laws, laws_in_c, learned, pictures, receding_report, robustness, tracking
 from dln_jax.studies.control.board import Motor, criteria, plant, play
-from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, success
+from dln_jax.studies.control.energy_laws import SwingUp, rows_of_criteria, rows_of_outcomes, success
 from dln_jax.studies.control.planned import Weights, follower, search
 from dln_jax.studies.control.values import equation, fits
-from dln_jax.studies.report import Row, expect
+from dln_jax.studies.report import Row
 
 TURN = 2 * np.pi / 2048
 """rad, of an encoder."""
@@ -52,12 +52,9 @@ WEIGHTS = (Weights(), Weights(torque=0.3, velocity=0.01, slope=3e-3))
 
 def swing_up(name: str, quick: bool) -> Findings:
     """Share of starts that are up after ten seconds, and when."""
-    times = success(SWING_UPS[name], 50 if quick else STARTS)
-    case, words = f"swing-up/{name}/known", f"of {len(times)} starts near hanging, in a laboratory"
-    reached = times[np.isfinite(times)]
-    rows = [expect(case, "success_share", words, np.isfinite(times).mean(), SUCCESS, at_least=True)]
-    for quantity, of in (("median", np.median), ("worst", np.max)):
-        rows.append(Row(case, f"seconds_{quantity}", float(of(reached)) if len(reached) else np.inf, "s"))
+    found = success(SWING_UPS[name], 50 if quick else STARTS)
+    words = f"of {len(found.seconds)} starts near hanging, in a laboratory"
+    rows = rows_of_outcomes(f"swing-up/{name}/known", found, words, SUCCESS)
     return Findings(rows, pictures.traces(SWING_UPS[name]))
 
 

@@ -23,7 +23,6 @@ from dln_jax.control import (
     Laboratory,
     Run,
     energy_shaping,
-    error,
     field_of,
     holding_controls,
     linearise,
@@ -36,6 +35,7 @@ from dln_jax.control import (
     value,
     with_differences,
 )
+from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.scene import Scene
 from dln_jax.studies.case import Findings
@@ -171,7 +171,7 @@ class SwingUp(NamedTuple):
 def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Run]:
     """Start [4] -> run in a laboratory: encoders alone are read at 500 Hz, rates are differences of theirs, and torques
     come a sample late."""
-    scene, rate = case.scene, 500.0
+    scene, rate = case.scene, RATE
     system, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
     field, goal = field_of(system, B), jnp.zeros(4)
     at = linearise(field, goal, holding_controls(system, goal[:2], B))
@@ -184,27 +184,22 @@ def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Ru
     return lambda start: simulate(field, controller, start, seconds=seconds, rate=rate, controls=1, laboratory=lab)
 
 
-def near_hanging(case: SwingUp, starts: int, seed: int = 0) -> np.ndarray:
-    """Starts [starts, 4] at rest."""
-    random = np.random.default_rng(seed)
-    x = np.zeros((starts, 4))
-    x[:, 0] = case.position * random.normal(size=starts)
-    x[:, 1] = np.pi + 0.1 * random.normal(size=starts)
-    return x
+def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> Outcomes:
+    """Of starts near hanging."""
+    return tried(case, hanging_starts(starts, seed, position=case.position), seconds=seconds)
 
 
-def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> np.ndarray:
-    """Time from which on the pole is up, s, infinite where it is not, of starts near hanging."""
-    return times_up(case, near_hanging(case, starts, seed), seconds=seconds)
-
-
-def times_up(case: SwingUp, starts: np.ndarray, *, seconds: float = 10.0) -> np.ndarray:
+def tried(case: SwingUp, starts: np.ndarray, *, seconds: float = 10.0) -> Outcomes:
     """Likewise of any starts [K, 4]."""
-    run, joints = closed_loop(case, seconds=seconds), case.scene.needs.joints
+    run = closed_loop(case, seconds=seconds)
+    return outcomes(jax.jit(jax.vmap(lambda start: run(start).x[:, 1]))(starts), rate=RATE)
 
-    def angles(start: Array) -> Array:
-        return jax.vmap(lambda x: error(x, jnp.zeros(4), joints)[1])(run(start).x)
 
-    up = np.abs(np.asarray(jax.jit(jax.vmap(angles))(starts))) < 0.1
-    last_down = up.shape[1] - np.argmin(up[:, ::-1], axis=1)
-    return np.where(up[:, -1], np.where(up.all(axis=1), 0, last_down) / 500.0, np.inf)
+def rows_of_outcomes(case: str, found: Outcomes, words: str, bound: float | None = None) -> list[Row]:
+    """Share that is up, and when."""
+    return [
+        Row(case, "success_share", found.share, expected=words, bound=bound, at_least=True),
+        Row(case, "no_number", float(found.failed.sum()), expected="runs, counted as failures"),
+        Row(case, "seconds_median", found.median, "s"),
+        Row(case, "seconds_worst", found.worst, "s"),
+    ]

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dln_jax.control import Run
+from dln_jax.control.outcomes import hanging_starts
 from dln_jax.figures.closed_loops import closed_loop_traces, success_over_starts
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.studies.case import Findings
-from dln_jax.studies.control.energy_laws import SwingUp, closed_loop, near_hanging, times_up
-from dln_jax.studies.report import Row
+from dln_jax.studies.control.energy_laws import SwingUp, closed_loop, rows_of_outcomes, tried
 
 SHOWN, SECONDS, EVERY = 6, 3.0, 4
 """Runs of a figure, their length in s, and samples of them between two that are drawn."""
@@ -25,7 +25,7 @@ FASTEST = 15.0
 
 def traces(case: SwingUp) -> dict[str, list[float]]:
     """Runs as numbers that a report stores."""
-    run = jax.jit(jax.vmap(closed_loop(case, seconds=SECONDS)))(near_hanging(case, SHOWN))
+    run = jax.jit(jax.vmap(closed_loop(case, seconds=SECONDS)))(hanging_starts(SHOWN, 0, position=case.position))
     energy = dynamics(case.scene.energies).energy
     x = run.x[:, ::EVERY]
     joules = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(x)
@@ -56,14 +56,10 @@ def from_anywhere(case: SwingUp, quick: bool) -> Findings:
     random = np.random.default_rng(1)
     x = np.zeros((50 if quick else ANYWHERE, 4))
     x[:, 1], x[:, 3] = random.uniform(-np.pi, np.pi, len(x)), random.uniform(-FASTEST, FASTEST, len(x))
-    times = times_up(case, x)
-    reached = times[np.isfinite(times)]
-    name = f"starts/{case.scene.name}/known"
+    found = tried(case, x)
     words = f"of {len(x)} starts at any angle of the pole and |rate| <= {FASTEST:g} rad/s, in a laboratory"
-    rows = [Row(name, "success_share", float(np.isfinite(times).mean()), expected=words)]
-    for quantity, of in (("median", np.median), ("worst", np.max)):
-        rows.append(Row(name, f"seconds_{quantity}", float(of(reached)) if len(reached) else np.inf, "s"))
-    return Findings(rows, {"angle": x[:, 1].tolist(), "rate": x[:, 3].tolist(), "seconds": times.tolist()})
+    rows = rows_of_outcomes(f"starts/{case.scene.name}/known", found, words)
+    return Findings(rows, {"angle": x[:, 1].tolist(), "rate": x[:, 3].tolist(), "seconds": found.seconds.tolist()})
 
 
 def draw_starts(curves: Mapping[str, Any]) -> Figure:
