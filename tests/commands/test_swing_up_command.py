@@ -9,7 +9,7 @@ from dln_jax.commands import swing_up
 
 
 def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("dln_jax.runs.swing_up.SHOWN", 1)
+    monkeypatch.setattr("dln_jax.runs.swing_up.MOST_SHOWN", 2)
     few = ("--seconds-of-data", 4, "--starts", 2)
     command(swing_up, "--plant", "furuta", "--model", "known", *few, "--out", tmp_path / "run")
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
