@@ -1,5 +1,4 @@
-"""Measure controllers: swing-ups from many starts, a public board's acrobot and pendubot by energy and by plan, and
-swing-ups by models that were learned from thirty seconds of a plant's motions.
+"""Measure controllers: swing-ups, a public board, learned models, value functions, tracking, plans, and C.
 
 Prints one table (case, quantity, expected, value, unit, reference, to reach, pass), writes report.json, and draws
 figures.

@@ -4,7 +4,7 @@ Plants are simulated as they stand on a desk: dry friction, limits, encoders, no
 A rough model explores; q and the torques asked for are all that is recorded. Models: delan (a structured deep
 Lagrangian network with friction), identified (linear in its parameters), analytic (the maker's sizes, no friction),
 known (the plant itself). Each gets the same energy law, regulator and friction compensation, with the same gains. A run
-folder gets data.npz, the model, metrics.json, config.json, and a figure of the runs.
+folder gets data.npz, the model, metrics.json, config.json, and a figure and a film of the runs.
 """
 
 from dataclasses import dataclass
@@ -32,13 +32,11 @@ class Arguments(Folder, Drawn):
     """Starts near hanging at rest."""
     seed: int = 0
     """Of the exploration, the network's initial parameters, the starts and the noise."""
-    gif: bool = False
-    """Draw a film of one swing-up too, swing-up.gif."""
 
 
 def main(given: Arguments) -> None:
     """Explores, learns and swings up, into the run folder."""
     checked = asked(given.plant, given.model, given.seconds_of_data, given.starts, given.seed)
     with command_folder(given, "swing_up") as folder:
-        swing_up(checked, folder, figures=given.figures, gif=given.gif)
+        swing_up(checked, folder, figures=given.figures)
         print(f"run folder: {folder}")

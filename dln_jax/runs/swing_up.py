@@ -31,6 +31,8 @@ LEAST_SECONDS = 4.0
 """Of data: two episodes, of which one is to select by."""
 UNITS = {"cart-pole": "N", "rotary-pendulum": "N m"}
 """Of the control."""
+FILMED = 4.0
+"""s, of a run."""
 
 
 class Asked(NamedTuple):
@@ -60,7 +62,7 @@ def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int
     return Asked(found, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed)
 
 
-def swing_up(given: Asked, folder: Path, *, figures: bool, gif: bool) -> dict[str, float]:
+def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
     """Explores, learns, swings up, and writes what came of it; gives the metrics."""
     plant = given.plant
     recording, _ = explore(plant, plant.numbers.gains, given.excitation, seed=given.seed)
@@ -84,8 +86,8 @@ def swing_up(given: Asked, folder: Path, *, figures: bool, gif: bool) -> dict[st
     }
     write_json(folder / "metrics.json", metrics)
     say(given, got, metrics)
-    if figures or gif:
-        draw(given, got.dynamics, folder, figures=figures, gif=gif)
+    if figures:
+        draw(given, got.dynamics, folder)
     return metrics
 
 
@@ -124,32 +126,28 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
     )
 
 
-def draw(given: Asked, model: Dynamics, folder: Path, *, figures: bool, gif: bool) -> None:
+def draw(given: Asked, model: Dynamics, folder: Path) -> None:
     """Writes the figure of some runs, and the film of the first."""
     plant, lab = given.plant, given.plant.laboratory
     runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
     unit, limits = UNITS[given.name], (lab.least, lab.most)
-    if figures:
-        parts = parts_of(plant.scene.needs.actuation)
-        energy = passive_energy(without_friction(model), parts, np.zeros(2))
-        of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
-        figure = closed_loop_traces(
-            runs, plant.scene.needs.joints, names=("driven", "pole"), limits=limits, unit=unit,
-            energy=np.asarray(of_pole), goal_energy=0.0,
-        )  # fmt: skip
-        write_figure(folder / "swing-ups.png", figure)
-    if gif:
-        sizes = plant.sizes
-        if "arm_length" in sizes:
-            drawing = rotary_pendulum_drawing(sizes["arm_length"], sizes["pole_length"])
-        else:
-            drawing = cart_pole_drawing(sizes["length"])
-        t = np.asarray(runs.t[0])
-        last = int(np.searchsorted(t, 4.0))
-        write_closed_loop_gif(
-            folder / "swing-up.gif", drawing, t[:last], runs.x[0, :last, :2], runs.u[0, :last, 0],
-            limits=limits, unit=unit,
-        )  # fmt: skip
+    energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
+    of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
+    traces = closed_loop_traces(
+        runs, plant.scene.needs.joints, names=("driven", "pole"), limits=limits, unit=unit,
+        energy=np.asarray(of_pole), goal_energy=0.0,
+    )  # fmt: skip
+    write_figure(folder / "swing-ups.png", traces)
+    sizes, t = plant.sizes, np.asarray(runs.t[0])
+    if "arm_length" in sizes:
+        drawing = rotary_pendulum_drawing(sizes["arm_length"], sizes["pole_length"])
+    else:
+        drawing = cart_pole_drawing(sizes["length"])
+    last = int(np.searchsorted(t, FILMED))
+    write_closed_loop_gif(
+        folder / "swing-up.gif", drawing, t[:last], runs.x[0, :last, :2], runs.u[0, :last, 0],
+        limits=limits, unit=unit,
+    )  # fmt: skip
 
 
 def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> Run:

@@ -14,7 +14,12 @@ def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
     command(swing_up, "--plant", "furuta", "--model", "known", *few, "--out", tmp_path / "run")
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["success_share"] == 1 and found["not_finite"] == 0 and found["torque_nmse"] < 1e-20
-    assert {each.name for each in (tmp_path / "run").iterdir()} >= {"config.json", "data.npz", "swing-ups.png"}
+    assert {each.name for each in (tmp_path / "run").iterdir()} >= {
+        "config.json",
+        "data.npz",
+        "swing-ups.png",
+        "swing-up.gif",
+    }
     assert "100.0% of 2 starts up" in capsys.readouterr().out
 
 
