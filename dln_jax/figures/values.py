@@ -101,5 +101,6 @@ def _over_time(axis: Axes, paths: np.ndarray, seconds: float) -> None:
     low, high = (np.round(edge / np.pi) for edge in (axis.get_ylim()[0], axis.get_ylim()[1]))
     marks = np.pi * np.arange(low, high + 1)
     axis.set(xlim=(0, seconds), xlabel="t, s", yticks=marks)
-    axis.set_yticklabels([f"{round(mark / np.pi)}π" if mark else "0" for mark in marks])
+    names = {0: "0", 1: "π", -1: "-π"}
+    axis.set_yticklabels([names.get(turn := round(mark / np.pi), f"{turn}π") for mark in marks])
     style.title(axis, "angle from upright, closed loop")

@@ -26,9 +26,10 @@ import optax
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.flow import circles, flow
-from dln_jax.control.optimal.problem import ControlProblem, optimal_control
-from dln_jax.control.optimal.targets import Targets, targets
+from dln_jax.control.optimal.adversaries import Disturbance
+from dln_jax.control.optimal.flow import circles
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.targets import Targets, greedy, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
 from dln_jax.types import InputError, require_positive
 
@@ -95,6 +96,7 @@ def fit_value(
     numbers: Iteration = Iteration(),  # noqa: B008
     parameters: Any = None,
     double: bool = False,
+    disturbance: Disturbance | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Fitted:
     """Iterates, and keeps what does best from validation states that are drawn apart.
@@ -106,14 +108,14 @@ def fit_value(
         numbers: of the iteration.
         parameters: to start from; by default drawn.
         double: whether to compute in float64, which takes twice as long.
+        disturbance: of an adversary, for a robust value.
         report: called after every iteration.
 
     Raises:
         InputError: numbers out of range, or a value that was never finite.
     """
-    (found,) = fit_values(
-        problem, network, (seed,), numbers=numbers, parameters=parameters, double=double, report=report
-    )
+    given = {"numbers": numbers, "parameters": parameters, "double": double, "disturbance": disturbance}
+    (found,) = fit_values(problem, network, (seed,), **given, report=report)
     return found
 
 
@@ -125,6 +127,7 @@ def fit_values(
     numbers: Iteration = Iteration(),  # noqa: B008
     parameters: Any = None,
     double: bool = False,
+    disturbance: Disturbance | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> list[Fitted]:
     """As `fit_value` for several seeds, one after the other, by a program that is compiled once."""
@@ -132,7 +135,7 @@ def fit_values(
     problem = widened(problem, numbers.margin)
     with jax.enable_x64(double):
         began = time.perf_counter()
-        programs = _compiled(problem, network, numbers, parameters)
+        programs = _compiled(problem, network, numbers, parameters, disturbance)
         compile_seconds = time.perf_counter() - began
         return [_fit(programs, seed, numbers, parameters, report, compile_seconds) for seed in seeds]
 
@@ -144,7 +147,13 @@ class _Programs(NamedTuple):
     score: Callable[[Any, Array], Array]
 
 
-def _compiled(problem: ControlProblem, network: ValueNetwork, numbers: Iteration, parameters: Any) -> _Programs:
+def _compiled(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    parameters: Any,
+    disturbance: Disturbance | None,
+) -> _Programs:
     rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
     adam = optax.adam(rate, b2=0.99)
 
@@ -156,8 +165,8 @@ def _compiled(problem: ControlProblem, network: ValueNetwork, numbers: Iteration
 
     key = jax.random.key(0)
     parameters, state, validated = begin(key, parameters)
-    iterate = jax.jit(functools.partial(_iterate, problem, network, numbers, adam))
-    score = jax.jit(functools.partial(_score, problem, network, numbers))
+    iterate = jax.jit(functools.partial(_iterate, problem, network, numbers, disturbance, adam))
+    score = jax.jit(functools.partial(_score, problem, network, numbers, disturbance))
     return _Programs(
         begin,
         iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile(),
@@ -215,6 +224,7 @@ def _iterate(
     problem: ControlProblem,
     network: ValueNetwork,
     numbers: Iteration,
+    disturbance: Disturbance | None,
     adam: optax.GradientTransformation,
     parameters: Any,
     state: Any,
@@ -232,6 +242,7 @@ def _iterate(
             steps=steps,
             dt=numbers.dt,
             memory=memory,
+            disturbance=disturbance,
         )
     )(x)
     index = np.unique((steps * (np.arange(numbers.kept) / numbers.kept) ** 2).astype(int))
@@ -264,16 +275,23 @@ def _robust(off: Array) -> Array:
     return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
 
 
-def _score(problem: ControlProblem, network: ValueNetwork, numbers: Iteration, parameters: Any, x: Array) -> Array:
+def _score(
+    problem: ControlProblem,
+    network: ValueNetwork,
+    numbers: Iteration,
+    disturbance: Disturbance | None,
+    parameters: Any,
+    x: Array,
+) -> Array:
     steps = round(numbers.seconds / numbers.dt)
 
     def one(x: Array) -> tuple[Array, Array]:
         value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
-        step, discount = flow(problem, numbers.dt, clipped=True), math.exp(-problem.discount * numbers.dt)
+        closed, discount = greedy(problem, value, numbers.dt, disturbance), math.exp(-problem.discount * numbers.dt)
 
         def forward(carry: tuple[Array, Array, Array], _: Any) -> tuple[tuple[Array, Array, Array], None]:
             x, total, weight = carry
-            after, cost = step(x, optimal_control(problem, x, value(x)[1]))
+            after, cost = closed(x)
             return (after, total + weight * cost, weight * discount), None
 
         (last, total, weight), _ = jax.lax.scan(

@@ -6,6 +6,7 @@ by the classical Runge-Kutta method on both at once.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +16,8 @@ from dln_jax.control.optimal.problem import ControlProblem, rates
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import Scalar, require_positive
 
-Flow = Callable[[Array, Array], tuple[Array, Scalar]]
-"""(x [n], u [m]) -> the state after a step [n], and its discounted cost."""
+Flow = Callable[..., tuple[Array, Scalar]]
+"""(x [n], u [m], change of dx/dt [n], none by default) -> the state after a step [n], and its discounted cost."""
 
 
 def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool = False) -> Flow:
@@ -33,12 +34,12 @@ def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool
     field, rho = rates(problem), problem.discount
     low, high = (jnp.asarray(each) for each in limits(problem))
 
-    def step(x: Array, u: Array) -> tuple[Array, Scalar]:
+    def step(x: Array, u: Array, change: Any = 0.0) -> tuple[Array, Scalar]:
         spent = problem.action_cost.cost(u)
 
         def rate(t: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             x, _ = state
-            return field(x, u), jnp.exp(-rho * t) * (problem.state_cost(x) + spent)
+            return field(x, u) + change, jnp.exp(-rho * t) * (problem.state_cost(x) + spent)
 
         after, cost = advance(runge_kutta(CLASSICAL, rate), 0.0, (x, jnp.zeros((), x.dtype)), dt, substeps=substeps)
         return (jnp.clip(after, low.astype(x.dtype), high.astype(x.dtype)) if clipped else after), cost

@@ -1,6 +1,7 @@
 """What a value is fitted to along a trajectory: costs with exponential weights, and their slopes; see `fitted`."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -8,8 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.flow import Flow, flow
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, optimal_control
+from dln_jax.types import Scalar
 
 
 class Targets(NamedTuple):
@@ -20,6 +23,20 @@ class Targets(NamedTuple):
     slope: Float[Array, "N n"]
 
 
+def greedy(
+    problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
+) -> Callable[[Array], tuple[Array, Scalar]]:
+    """x -> the state after a step under the value's own policy, against an adversary if there is one, and its cost."""
+    step: Flow = flow(problem, dt, clipped=True)
+
+    def closed(x: Array) -> tuple[Array, Scalar]:
+        slope = value(x)[1]
+        u = optimal_control(problem, x, slope)
+        return step(x, u, 0.0 if disturbance is None else disturbance(x, slope, u))
+
+    return closed
+
+
 def targets(
     problem: ControlProblem,
     value: ValueAndGradient,
@@ -28,6 +45,7 @@ def targets(
     steps: int,
     dt: float,
     memory: Any,
+    disturbance: Disturbance | None = None,
 ) -> Targets:
     """Targets at all states of the trajectory from x [n], the last of which is not among them.
 
@@ -38,12 +56,10 @@ def targets(
         steps: N.
         dt: s.
         memory: of the weights, s.
+        disturbance: of an adversary, held over a step as the controls are.
     """
-    step: Flow = flow(problem, dt, clipped=True)
+    closed = greedy(problem, value, dt, disturbance)
     share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)
-
-    def closed(x: Array) -> tuple[Array, Array]:
-        return step(x, optimal_control(problem, x, value(x)[1]))
 
     def forward(x: Array, _: Any) -> tuple[Array, Array]:
         return closed(x)[0], x

@@ -7,6 +7,7 @@ import pytest
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
+from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.fitted import Iteration, drawn, fit_value, fit_values, widened
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
@@ -62,11 +63,14 @@ def test_targets_are_weighted_returns_and_their_slopes():
     np.testing.assert_allclose(found(0.05).x[0], x)
 
 
-def test_the_value_of_a_line():
-    numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.05, steps=40, batch=64, kept=2, learning_rate=0.05)
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_the_value_of_a_line_and_of_the_worst_of_lines(share):
+    """dx/dt = p x + u with p off by a share: the worst is always the larger p."""
+    numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.025, steps=40, batch=64, kept=2, learning_rate=0.05)
     network = value_network(LINE, widths=())
-    found = fit_value(LINE, network, numbers=numbers, double=True)
-    S = lqr([[0.9]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
+    worst = adversary(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share))
+    found = fit_value(LINE, network, numbers=numbers, double=True, disturbance=worst if share else None)
+    S = lqr([[0.9 + share]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
     V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))
     assert pytest.approx(float(S) * 1.5**2, rel=5e-3) == V and slope[0] == pytest.approx(3.0 * float(S), rel=5e-3)
     assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)

@@ -114,6 +114,7 @@ def pendulum(quick: bool) -> Findings:
         ),
         Row(case, "ridge_share", float(np.mean(ridge[counted]))),
         Row(case, "grid_median_relative_change", float(np.median(_relative([before], truth)[:, counted]))),
+        _of_grid(case, plant, fine),
         Row(case, "grid_value_hanging", float(interpolated(fine.grid, fine.V, jnp.array([np.pi, 0.0])))),
     ]
     runs = evaluate(plant, _law(plant, found.values[0]), starts(plant, "down", 12)).x
@@ -160,6 +161,12 @@ def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None =
     angle = plant.problem.high[0]
     # The action cost is finite up to the limit.
     return solve_on_grid(plant.problem, points, low=[-angle, -EDGE], high=[angle, EDGE], most=plant.limit, start=start)
+
+
+def _of_grid(case: str, plant: ValuePlant, found: GridValue) -> Row:
+    """What the grid's own policy gets, against which returns are to be seen."""
+    got = evaluate(plant, lambda x: interpolated(found.grid, found.u, x)[None], starts(plant, "down"))
+    return Row(case, "grid_down_return", float(np.mean(got.returns)))
 
 
 def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
