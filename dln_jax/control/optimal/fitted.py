@@ -24,10 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.control.optimal.adversaries import Disturbance
-from dln_jax.control.optimal.flow import circles
+from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.targets import Targets, greedy, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
@@ -197,27 +196,6 @@ def _fit(
     if not math.isfinite(least):
         raise InputError("the cost of the policy was never finite; take a smaller dt, or a box that it can stay near")
     return Fitted(best, history, time.perf_counter() - began, compile_seconds)
-
-
-def widened(problem: ControlProblem, factor: float) -> ControlProblem:
-    """The problem in a box that is so many times as wide."""
-    low, high = np.asarray(problem.low), np.asarray(problem.high)
-    middle, half = (low + high) / 2, factor * (high - low) / 2
-    straight = ~circles(problem)
-    return problem._replace(low=np.where(straight, middle - half, low), high=np.where(straight, middle + half, high))
-
-
-def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
-    """States of which half are uniform in the box, and half in boxes that are shrunk, by a share that is uniform too.
-
-    Angles on a circle are uniform in both. In a box of several dimensions nearly all states are far from rest, where
-    few motions ever are.
-    """
-    of_box, of_share = jax.random.split(key)
-    low, high, goal = (jnp.asarray(each, float) for each in (problem.low, problem.high, problem.goal))
-    x = low + (high - low) * jax.random.uniform(of_box, (count, len(low)))
-    share = jnp.where(jnp.arange(count) % 2 == 0, 1.0, jax.random.uniform(of_share, (count,)))
-    return jnp.where(circles(problem), x, goal + share[:, None] * (x - goal))
 
 
 def _iterate(

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
+from dln_jax.control.optimal.boxes import limits
 from dln_jax.control.optimal.problem import ControlProblem, rates
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import Scalar, require_positive
@@ -45,15 +45,3 @@ def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool
         return (jnp.clip(after, low.astype(x.dtype), high.astype(x.dtype)) if clipped else after), cost
 
     return step
-
-
-def circles(problem: ControlProblem) -> np.ndarray:
-    """Which of the n coordinates are angles on a circle."""
-    on_circle = np.array(problem.joints) == "revolute"
-    return np.concatenate([on_circle, np.zeros(len(problem.low) - len(on_circle), bool)])
-
-
-def limits(problem: ControlProblem) -> tuple[np.ndarray, np.ndarray]:
-    """The box, without limits of angles on a circle."""
-    angles = circles(problem)
-    return np.where(angles, -np.inf, problem.low), np.where(angles, np.inf, problem.high)

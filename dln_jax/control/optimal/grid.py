@@ -19,7 +19,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.flow import Flow, circles, flow
+from dln_jax.control.optimal.boxes import circles
+from dln_jax.control.optimal.flow import Flow, flow
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.types import InputError, require_positive
 

@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.adversaries import Disturbance
+from dln_jax.control.optimal.boxes import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
@@ -149,9 +149,3 @@ def fit_residual(
             "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
         )
     return ResidualFit(best, float(lowest), stages)
-
-
-def uniform(problem: ControlProblem, key: Array, samples: int) -> Float[Array, "samples n"]:
-    """States, uniform in the box."""
-    low, high = jnp.asarray(problem.low, float), jnp.asarray(problem.high, float)
-    return jax.random.uniform(key, (samples, len(low)), low.dtype, low, high)

@@ -8,7 +8,8 @@ import pytest
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
 from dln_jax.control.optimal.adversaries import Bounds, adversary
-from dln_jax.control.optimal.fitted import Iteration, drawn, fit_value, fit_values, widened
+from dln_jax.control.optimal.boxes import drawn, widened
+from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
 from dln_jax.control.optimal.targets import targets

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.flow import limits
+from dln_jax.control.optimal.boxes import limits
 from dln_jax.control.optimal.problem import rates
 from dln_jax.studies.control.values.plants import ValuePlant
 

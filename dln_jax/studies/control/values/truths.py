@@ -16,7 +16,8 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control import Problem, lqr, optimise
-from dln_jax.control.optimal.flow import circles, flow
+from dln_jax.control.optimal.boxes import circles
+from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.types import Scalar
 
