@@ -13,6 +13,7 @@ from dln_jax.control.energy_shaping import (
 )
 from dln_jax.control.finite import where_finite
 from dln_jax.control.friction_compensation import friction_compensation, without_friction
+from dln_jax.control.judgement import Judgement, judged
 from dln_jax.control.outcomes import Outcomes, outcomes
 from dln_jax.control.quadratic import Regulator, SampledRegulators, lqr, sampled_lqr, time_varying_lqr
 from dln_jax.control.shooting import Shooting, shoot
@@ -34,6 +35,7 @@ __all__ = [
     "Controller",
     "EnergyGains",
     "Gains",
+    "Judgement",
     "Laboratory",
     "Linearisation",
     "Outcomes",
@@ -60,6 +62,7 @@ __all__ = [
     "holding_controls",
     "improve",
     "integrated",
+    "judged",
     "limited",
     "linearise",
     "lqr",

@@ -92,6 +92,7 @@ def trusted(
     otherwise: Tracker,
     *,
     outside: Callable[[Vector, Vector, Vector], Any] | None = None,
+    usable: bool = True,
 ) -> Callable[[Vector, Vector, Reference], tuple[Array, Array]]:
     """One law where the model can be used at the state, and another where it cannot, with whether it was the first.
 
@@ -103,10 +104,12 @@ def trusted(
         first: a law such as `computed_torque`.
         otherwise: a law such as `feed_forward`.
         outside: (q, qd, qdd) -> whether the state is outside the data, such as that of a run with uncertainty.
+        usable: whether the model may be used at all, such as `judgement.judged` says of held-out motions.
     """
+    credible = usable
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> tuple[Array, Array]:
-        usable = definite(plant, q)
+        usable = definite(plant, q) & credible
         if outside is not None:
             usable &= jnp.logical_not(outside(q, qd, wanted.qdd))
         return jnp.where(usable, first(q, qd, wanted), otherwise(q, qd, wanted)), usable

@@ -11,9 +11,11 @@ from dln_jax.control import (
     computed_torque,
     feed_forward,
     gravity_compensation,
+    judged,
     limited,
     trusted,
 )
+from dln_jax.data.schema import from_arrays
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, rollout, runge_kutta, second_order
 from dln_jax.scenes.two_link_arm import two_link_arm
@@ -66,6 +68,27 @@ def test_an_indefinite_or_unknown_state_falls_back():
         tau, usable = law(q, wanted.qd, wanted)
         np.testing.assert_allclose(tau, expected(q, wanted.qd, wanted), rtol=1e-12)
         assert bool(usable) == (expected is first)
+
+
+def test_a_model_is_judged_by_motions_that_it_has_not_seen():
+    x = np.random.default_rng(0).normal(size=(3, 50, 2))
+    tau = np.asarray(jax.vmap(ARM.inverse_dynamics)(*map(jnp.asarray, x)))
+    unseen = from_arrays(
+        {"t": 0.01 * np.arange(50), "q": x[0], "qd": x[1], "qdd": x[2], "tau": tau, "trajectory": np.zeros(50, int)}
+    )
+    good = judged(ARM, unseen)
+    assert good.usable and np.all(good.nmse < 1e-20) and good.definite == 1 and good.line.endswith("the model is used")
+    heavy = ARM._replace(inverse_dynamics=lambda q, qd, qdd: 1.5 * ARM.inverse_dynamics(q, qd, qdd))
+    bad = judged(heavy, unseen)
+    share = 0.25 * np.mean(tau**2, axis=0) / np.var(tau, axis=0)
+    np.testing.assert_allclose(bad.nmse, share, rtol=1e-10)
+    assert not bad.usable and f"joint {np.argmax(share) + 1}'s" in bad.line
+    none = judged(ARM._replace(inverse_dynamics=lambda q, qd, qdd: jnp.full(2, jnp.nan)), unseen)
+    assert not none.usable
+    hollow = judged(ARM._replace(mass_matrix=lambda q: -ARM.mass_matrix(q)), unseen)
+    assert not hollow.usable and "not positive definite in 100.0%" in hollow.line
+    law = trusted(ARM, computed_torque(ARM, Gains(P, D)), feed_forward(ARM, Gains(P, D)), usable=bad.usable)
+    assert not law(jnp.zeros(2), jnp.zeros(2), reference(0.3))[1]
 
 
 def test_limits_leave_what_is_no_number():

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.control import Gains, computed_torque, feed_forward, trusted
+from dln_jax.control import Gains, computed_torque, feed_forward, judged, trusted
 from dln_jax.control.tracking import feedback
 from dln_jax.data.encoders import smooth
 from dln_jax.data.robots import Robot
@@ -114,14 +114,16 @@ def within(data: Trajectories) -> Callable[..., Any]:
     return outside
 
 
-def laws(known: dict[str, tuple[Dynamics, Any]]) -> dict[str, Any]:
-    """By name; feedback alone first."""
+def laws(known: dict[str, tuple[Dynamics, Any]], held_out: Trajectories) -> dict[str, Any]:
+    """By name; feedback alone first. `judged` trusts a model that explains held-out motions, too."""
     found: dict[str, Any] = {"feedback-alone": lambda q, qd, now: feedback(AHEAD, q, qd, now)}
     for name, (model, outside) in known.items():
         ahead, computed = feed_forward(model, AHEAD), computed_torque(model, COMPUTED)
         found |= {f"feed-forward/{name}": ahead, f"computed-torque/{name}": computed}
         if outside is not None:
             found[f"trusted/{name}"] = trusted(model, computed, ahead, outside=outside)
+            usable = judged(model, held_out).usable
+            found[f"judged/{name}"] = trusted(model, computed, ahead, outside=outside, usable=usable)
     return found
 
 
@@ -152,11 +154,14 @@ def one_seed(
     known = models(robot, seed, effort, random)
     wanted = [motion(random) for _ in range(effort.unseen)]
     test, errors = logs(robot, random, 1), {}
+    other = np.random.default_rng([seed, 1])
+    held_out = smooth(from_arrays(measured(logs(robot, other, 1), other))).data
     for name, (model, _) in known.items():
         tau = jax.jit(jax.vmap(model.inverse_dynamics))(test.q, test.qd, test.qdd)
         errors[name] = float(np.mean(normalised_error(np.asarray(tau), test.tau)))
     return errors, {
-        name: [track(plant, law, each, effort.samples) for each in wanted] for name, law in laws(known).items()
+        name: [track(plant, law, each, effort.samples) for each in wanted]
+        for name, law in laws(known, held_out).items()
     }
 
 
@@ -166,7 +171,7 @@ def rows_of(name: str, runs: list[Tracked]) -> list[Row]:
     sound = rms[np.isfinite(rms)]
     rows = [Row(case, f"rms_mrad_{key}", float(of(sound)) if len(sound) else np.inf, "mrad") for key, of in SPREADS]
     rows.append(Row(case, "failures", float(len(rms) - len(sound)), expected=f"of {len(rms)} runs"))
-    if name.startswith("trusted"):
+    if name.startswith(("trusted", "judged")):
         rows.append(Row(case, "share_trusted", float(np.mean([run.trusted for run in runs]))))
     return rows
 
