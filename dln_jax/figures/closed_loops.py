@@ -29,7 +29,7 @@ def closed_loop_traces(
     energy: Any = None,
     goal_energy: float | None = None,
 ) -> Figure:
-    """Coordinates, controls between their limits, and energy of some runs over time; the first run is in colour.
+    """Coordinates and energy of some runs over time, the first in front, and its controls between their limits.
 
     Args:
         runs: K of them, along a leading axis, such as `vmap` of `simulate` gives.
@@ -63,7 +63,7 @@ def closed_loop_traces(
         axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
     for control in range(m):
         axis = axes[d + control, 0]
-        _curves(axis, t[:-1], u[:MOST_SHOWN, :, control], steps=True)
+        _curves(axis, t[:-1], u[:1, :, control], steps=True)  # of many runs one sees none
         for limit in limits:
             level = float(np.broadcast_to(limit, m)[control])
             if np.isfinite(level):

@@ -28,7 +28,7 @@ def test_traces_show_every_coordinate_and_the_limits():
     figure = closed_loop_traces(runs, ("prismatic", "revolute"), **options)
     cart, pole, control, energy = figure.axes
     assert len(cart.lines) == 4 and len(energy.lines) == 4
-    assert [float(line.get_ydata()[0]) for line in control.lines[3:]] == [-2.0]
+    assert [float(line.get_ydata()[0]) for line in control.lines[1:]] == [-2.0]
     assert np.abs(pole.lines[0].get_ydata()).max() <= np.pi
     assert np.isfinite(energy.lines[0].get_ydata()).all()
     figure.draw_without_rendering()

@@ -40,7 +40,7 @@ FITS = {
     "cart-pole": Fit(
         (96, 96, 96),
         Iteration(
-            iterations=40,
+            iterations=80,
             starts=2048,
             kept=6,
             steps=250,
