@@ -57,7 +57,7 @@ class Arguments(Folder):
     members: Unstated[int] = None
     """Networks, of which V is the mean (default: 1)."""
     iterations: Unstated[int] = None
-    """Of value iteration, or of Gauss-Newton for each discount (default: 48 or 40 by the plant; residual: 15)."""
+    """Of value iteration, or of Gauss-Newton for each discount (default: 48 or 80 by the plant; residual: 15)."""
     seed: int = 0
     """Of parameters and states."""
     seeds: int = 1
