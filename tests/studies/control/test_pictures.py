@@ -14,7 +14,7 @@ def test_traces_are_drawn_from_numbers(monkeypatch):
     case = SWING_UPS["rotary-pendulum"]
     curves = json.loads(json.dumps(pictures.traces(case)))
     arm, pole, control, energy = pictures.draw_traces(curves).axes
-    limits = sorted(float(line.get_ydata()[0]) for line in control.lines[2:])
+    limits = sorted(float(line.get_ydata()[0]) for line in control.lines[1:])
     assert limits == [-case.limit, case.limit] and np.abs(control.lines[0].get_ydata()).max() <= case.limit
     assert len(arm.lines) == len(pole.lines) == len(energy.lines) == 3
 
