@@ -12,6 +12,7 @@ FLOORS = {
     "files": -2,
     "precision": -2,
     "compilation": -2,
+    "scale": 0,  # devices and processes
     "rollout": 1,  # many steps of anything
     "nn": 1,
     "solvers": 1,

@@ -1,0 +1,1 @@
+"""One program over several devices and hosts: processes that know each other, and batches split over their devices."""

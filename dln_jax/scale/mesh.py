@@ -1,0 +1,134 @@
+"""Batches split over the devices of one process, or of all.
+
+A mesh has one axis. What is shared, such as parameters, lies whole on every device; a batch is split along axis 0, and
+each device works at its share. `spread` brings the results together again, in the order of the batch, so that what is
+done with them afterwards is the same program on any number of devices; `summed` adds them up, whose order, and so the
+rounding, depends on their number. Where there is no mesh (`None`), both are the function itself.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from dln_jax.types import InputError
+
+AXIS = "batch"
+"""Name of the mesh's one axis."""
+SPLIT, WHOLE = PartitionSpec(AXIS), PartitionSpec()
+
+OfBatch = Callable[[Any, Any], Any]
+"""(what is shared, a batch on axis 0 of every leaf) -> results."""
+
+
+def batch_mesh(devices: int | None = None) -> Mesh | None:
+    """The devices that share batches, `None` where that is one alone.
+
+    Args:
+        devices: how many of every process (default: all that JAX sees).
+
+    Raises:
+        InputError: a process has fewer.
+    """
+    local = jax.local_device_count()
+    count = local if devices is None else devices
+    if not 1 <= count <= local:
+        raise InputError(f"--devices is {count}; JAX sees {local} here ({jax.default_backend()}), give 1 to {local}")
+    by_process = [jax.local_devices(process_index=process)[:count] for process in range(jax.process_count())]
+    chosen = np.array([device for of_one in by_process for device in of_one])
+    return Mesh(chosen, (AXIS,)) if len(chosen) > 1 else None
+
+
+def shares(mesh: Mesh | None, count: int, what: str) -> int:
+    """How many of `count` each device has.
+
+    Raises:
+        InputError: they cannot be divided; `what` names them, in the plural.
+    """
+    devices = 1 if mesh is None else mesh.size
+    if count % devices:
+        raise InputError(f"{count} {what} cannot be split over {devices} devices; give a multiple of {devices}")
+    return count // devices
+
+
+def shard(tree: Any, mesh: Mesh | None) -> Any:
+    """Arrays split along axis 0; every process gives the same whole ones, and keeps its part.
+
+    Raises:
+        InputError: the mesh does not divide an axis.
+    """
+    if mesh is None:
+        return tree
+    for leaf in jax.tree.leaves(tree):
+        shares(mesh, np.shape(leaf)[0], "rows of an array")
+    return _placed(tree, NamedSharding(mesh, SPLIT))
+
+
+def replicate(tree: Any, mesh: Mesh | None) -> Any:
+    """Arrays that lie whole on every device; every process gives the same."""
+    return tree if mesh is None else _placed(tree, NamedSharding(mesh, WHOLE))
+
+
+def gathered(tree: Any) -> Any:
+    """The same arrays, whole and readable in every process."""
+
+    def whole(leaf: Any) -> Any:
+        split = isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
+        if not split:
+            return leaf
+        return jax.jit(lambda x: x, out_shardings=NamedSharding(leaf.sharding.mesh, WHOLE))(leaf)  # pyright: ignore[reportAttributeAccessIssue]
+
+    return jax.tree.map(whole, tree)
+
+
+def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
+    """The same function, each device on its share of the batch; every device has all results.
+
+    The function treats the samples of a batch as strangers, as `vmap` does: a batch that the mesh does not divide is
+    filled up with its first sample, whose results are dropped. Differentiable in forward mode; take reverse mode inside
+    of it.
+    """
+    if mesh is None:
+        return function
+
+    def on_one(shared: Any, batch: Any) -> Any:
+        return jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS, tiled=True), function(shared, batch))
+
+    on_all = _on_devices(on_one, mesh)
+
+    def on_batch(shared: Any, batch: Any) -> Any:
+        count = jax.tree.leaves(batch)[0].shape[0]
+        fillers = -count % mesh.size
+        rows = np.append(np.arange(count), np.zeros(fillers, int))
+        results = on_all(shared, jax.tree.map(lambda leaf: leaf[rows], batch) if fillers else batch)
+        return jax.tree.map(lambda leaf: leaf[:count], results) if fillers else results
+
+    return on_batch
+
+
+def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
+    """A function whose results are sums over the batch, each device on its share; every device has the whole sums.
+
+    The mesh divides the batch. Take derivatives inside of it.
+    """
+    if mesh is None:
+        return function
+    return _on_devices(lambda shared, batch: lax.psum(function(shared, batch), AXIS), mesh)
+
+
+def _on_devices(function: OfBatch, mesh: Mesh) -> OfBatch:
+    # Loops of different length on each device have no types in common over the mesh: what varies is not checked.
+    return jax.shard_map(function, mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False)
+
+
+def _placed(tree: Any, sharding: NamedSharding) -> Any:
+    def place(leaf: Any) -> jax.Array:
+        # Made here from this process's copy: `device_put` would compare the copies of all processes first.
+        array = np.asarray(leaf)
+        return jax.make_array_from_callback(array.shape, sharding, lambda index: jnp.asarray(array[index]))
+
+    return jax.tree.map(place, tree)
