@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
@@ -50,6 +51,7 @@ def train(
     window: int | None = None,
     directory: Path | None = None,
     resume: bool = False,
+    mesh: Mesh | None = None,
     report: Report = lambda seed, record: None,
 ) -> Trained:
     """Learns with each seed; settings are the same for all seeds and, but for the window, for all creatures.
@@ -63,10 +65,12 @@ def train(
         window: steps that gradients go back (default: those of `WINDOWS`).
         directory: where gradients and evolution store their states.
         resume: continue what is stored there.
+        mesh: devices that share the creatures which are stepped side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings.
+        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings, a
+            mesh that does not divide the creatures.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
@@ -74,10 +78,10 @@ def train(
     if method == "ppo":
         if resume:
             raise InputError("runs of ppo are not stored on their way; train again without --resume")
-        compiled, directory = compile_ppo(task, chosen), None
+        compiled, directory = compile_ppo(task, chosen, mesh=mesh), None
     else:
         make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
-        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen))
+        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen, mesh=mesh), mesh)
     settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
     settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
     settings |= chosen._asdict()

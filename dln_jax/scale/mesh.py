@@ -85,6 +85,20 @@ def gathered(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> Any:
+    """`jax.jit` of a function whose arguments and results lie whole on every device of the mesh.
+
+    Arguments may be arrays of this process alone, if every process gives the same. `options` are those of `jax.jit`.
+    """
+    whole = {} if mesh is None else dict.fromkeys(("in_shardings", "out_shardings"), NamedSharding(mesh, WHOLE))
+    return jax.jit(function, **whole, **options)
+
+
+def own(tree: Any, mesh: Mesh | None) -> Any:
+    """What lies whole on every device as arrays of this process alone, on one device."""
+    return tree if mesh is None else jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
+
+
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
     """The same function, each device on its share of the batch; every device has all results.
 
