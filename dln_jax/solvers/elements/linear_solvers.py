@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.lax.linalg import cholesky, triangular_solve
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -25,6 +24,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
+from dln_jax.solvers.lapack import cholesky, substitute
 
 # Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160
@@ -92,12 +92,11 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
-        return cholesky(_with_constants(values)[table], symmetrize_input=False)
+        return cholesky(_with_constants(values)[table])
 
     def solve(factor: Array, b: Blocks) -> Blocks:
         right = jnp.where(at.free, b, 0).reshape(-1, 1)
-        y = triangular_solve(factor, right, left_side=True, lower=True)
-        return triangular_solve(factor, y, left_side=True, lower=True, transpose_a=True).reshape(b.shape)
+        return substitute(factor, substitute(factor, right), transposed=True).reshape(b.shape)
 
     return LinearSolver(factorise, solve, solve)
 
