@@ -22,9 +22,11 @@ from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
 from dln_jax.locomotion.learning import Goal, compile_learner, learn
 from dln_jax.locomotion.policy import make_policy
 from dln_jax.locomotion.task import make_task
-from dln_jax.scale.mesh import batch_mesh
+from dln_jax.scale.mesh import batch_mesh, program
 from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.scene import State
+from dln_jax.softbody.step import Stepper
 
 LINE = ControlProblem(
     lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.2, [-2.0], [2.0], (), [0.0]
@@ -38,13 +40,13 @@ def block():
     return make_task(Creature("block", mesh, np.array([[0, 2]])), episode=3, clock_period=4.0, upright=0.5)
 
 
-def walked(folder, name, learner, task, mesh):
+def walked(folder, name, compiled):
     """Parameters and distances of a run of two updates, and of one that is continued after the first."""
-    compiled, given = compile_learner(task, learner, mesh), {"seed": 1, "settings": {"learner": name}}
-    half, whole = folder / "half" / name, Goal(2 * learner.steps)
+    given, steps = {"seed": 1, "settings": {"learner": name}}, compiled.learner.steps
+    half, whole = folder / "half" / name, Goal(2 * steps)
     if not half.exists():
         half.mkdir(parents=True)
-        learn(compiled, goal=Goal(learner.steps), directory=half, **given)
+        learn(compiled, goal=Goal(steps), directory=half, **given)
     copy = shutil.copytree(half, folder / f"{name}-{sys.argv[2]}")
     runs = [
         learn(compiled, goal=whole, **given),
@@ -53,17 +55,16 @@ def walked(folder, name, learner, task, mesh):
     return [(run.parameters, [record.distance for record in run.records]) for run in runs]
 
 
-def ratio_of_masses(task, mesh):
-    """Found from three motions, which neither two nor four devices divide."""
-    x0 = jnp.asarray([1.0, 1.1, 0.9])[:, None, None] * task.scene.params.rest
-    controls = jnp.broadcast_to(jnp.asarray([0.6, 0.9])[:, None], (3, 2, 1))
-    motions = ObservedMotions(x0, jnp.zeros_like(x0), controls, jnp.broadcast_to(x0[:, None], (3, 2, 4, 2)))
+def stiffness(mesh):
+    """Of a spring, from three motions, which neither two nor four devices divide; a body would be traced for long."""
 
-    def params_of(ratio):
-        return task.scene.params._replace(masses=ratio * task.scene.params.masses)
+    def step(stiffness, state, control):
+        v = state.v - 0.1 * stiffness * jnp.sin(state.x)
+        return State(state.x + 0.1 * v, v), None
 
-    found = identify(task.stepper, params_of, jnp.asarray(2.0), motions, iterations=2, mesh=mesh)
-    assert found.iterations == 2
+    x0 = jnp.asarray([1.0, 1.1, 0.9])[:, None, None]
+    motions = ObservedMotions(x0, jnp.zeros((3, 1, 1)), jnp.zeros((3, 2, 0)), 0.9 * jnp.stack([x0, x0], axis=1))
+    found = identify(Stepper(State, step), lambda theta: theta, jnp.asarray(2.0), motions, iterations=3, mesh=mesh)
     return found.parameters, found.misfit
 
 
@@ -78,10 +79,14 @@ def main(folder, name):
     policy = make_policy(task, width=2)
     evolution = make_evolution_learner(task, policy, EvolutionSettings(pairs=2, generations=1), mesh=mesh)
     settings = GradientSettings(window=3, pairs=2, updates=1)
+    by_gradient = compile_learner(task, make_gradient_learner(task, policy, settings, mesh=mesh), mesh)
+    # Both have one program of evaluation.
+    improve = program(evolution.improve, mesh).lower(jax.eval_shape(lambda: evolution.start(0))).compile()
+    by_evolution = by_gradient._replace(learner=evolution, improve=improve)
     found = {
-        "evolution": walked(folder, "evolution", evolution, task, mesh),
-        "gradient": walked(folder, "gradient", make_gradient_learner(task, policy, settings, mesh=mesh), task, mesh),
-        "masses": ratio_of_masses(task, mesh),
+        "evolution": walked(folder, "evolution", by_evolution),
+        "gradient": walked(folder, "gradient", by_gradient),
+        "stiffness": stiffness(mesh),
         "value": value(mesh),
     }
     arrays = {
