@@ -23,7 +23,9 @@ from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
-PLACES = ("out", "resume", "figures", "low_latency", "uncertainty")
+SCALE = ("devices", "processes", "coordinator", "process_id")
+"""Arguments that say where a result is computed."""
+PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not decide the result."""
 CHANGEABLE = ("seconds",)
 """Arguments that may be given anew to --resume."""

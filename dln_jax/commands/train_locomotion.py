@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from dln_jax.command_line.arguments import refuse_given
-from dln_jax.command_line.options import Drawn, Resumable
+from dln_jax.command_line.options import Drawn, Resumable, Scaled
 from dln_jax.command_line.running import command_folder
 from dln_jax.runs.locomotion import Options, announce, learned, prepare, write_run
 from dln_jax.runs.results import print_numbers
@@ -22,7 +22,7 @@ UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
 
 
 @dataclass(frozen=True)
-class Arguments(Options, Resumable, Drawn):
+class Arguments(Options, Resumable, Drawn, Scaled):
     """What to train, how, and where the results go."""
 
     MOVED: ClassVar = {"--compare": "compare_locomotion"}

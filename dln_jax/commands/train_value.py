@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, require_positive_if_given
-from dln_jax.command_line.options import Folder
+from dln_jax.command_line.options import Folder, Scaled
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
 from dln_jax.control.optimal.fitted import Iteration
@@ -41,7 +41,7 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 
 @dataclass(frozen=True)
-class Arguments(Folder):
+class Arguments(Folder, Scaled):
     """What to train a value function of, how, and where it goes."""
 
     plant: Annotated[str, choice(PLANTS)] = "pendulum"

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given
 from dln_jax.command_line.encoders import Filtered
-from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
+from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -19,7 +19,7 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
 @dataclass(frozen=True)
-class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
+class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go."""
 
     model: str = "structured-delan"
