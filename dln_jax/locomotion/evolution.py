@@ -15,14 +15,11 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
-from dln_jax.locomotion.learning import Learner
+from dln_jax.locomotion.learning import LANES, Learner
 from dln_jax.locomotion.policy import Policy
 from dln_jax.locomotion.task import Task, run_episode
 from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import require_positive
-
-EPISODES = "episodes of a generation"
-"""What devices share."""
 
 
 class EvolutionSettings(NamedTuple):
@@ -36,6 +33,11 @@ class EvolutionSettings(NamedTuple):
     """Of Adam."""
     generations: int = 1
     """Between two evaluations."""
+
+    @property
+    def lanes(self) -> int:
+        """Creatures side by side."""
+        return 2 * self.pairs
 
 
 class EvolutionState(NamedTuple):
@@ -72,10 +74,10 @@ def make_evolution_learner(
     """The learner; episodes with a step that does not converge rank last and count as skipped.
 
     Raises:
-        InputError: settings that are not positive, or a mesh that does not divide the episodes of a generation.
+        InputError: settings that are not positive, or a mesh that does not divide the lanes.
     """
     require_positive(**settings._asdict())
-    shares(mesh, 2 * settings.pairs, EPISODES)
+    shares(mesh, settings.lanes, LANES)
     like, unravel = ravel_pytree(policy.init(jax.random.key(0)))
     optimiser = optax.adam(settings.learning_rate)
 
@@ -105,5 +107,5 @@ def make_evolution_learner(
         start=start,
         improve=lambda state: jax.lax.scan(generation, state, length=settings.generations)[0],
         parameters=lambda state: unravel(state.parameters),
-        steps=settings.generations * 2 * settings.pairs * task.episode,
+        steps=settings.generations * settings.lanes * task.episode,
     )

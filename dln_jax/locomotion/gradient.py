@@ -17,14 +17,11 @@ import optax
 from jax.sharding import Mesh
 from jaxtyping import Array, Int
 
-from dln_jax.locomotion.learning import Learner, chosen, finite
+from dln_jax.locomotion.learning import LANES, Learner, chosen, finite
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import FALLEN, Place, Task, beginning, walk
 from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import InputError, require_positive
-
-LANES = "lanes"
-"""What devices share."""
 
 
 class GradientSettings(NamedTuple):
@@ -40,6 +37,11 @@ class GradientSettings(NamedTuple):
     """Of Adam, after clipping the gradient's norm at 1 body length per episode."""
     updates: int = 5
     """Between two evaluations."""
+
+    @property
+    def lanes(self) -> int:
+        """Creatures side by side."""
+        return 2 * self.pairs
 
 
 class GradientState(NamedTuple):
@@ -74,8 +76,8 @@ def make_gradient_learner(
         InputError: what `check` finds, or a mesh that does not divide the lanes.
     """
     check(settings, task.episode)
-    shares(mesh, 2 * settings.pairs, LANES)
-    lanes, window = 2 * settings.pairs, settings.window
+    shares(mesh, settings.lanes, LANES)
+    lanes, window = settings.lanes, settings.window
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
 
     def start(seed: int) -> GradientState:

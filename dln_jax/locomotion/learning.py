@@ -26,6 +26,8 @@ from dln_jax.zoo import parameter_files as checkpoints
 
 CHECKPOINT = "checkpoint"
 """Beginning of the names of the files from which a seed can continue."""
+LANES = "creatures side by side"
+"""What devices share."""
 
 
 class Record(NamedTuple):

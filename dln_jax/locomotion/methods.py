@@ -49,6 +49,7 @@ def train(
     goal: Goal,
     width: int = WIDTH,
     window: int | None = None,
+    lanes: int | None = None,
     directory: Path | None = None,
     resume: bool = False,
     mesh: Mesh | None = None,
@@ -63,6 +64,7 @@ def train(
         goal: when each ends.
         width: of the hidden layer of a policy that is learned by gradients or evolution.
         window: steps that gradients go back (default: those of `WINDOWS`).
+        lanes: creatures side by side, an even number for gradients and evolution (default: those of `SETTINGS`).
         directory: where gradients and evolution store their states.
         resume: continue what is stored there.
         mesh: devices that share the creatures which are stepped side by side.
@@ -74,7 +76,7 @@ def train(
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
-    chosen = settings_of(method, task.creature.name, window)
+    chosen = settings_of(method, task.creature.name, window, lanes)
     if method == "ppo":
         if resume:
             raise InputError("runs of ppo are not stored on their way; train again without --resume")
@@ -89,11 +91,20 @@ def train(
     return Trained(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
-def settings_of(method: Method, creature: str, window: int | None = None) -> Any:
-    """Settings of a method for a creature; only the window of gradients depends on it."""
+def settings_of(method: Method, creature: str, window: int | None = None, lanes: int | None = None) -> Any:
+    """Settings of a method for a creature; only the window of gradients depends on it.
+
+    Raises:
+        InputError: an odd number of lanes, for a method that takes them in pairs.
+    """
+    settings = SETTINGS[method]
+    if lanes is not None and method != "ppo" and lanes % 2:
+        raise InputError(f"{lanes} creatures are no pairs, in which {method} takes them; give an even number")
+    if lanes is not None:
+        settings = settings._replace(lanes=lanes) if method == "ppo" else settings._replace(pairs=lanes // 2)
     if method != "gradient":
-        return SETTINGS[method]
-    return SETTINGS[method]._replace(window=window or WINDOWS.get(creature, GradientSettings().window))
+        return settings
+    return settings._replace(window=window or WINDOWS.get(creature, GradientSettings().window))
 
 
 def shown_walk(task: Task, policy: Policy, parameters: Parameters, steps: int) -> Walk:

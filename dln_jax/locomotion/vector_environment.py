@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from dln_jax.locomotion.environment import spaces
-from dln_jax.locomotion.learning import chosen
+from dln_jax.locomotion.learning import LANES, chosen
 from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
 from dln_jax.scale.mesh import program, shares, spread
 
@@ -22,7 +22,7 @@ class VectorEnvironment(VecEnv):
     """
 
     def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0, mesh: Mesh | None = None):
-        shares(mesh, lanes, "lanes")
+        shares(mesh, lanes, LANES)
         self.render_mode = None
         super().__init__(lanes, *spaces(task))
         self._scale = reward_scale

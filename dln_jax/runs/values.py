@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.control.balance import Law
 from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
@@ -114,15 +115,20 @@ def usual(name: str, method: str) -> Fit:
 
 
 def by_iteration(
-    plant: ValuePlant, family: Family, numbers: Iteration, seeds: Sequence[int], report: Report
+    plant: ValuePlant,
+    family: Family,
+    numbers: Iteration,
+    seeds: Sequence[int],
+    report: Report,
+    mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by fitted value iteration, one for each seed."""
+    """Values by fitted value iteration, one for each seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
     def told(at: Progress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
-    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, report=told)
+    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=told)
     return [
         Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
         for fit in fits
