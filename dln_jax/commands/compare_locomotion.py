@@ -46,13 +46,12 @@ def main(given: Arguments) -> None:
             found = write_run(folder / method, task, method, trained, given, figures=given.figures)
             numbers |= {f"{method}_{name}": value for name, value in found.items()}
             curves[method] = [of.records for of in trained.learned]
+        settings = {method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS}
         rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
             seeds=list(range(given.seed, given.seed + given.seeds)),
-            settings={
-                method: settings_of(method, given.creature, given.window, given.lanes)._asdict() for method in METHODS
-            },
+            settings={method: numbers._asdict() for method, numbers in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
             counted="environment steps of learning; one episode after each evaluation is apart",
             seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",

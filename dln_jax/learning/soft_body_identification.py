@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.rollout import rollout
-from dln_jax.scale.mesh import own, program, spread
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.softbody.scene import Params, SoftScene
 from dln_jax.softbody.step import Stepper, static_solve
 from dln_jax.types import require_positive
@@ -130,4 +130,4 @@ def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh:
         return found.value, misfit, found.stats["num_steps"]
 
     theta, misfit, count = program(solve, mesh, compiler_options=quick_compilation())(guess)
-    return Fitted(own(theta, mesh), float(misfit), int(count))
+    return Fitted(local(theta, mesh), float(misfit), int(count))

@@ -20,7 +20,7 @@ from dln_jax.files import finite as finite_values
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
-from dln_jax.scale.mesh import own, program, spread
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
@@ -168,7 +168,7 @@ def learn(
             stored = {**identity, "records": rows}
             checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
         report(records[-1])
-    return Learned(own(best, compiled.mesh), records, compiled.seconds, len(records) * compiled.episode)
+    return Learned(local(best, compiled.mesh), records, compiled.seconds, len(records) * compiled.episode)
 
 
 def finite(tree: Any) -> Any:

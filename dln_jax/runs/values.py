@@ -136,9 +136,14 @@ def by_iteration(
 
 
 def by_equation(
-    plant: ValuePlant, family: Family, iterations: int, seeds: Sequence[int], report: Report
+    plant: ValuePlant,
+    family: Family,
+    iterations: int,
+    seeds: Sequence[int],
+    report: Report,
+    mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed."""
+    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed; devices share the samples."""
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     each = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []
@@ -152,7 +157,7 @@ def by_equation(
 
         found = fit_residual(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            discounts=discounts, iterations=iterations, rounds=ROUNDS, report=told,
+            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=told,
         )  # fmt: skip
         trained.append(Trained(found.parameters, found.validation, time.perf_counter() - began))
     return trained

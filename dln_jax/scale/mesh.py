@@ -3,7 +3,8 @@
 A mesh has one axis. What is shared, such as parameters, lies whole on every device; a batch is split along axis 0, and
 each device works at its share. `spread` brings the results together again, in the order of the batch, so that what is
 done with them afterwards is the same program on any number of devices; `summed` adds them up, whose order, and so the
-rounding, depends on their number. Where there is no mesh (`None`), both are the function itself.
+rounding, depends on their number. A function of `on_devices` does that itself, wherever it needs to: by `total`,
+`mean` and `first`. Where there is no mesh (`None`), all are the function or the arrays themselves.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dln_jax.types import InputError
@@ -94,9 +96,14 @@ def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> 
     return jax.jit(function, **whole, **options)
 
 
-def own(tree: Any, mesh: Mesh | None) -> Any:
-    """What lies whole on every device as arrays of this process alone, on one device."""
+def local(tree: Any, mesh: Mesh | None) -> Any:
+    """Copies of arrays that lie whole on every device, on this process's first device alone."""
     return tree if mesh is None else jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
+
+
+def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
+    """A number that processes may see differently, such as a time, as the first one sees it."""
+    return value if mesh is None else type(value)(multihost_utils.broadcast_one_to_all(np.asarray(value)))
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
@@ -112,7 +119,7 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
     def on_one(shared: Any, batch: Any) -> Any:
         return jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS, tiled=True), function(shared, batch))
 
-    on_all = _on_devices(on_one, mesh)
+    on_all = on_devices(on_one, mesh)
 
     def on_batch(shared: Any, batch: Any) -> Any:
         count = jax.tree.leaves(batch)[0].shape[0]
@@ -129,14 +136,41 @@ def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
     The mesh divides the batch. Take derivatives inside of it.
     """
+    return on_devices(lambda shared, batch: total(function(shared, batch), mesh), mesh)
+
+
+def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
+    """A function that each device works out on its share, and that gives the same on all by `total`, `mean` or `first`.
+
+    The mesh divides the batch. Where loops or branches bring anything together, their conditions must agree.
+    """
     if mesh is None:
         return function
-    return _on_devices(lambda shared, batch: lax.psum(function(shared, batch), AXIS), mesh)
-
-
-def _on_devices(function: OfBatch, mesh: Mesh) -> OfBatch:
     # Loops of different length on each device have no types in common over the mesh: what varies is not checked.
     return jax.shard_map(function, mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False)
+
+
+def total(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: the sum over devices."""
+    return tree if mesh is None else lax.psum(tree, AXIS)
+
+
+def mean(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: the mean over devices."""
+    return tree if mesh is None else lax.pmean(tree, AXIS)
+
+
+def first(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: what the first device has; others may have rounded otherwise."""
+    return tree if mesh is None else jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS)[0], tree)
+
+
+def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
+    """Within a function of `on_devices`: this device's part of an array that is whole, along an axis."""
+    if mesh is None:
+        return array
+    size = array.shape[axis] // mesh.size
+    return lax.dynamic_slice_in_dim(array, lax.axis_index(AXIS) * size, size, axis)
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:

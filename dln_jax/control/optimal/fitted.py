@@ -31,7 +31,7 @@ from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.targets import Targets, greedy, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
-from dln_jax.scale.mesh import own, program, spread
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256
@@ -149,7 +149,7 @@ class _Programs(NamedTuple):
     """(key, parameters or none) -> parameters, state of the optimiser, validation states."""
     iterate: Callable[..., tuple[Any, Any, Array]]
     score: Callable[[Any, Array], Array]
-    own: Callable[[Any], Any]
+    local: Callable[[Any], Any]
     """What the programs give, as arrays of this process."""
 
 
@@ -178,7 +178,7 @@ def _compiled(
         begin,
         iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile(),
         score.lower(parameters, validated).compile(),
-        functools.partial(own, mesh=mesh),
+        functools.partial(local, mesh=mesh),
     )
 
 
@@ -204,7 +204,7 @@ def _fit(
         report(history[-1])
     if not math.isfinite(least):
         raise InputError("the cost of the policy was never finite; take a smaller dt, or a box that it can stay near")
-    return Fitted(programs.own(best), history, time.perf_counter() - began, compile_seconds)
+    return Fitted(programs.local(best), history, time.perf_counter() - began, compile_seconds)
 
 
 def _iterate(
