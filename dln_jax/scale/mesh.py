@@ -88,6 +88,15 @@ def gathered(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> Any:
+    """`jax.jit` of a function whose arguments and results lie whole on every device of the mesh.
+
+    Arguments may be arrays of this process alone, if every process gives the same. `options` are those of `jax.jit`.
+    """
+    whole = {} if mesh is None else dict.fromkeys(("in_shardings", "out_shardings"), NamedSharding(mesh, WHOLE))
+    return jax.jit(function, **whole, **options)
+
+
 def local(tree: Any, mesh: Mesh | None) -> Any:
     """Copies of arrays that lie whole on every device, on this process's first device alone."""
     return tree if mesh is None else jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
