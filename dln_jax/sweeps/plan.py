@@ -1,0 +1,140 @@
+"""From a grid to jobs: options and values checked against the command's own arguments before anything starts."""
+
+import dataclasses
+import difflib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, get_args, get_type_hints
+
+from dln_jax.command_line.arguments import parse
+from dln_jax.command_line.running import with_compilation_cache
+from dln_jax.files import is_file, read_json, write_json
+from dln_jax.sweeps.grid import combinations
+from dln_jax.types import InputError
+
+OF_SWEEPS = ("out", "resume", "processes", "coordinator", "process_id")
+"""Options of commands that every job gets from the sweep, or cannot have."""
+TRUTH = {**dict.fromkeys(("yes", "true", "on"), True), **dict.fromkeys(("no", "false", "off"), False)}
+JOB = "job.json"
+"""File in a job's folder that says what it is, in JSON."""
+
+
+class Job(NamedTuple):
+    """One run of the command."""
+
+    folder: Path
+    values: dict[str, str]
+    """Of the grid, as they were typed."""
+    arguments: tuple[str, ...]
+    """Of the command's line, without --out and --resume."""
+    resumes: bool
+    """Whether the command can continue what was interrupted."""
+
+    @property
+    def path(self) -> Path:
+        """Of its file."""
+        return self.folder / JOB
+
+
+def plan(
+    command: str,
+    arguments: type,
+    grid: Mapping[str, Sequence[str]],
+    fixed: Mapping[str, str],
+    folder: Path,
+) -> list[Job]:
+    """The jobs of a grid, in folders 0000, 0001, ... below `folder`.
+
+    Args:
+        command: name of the command.
+        arguments: its dataclass of arguments.
+        grid: values by option.
+        fixed: values of the options that all jobs have.
+        folder: of the sweep.
+
+    Raises:
+        InputError: an option that the command does not have or that is the sweep's, a value of another type, a file
+            that does not exist.
+    """
+    if both := [name for name in grid if name in fixed]:
+        raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
+    if "out" not in _options(arguments):
+        raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
+    common = [words for name, text in fixed.items() for words in _words(command, arguments, "--fixed", name, [text])]
+    words = {
+        name: dict(zip(texts, _words(command, arguments, "--grid", name, texts), strict=True))
+        for name, texts in grid.items()
+    }
+    jobs = []
+    for number, values in enumerate(combinations(dict(grid))):
+        line = (*common, *(words[name][text] for name, text in values.items()))
+        jobs.append(Job(folder / "jobs" / f"{number:04}", values, line, _resumes(command, arguments, line)))
+    return jobs
+
+
+def write_jobs(jobs: Sequence[Job], command: str) -> None:
+    """Writes the file of each job, from which it can be run anywhere that sees its folder.
+
+    Raises:
+        InputError: a file is there that says something else, or cannot be written.
+    """
+    here = str(Path.cwd())
+    for job in jobs:
+        said = {"command": command, "arguments": list(job.arguments), "values": job.values, "resumes": job.resumes}
+        if is_file(job.path):
+            stored = read_json(job.path, remedy="remove the folder of this job")
+            if stored.get("command") != command or stored.get("arguments") != said["arguments"]:
+                raise InputError(f"{job.path} is of another job; continue where the sweep was started, or remove it")
+            continue
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_json(job.path, {**said, "folder": here})
+
+
+def closest(word: str, known: Sequence[str]) -> str:
+    """ "; did you mean WORD?" for the word that is most like a wrong one, or nothing."""
+    like = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {like[0]}?" if like else ""
+
+
+def _options(arguments: type) -> list[str]:
+    return [*(field.name for field in dataclasses.fields(arguments)), "compilation_cache"]
+
+
+def _words(command: str, arguments: type, where: str, name: str, texts: Sequence[str]) -> list[str]:
+    """The word of a command line for each value of an option."""
+    known = _options(arguments)
+    if name in OF_SWEEPS:
+        raise InputError(f"{where} has {name}, which every job gets from the sweep; leave it out")
+    if name not in known:
+        raise InputError(f"{where}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
+    hint = get_type_hints(arguments).get(name, bool)
+    option = name.replace("_", "-")
+    if bool in (hint, *get_args(hint)):
+        if wrong := [text for text in texts if text.lower() not in TRUTH]:
+            raise InputError(f"{where}: {name} is {wrong[0]!r:.40}; expected yes or no")
+        return [f"--{option}" if TRUTH[text.lower()] else f"--no-{option}" for text in texts]
+    words = [f"--{option}={text}" for text in texts]
+    # A long range of whole numbers has one type: its ends tell.
+    whole = len(texts) > 2 and all(text.lstrip("-").isdigit() for text in texts)
+    for index in (0, len(texts) - 1) if whole else range(len(texts)):
+        try:
+            value = getattr(_parsed(command, arguments, [words[index]]), name)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        if isinstance(value, Path):
+            if not value.exists():
+                raise InputError(f"{where}: {name}={texts[index]}: no such file or folder")
+            words[index] = f"--{option}={value.resolve()}"
+    return words
+
+
+def _parsed(command: str, arguments: type, words: Sequence[str]) -> Any:
+    whole = with_compilation_cache(arguments)
+    return parse(whole, prog=f"python -m dln_jax {command}", description=None, line=words).own
+
+
+def _resumes(command: str, arguments: type, line: Sequence[str]) -> bool:
+    # To parse a line takes milliseconds: only where its values decide.
+    if not hasattr(arguments, "continues"):
+        return "resume" in _options(arguments)
+    return _parsed(command, arguments, line).continues
