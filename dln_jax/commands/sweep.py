@@ -57,6 +57,8 @@ def main(given: Arguments) -> None:
     """Checks, runs, and shows what came of it; raises `SystemExit` with 1 if a job is not done."""
     require_positive_if_given(given, ("jobs", "gpus"))
     grid, fixed = grid_of(given.grid or ""), fixed_of(given.fixed)
+    if given.jobs is not None and given.jobs > (given.gpus or given.jobs):
+        raise InputError(f"--jobs {given.jobs} for --gpus {given.gpus}; each job has one: give fewer jobs")
     asked = Asked(
         where=given.where or "here",
         at_once=given.jobs,
@@ -80,9 +82,8 @@ def arguments_of(command: str) -> type:
     """The dataclass of a command's arguments; `InputError` for a name that is none, or this one's."""
     known = [name for name in command_names() if name != "sweep"]
     if command not in known:
-        raise InputError(
-            f"--command: there is no {command!r:.40}{closest(command, known)} (see python -m dln_jax --help)"
-        )
+        like = closest(command, known)
+        raise InputError(f"--command: there is no {command!r:.40}{like} (see python -m dln_jax --help)")
     return importlib.import_module(f"dln_jax.commands.{command}").Arguments
 
 

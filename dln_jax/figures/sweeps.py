@@ -1,4 +1,4 @@
-"""Error against seconds over a grid of runs: a point for each, medians over seeds, and the best in validation ringed."""
+"""Error against seconds over a grid of runs: a point for each, medians over seeds, the best in validation ringed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -16,7 +16,7 @@ def drawn(
     over: Sequence[str],
     names: Names,
     *,
-    beside: int,
+    beside: int | None,
 ) -> Figure | None:
     """Test error against seconds of training; None where no job has both.
 
@@ -26,7 +26,7 @@ def drawn(
         of: groups, whose medians are drawn if jobs differ in `over`.
         over: options that medians are taken over.
         names: metrics.
-        beside: jobs that ran beside each other.
+        beside: jobs that ran beside each other, if that is known.
     """
     if not names.error or not names.seconds:
         return None
@@ -50,10 +50,10 @@ def drawn(
         ]
     if not points:
         return None
-    side = f"{beside} jobs at once" if beside > 1 else "one job at a time"
+    side = "" if beside is None else f", {beside} jobs at once" if beside > 1 else ", one job at a time"
     return error_against_seconds(
         points,
-        x=f"{spaced(names.seconds)}, {side}",
+        x=f"{spaced(names.seconds)}{side}",
         y=f"test {spaced(names.error)}",
         colour=spaced(colour),
         marker=spaced(marker),

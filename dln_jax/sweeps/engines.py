@@ -49,7 +49,7 @@ def run_all(engine: Engine, paths: Sequence[Path], report: Callable[[int, int], 
                 if (word := engine.over(handle)) is not None:
                     ended.append(close(path.parent, word))
                     del running[path]
-            report(len(ended), sum(each.state != "done" for each in ended))
+                    report(len(ended), sum(each.state != "done" for each in ended))
     except BaseException:
         engine.stop(list(running.values()))
         raise

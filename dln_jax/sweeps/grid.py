@@ -4,6 +4,7 @@ import itertools
 import re
 import shlex
 from collections import Counter
+from collections.abc import Mapping, Sequence
 
 from dln_jax.types import InputError
 
@@ -33,11 +34,11 @@ def grid_of(text: str) -> dict[str, tuple[str, ...]]:
 
 
 def fixed_of(text: str) -> dict[str, str]:
-    """The value of each option that all jobs have, `steps=500 test=e,q,v`: a comma is part of it. Errors as `grid_of`."""
+    """The value of each option that all jobs have, `steps=500 test=e,q,v`; commas are part of it. Errors as `grid_of`."""
     return pairs("--fixed", text)
 
 
-def combinations(grid: dict[str, tuple[str, ...]]) -> list[dict[str, str]]:
+def combinations(grid: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
     """Every combination of the values, the last option's changing fastest."""
     return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
 

@@ -66,7 +66,7 @@ def plan(
         for name, texts in grid.items()
     }
     jobs = []
-    for number, values in enumerate(combinations(dict(grid))):
+    for number, values in enumerate(combinations(grid)):
         line = (*common, *(words[name][text] for name, text in values.items()))
         jobs.append(Job(folder / "jobs" / f"{number:04}", values, line, _resumes(command, arguments, line)))
     return jobs

@@ -38,9 +38,7 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Engine]:
     """
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
-        raise InputError(
-            f"--where slurm: no {missing[0]} on the PATH; call it on a host of the cluster, or --where here"
-        )
+        raise InputError(f"--where slurm: no {missing[0]} on the PATH; call it on a host of the cluster")
     executor = submitit.SlurmExecutor(folder=folder / "submitit", max_num_timeout=TIMEOUTS)
     limit = {} if at_once is None else {"array_parallelism": at_once}
     given = parameters(options, sorted(executor._valid_parameters()))

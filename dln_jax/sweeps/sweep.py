@@ -1,6 +1,5 @@
 """A sweep from its jobs to its table: what is not done is run, and everything is shown."""
 
-import collections
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,7 +15,7 @@ from dln_jax.sweeps.plan import Job, write_jobs
 from dln_jax.sweeps.results import Entry, Names, best_of, entries, groups, names_in
 from dln_jax.sweeps.slurm import slurm
 from dln_jax.sweeps.status import status_of
-from dln_jax.sweeps.tables import print_groups, print_jobs, said, write_tables
+from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
 
 
 class Asked(NamedTuple):
@@ -31,6 +30,11 @@ class Asked(NamedTuple):
     error: str | None = None
     over: tuple[str, ...] = ()
 
+    @property
+    def beside(self) -> int | None:
+        """Jobs at once; None where that is left to Slurm."""
+        return self.at_once or (None if self.where == "slurm" else self.gpus or cores())
+
 
 def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool:
     """Runs the jobs that are not done, prints and writes what came of all; whether all are done.
@@ -41,18 +45,17 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
     """
     write_jobs(jobs, command)
     left = [job for job in jobs if status_of(job.folder).state != "done"]
-    beside = asked.at_once or cores()
     if left:
-        before = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
-        print(f"{command}: {len(left)} jobs{before}; {said_of(asked)}", flush=True)
+        before = f" of {len(jobs)}, the others are done" if len(left) < len(jobs) else ""
+        beside = "an array of the cluster" if asked.beside is None else f"{asked.beside} at once"
+        print(f"{command}: {len(left)} jobs{before}; {asked.where}, {beside}", flush=True)
         with engine_of(asked, folder) as engine, progress(len(left), "jobs") as show:
             run_all(engine, [job.path for job in left], lambda over, bad: show(over, f"{bad} not done" if bad else ""))
     found = entries(jobs)
     names = names_in(found, asked.metric, asked.error, largest=asked.largest)
     best, of = best_of(found, names), groups(found, asked.over, names)
-    facts = {"command": command, "where": asked.where, "at_once": None if asked.where == "slurm" else beside}
-    write_tables(folder, found, best, of, names, **facts)
-    if figure := drawn(found, best, of, asked.over, names, beside=beside if asked.where != "slurm" else 1):
+    write_tables(folder, found, best, of, names, command=command, where=asked.where, at_once=asked.beside)
+    if figure := drawn(found, best, of, asked.over, names, beside=asked.beside):
         write_figure(folder / "sweep.png", figure)
     print_jobs(found, best, names, title=f"{command}, {len(jobs)} jobs")
     if asked.over:
@@ -63,17 +66,10 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
 
 def engine_of(asked: Asked, folder: Path) -> AbstractContextManager[Engine]:
     """What runs the jobs; errors as it is entered."""
-    at_once = asked.at_once or asked.gpus or cores()
     if asked.where == "slurm":
-        return slurm(folder, asked.at_once, asked.slurm)
+        return slurm(folder, asked.beside, asked.slurm)
+    at_once = asked.beside or 1
     return ray(at_once, asked.gpus) if asked.where == "ray" else here(at_once, asked.gpus)
-
-
-def said_of(asked: Asked) -> str:
-    """Where the jobs run, in words."""
-    if asked.where == "slurm":
-        return "an array of the cluster"
-    return f"{asked.where}, {asked.at_once or asked.gpus or cores()} at once"
 
 
 def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder: Path) -> None:
@@ -88,8 +84,11 @@ def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder
         print(f"best by {names.validation}: {values}, run folder {entry.job.folder / entry.status.run}")
     if best and names.error:
         print(f"{names.error} is of the test, and took no part in the choice")
-    if wrong := [entry for entry in found if entry.status.state != "done"]:
-        lines = collections.Counter(said(entry) for entry in wrong)
-        print(undone(found), *(f"  {count} x {line}" for line, count in lines.most_common()), sep="\n")
+    wrong: dict[str, list[str]] = {}
+    for entry in found:
+        if entry.status.state != "done":
+            wrong.setdefault(f"{entry.status.state}: {entry.status.line}", []).append(entry.job.folder.name)
+    if wrong:
+        print(undone(found), *(f"  {', '.join(jobs)} {line}" for line, jobs in wrong.items()), sep="\n")
         print(f"--out {folder} --resume does them again")
     print(f"sweep: {folder}")

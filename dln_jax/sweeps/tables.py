@@ -25,7 +25,7 @@ def print_jobs(found: Sequence[Entry], best: Sequence[Entry], names: Names, *, t
     for entry in listed:
         numbers = [figure(entry.number(name)) for name in filter(None, names[:3])]
         values = [shown(text) for text in entry.job.values.values()]
-        rows.append([entry.job.folder.name, *values, *numbers, "best" if entry in best else said(entry)])
+        rows.append([entry.job.folder.name, *values, *numbers, "best" if entry in best else entry.status.state])
     print_numbers(rows, title=title, columns=["job", *map(spaced, columns), "status"])
 
 
@@ -49,9 +49,9 @@ def write_tables(
             "job": entry.job.folder.name,
             "values": entry.job.values,
             **entry.status._asdict(),
-            **{
-                kind: entry.number(name) for kind, name in zip(("validation", "error", "train"), names[:3], strict=True)
-            },
+            "validation": entry.number(names.validation),
+            "error": entry.number(names.error),
+            "train_seconds": entry.number(names.seconds),
             "best": entry in best,
         }
         for entry in found
@@ -70,12 +70,6 @@ def write_tables(
         numbers = [finite(entry.metrics.get(name)) for name in metrics]
         lines.writerow([entry.job.folder.name, *entry.job.values.values(), *own, *numbers])
     write_bytes(folder / "table.csv", text.getvalue().encode())
-
-
-def said(entry: Entry) -> str:
-    """A job's status on one line."""
-    status = entry.status
-    return f"{status.state}: {status.line}" if status.line else status.state
 
 
 def figure(number: float | None) -> str:

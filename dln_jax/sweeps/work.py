@@ -1,4 +1,4 @@
-"""One job, in a process of its own, wherever an engine has put it: the command runs here, and its end is written down."""
+"""One job, in a process of its own, wherever an engine has put it: the command runs, and its end is written down."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ INTERRUPTED = 130
 
 
 class Work:
-    """What an engine is given, with the path of a job's file: submitit pickles this name and that path, nothing else."""
+    """What an engine is given, with the path of a job's file; submitit pickles this name and that path only."""
 
     def __call__(self, path: str) -> None:
         """Does the job; raises `SystemExit` with the command's exit code unless that is 0."""
