@@ -34,7 +34,7 @@ def grid_of(text: str) -> dict[str, tuple[str, ...]]:
 
 
 def fixed_of(text: str) -> dict[str, str]:
-    """The value of each option that all jobs have, `steps=500 test=e,q,v`; commas are part of it. Errors as `grid_of`."""
+    """The value of each option that all jobs have, commas and all: `steps=500 test=e,q,v`. Errors as `grid_of`."""
     return pairs("--fixed", text)
 
 

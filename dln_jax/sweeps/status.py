@@ -24,6 +24,8 @@ class Status(NamedTuple):
     seconds: float | None = None
     """From start to end of the last attempt."""
     host: str = ""
+    process: int | None = None
+    """Its number there."""
 
 
 def status_of(folder: Path) -> Status:

@@ -54,7 +54,7 @@ def perform(path: Path) -> int:
         resume = job["resumes"] and (run / CONFIG).is_file()
         if not resume and run.exists():
             run = folder / f"run-{attempt}"
-        status = Status("running", attempt=attempt, run=run.name, host=socket.gethostname())
+        status = Status("running", attempt=attempt, run=run.name, host=socket.gethostname(), process=os.getpid())
         write_status(folder, status)
         line = [job["command"], *job["arguments"], f"--out={run}", *["--resume"] * resume]
         begun = time.monotonic()
