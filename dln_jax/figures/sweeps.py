@@ -75,14 +75,13 @@ def error_against_seconds(
         ring = Line2D([], [], linestyle="", marker="o", color="black", fillstyle="none", markersize=10)
         ring.set_label("best in validation")
         handles.append(ring)
-    if handles:
-        style.legend(figure, handles=handles, loc="outside lower center", ncols=4)
-    if note:
-        figure.supxlabel(note, fontsize=style.SMALL, color="0.3")
+    if handles or note:
+        titled = {"title": note, "title_fontsize": style.SMALL} if note else {}
+        style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **titled)
     return figure
 
 
-def _handle(marker: str, label: str, colour, *, size: float = 6) -> Line2D:
+def _handle(marker: str, label: str, colour, *, size: float | int = 6) -> Line2D:
     return Line2D([], [], linestyle="", marker=marker, color=colour, markersize=size, markeredgewidth=0, label=label)
 
 

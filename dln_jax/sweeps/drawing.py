@@ -53,7 +53,7 @@ def drawn(
     side = "" if beside is None else f", {beside} jobs at once" if beside > 1 else ", one job at a time"
     return error_against_seconds(
         points,
-        x=f"{spaced(names.seconds)}{side}",
+        x=f"{spaced(names.seconds.removesuffix('_seconds'))}, s{side}",
         y=f"test {spaced(names.error)}",
         colour=spaced(colour),
         marker=spaced(marker),

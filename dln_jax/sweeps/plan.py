@@ -36,6 +36,16 @@ class Job(NamedTuple):
         return self.folder / JOB
 
 
+class Target(NamedTuple):
+    """What every job runs."""
+
+    command: str
+    arguments: type
+    """Its dataclass of arguments."""
+    stated: Mapping[str, str]
+    """A value of each option that is given, as it was typed."""
+
+
 def plan(
     command: str,
     arguments: type,
@@ -60,15 +70,13 @@ def plan(
         raise InputError(f"{both[0]} is in --grid and in --fixed; leave it out of one")
     if "out" not in _options(arguments):
         raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
-    common = [words for name, text in fixed.items() for words in _words(command, arguments, "--fixed", name, [text])]
-    words = {
-        name: dict(zip(texts, _words(command, arguments, "--grid", name, texts), strict=True))
-        for name, texts in grid.items()
-    }
+    target = Target(command, arguments, {**{name: texts[0] for name, texts in grid.items()}, **fixed})
+    common = [word for name, text in fixed.items() for word in _words(target, "--fixed", name, [text])]
+    words = {name: dict(zip(texts, _words(target, "--grid", name, texts), strict=True)) for name, texts in grid.items()}
     jobs = []
     for number, values in enumerate(combinations(grid)):
         line = (*common, *(words[name][text] for name, text in values.items()))
-        jobs.append(Job(folder / "jobs" / f"{number:04}", values, line, _resumes(command, arguments, line)))
+        jobs.append(Job(folder / "jobs" / f"{number:04}", values, line, _resumes(target, line)))
     return jobs
 
 
@@ -100,25 +108,27 @@ def _options(arguments: type) -> list[str]:
     return [*(field.name for field in dataclasses.fields(arguments)), "compilation_cache"]
 
 
-def _words(command: str, arguments: type, where: str, name: str, texts: Sequence[str]) -> list[str]:
+def _words(target: Target, where: str, name: str, texts: Sequence[str]) -> list[str]:
     """The word of a command line for each value of an option."""
-    known = _options(arguments)
+    known = _options(target.arguments)
     if name in OF_SWEEPS:
         raise InputError(f"{where} has {name}, which every job gets from the sweep; leave it out")
     if name not in known:
-        raise InputError(f"{where}: {command} has no option {name}{closest(name, known)} (see {command} --help)")
-    hint = get_type_hints(arguments).get(name, bool)
+        like = closest(name, known)
+        raise InputError(f"{where}: {target.command} has no option {name}{like} (see {target.command} --help)")
+    hint = get_type_hints(target.arguments).get(name, bool)
+    kinds = (hint, *get_args(hint))
     option = name.replace("_", "-")
-    if bool in (hint, *get_args(hint)):
+    if bool in kinds:
         if wrong := [text for text in texts if text.lower() not in TRUTH]:
             raise InputError(f"{where}: {name} is {wrong[0]!r:.40}; expected yes or no")
         return [f"--{option}" if TRUTH[text.lower()] else f"--no-{option}" for text in texts]
     words = [f"--{option}={text}" for text in texts]
-    # A long range of whole numbers has one type: its ends tell.
-    whole = len(texts) > 2 and all(text.lstrip("-").isdigit() for text in texts)
-    for index in (0, len(texts) - 1) if whole else range(len(texts)):
+    # All whole numbers are of the type that one is of.
+    alike = (int in kinds or float in kinds) and all(text.removeprefix("-").isdigit() for text in texts)
+    for index in range(1 if alike else len(texts)):
         try:
-            value = getattr(_parsed(command, arguments, [words[index]]), name)
+            value = getattr(_parsed(target, [*_required(target, name), words[index]]), name)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         if isinstance(value, Path):
@@ -128,13 +138,23 @@ def _words(command: str, arguments: type, where: str, name: str, texts: Sequence
     return words
 
 
-def _parsed(command: str, arguments: type, words: Sequence[str]) -> Any:
-    whole = with_compilation_cache(arguments)
-    return parse(whole, prog=f"python -m dln_jax {command}", description=None, line=words).own
+def _required(target: Target, but: str) -> list[str]:
+    """Words for the options without a default, as far as they are given, without one option."""
+    missing = dataclasses.MISSING
+    fields = [
+        field for field in dataclasses.fields(target.arguments) if field.default is field.default_factory is missing
+    ]
+    names = [field.name for field in fields if field.name in target.stated and field.name != but]
+    return [f"--{name.replace('_', '-')}={target.stated[name]}" for name in names]
 
 
-def _resumes(command: str, arguments: type, line: Sequence[str]) -> bool:
+def _parsed(target: Target, line: Sequence[str]) -> Any:
+    whole = with_compilation_cache(target.arguments)
+    return parse(whole, prog=f"python -m dln_jax {target.command}", description=None, line=line).own
+
+
+def _resumes(target: Target, line: Sequence[str]) -> bool:
     # To parse a line takes milliseconds: only where its values decide.
-    if not hasattr(arguments, "continues"):
-        return "resume" in _options(arguments)
-    return _parsed(command, arguments, line).continues
+    if not hasattr(target.arguments, "continues"):
+        return "resume" in _options(target.arguments)
+    return _parsed(target, line).continues

@@ -92,13 +92,14 @@ def shown(text: str) -> str:
 
 
 def best_of(found: Sequence[Entry], names: Names) -> list[Entry]:
-    """Of each problem the job with the best validation; test errors take no part."""
+    """Of each problem with several jobs the one with the best validation; test errors take no part."""
     problems: dict[tuple[str, ...], list[Entry]] = {}
     for entry in found:
         if entry.number(names.validation) is not None:
             problems.setdefault(problem_of(entry.job.values), []).append(entry)
     choose = max if names.largest else min
-    return [choose(each, key=lambda entry: entry.number(names.validation) or 0.0) for each in problems.values()]
+    several = [each for each in problems.values() if len(each) > 1]
+    return [choose(each, key=lambda entry: entry.number(names.validation) or 0.0) for each in several]
 
 
 def groups(found: Sequence[Entry], over: Sequence[str], names: Names) -> list[Group]:

@@ -1,6 +1,7 @@
 """Jobs as one array of a Slurm cluster, by submitit."""
 
 import contextlib
+import io
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -52,7 +53,8 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Engine]:
         new = [path for path, job in jobs.items() if job is None]
         if new:
             try:
-                jobs |= zip(new, executor.map_array(Work(), map(str, new)), strict=True)
+                with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it raises
+                    jobs |= zip(new, executor.map_array(Work(), map(str, new)), strict=True)
             except submitit.core.utils.FailedJobError as error:
                 raise InputError(f"--where slurm: {' '.join(str(error).split())[-300:]}") from None
         write_json(folder / IDS, known | {path.parent.name: job.job_id for path, job in jobs.items()})
@@ -85,7 +87,7 @@ def over(handle: tuple[Path, Any]) -> str | None:
     path, job = handle
     if status_of(path.parent).state in ("done", "failed", "killed"):
         return ""
-    return job.state if job.done() else None
+    return job.state if job.done() and job.state != "SUSPENDED" else None
 
 
 def stop(handles: Sequence[tuple[Path, Any]]) -> None:

@@ -43,13 +43,13 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
         InputError: what runs the jobs is missing, or refuses them.
         KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
     """
-    write_jobs(jobs, command)
     left = [job for job in jobs if status_of(job.folder).state != "done"]
     if left:
-        before = f" of {len(jobs)}, the others are done" if len(left) < len(jobs) else ""
+        before = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
         beside = "an array of the cluster" if asked.beside is None else f"{asked.beside} at once"
-        print(f"{command}: {len(left)} jobs{before}; {asked.where}, {beside}", flush=True)
         with engine_of(asked, folder) as engine, progress(len(left), "jobs") as show:
+            write_jobs(jobs, command)
+            print(f"{command}: {len(left)} of {len(jobs)} jobs{before}; {asked.where}, {beside}", flush=True)
             run_all(engine, [job.path for job in left], lambda over, bad: show(over, f"{bad} not done" if bad else ""))
     found = entries(jobs)
     names = names_in(found, asked.metric, asked.error, largest=asked.largest)
@@ -74,11 +74,10 @@ def engine_of(asked: Asked, folder: Path) -> AbstractContextManager[Engine]:
 
 def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder: Path) -> None:
     """Prints what was chosen and by what, what is not done, and where everything is."""
-    if names.validation is None:
-        print("no job has a validation error: none is chosen; --metric names another number of metrics.json")
-    elif not best:
-        known = sorted({name for entry in found for name in entry.metrics})
-        print(f"no job has {names.validation}: none is chosen; --metric takes one of {', '.join(known) or 'none'}")
+    known = sorted({name for entry in found for name in entry.metrics})
+    if known and names.validation not in known:
+        missing = names.validation or "a validation error"
+        print(f"no job has {missing}: none is chosen; --metric takes one of {', '.join(known)}")
     for entry in best:
         values = " ".join(f"{name}={text}" for name, text in entry.job.values.items())
         print(f"best by {names.validation}: {values}, run folder {entry.job.folder / entry.status.run}")

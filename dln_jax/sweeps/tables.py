@@ -25,7 +25,7 @@ def print_jobs(found: Sequence[Entry], best: Sequence[Entry], names: Names, *, t
     for entry in listed:
         numbers = [figure(entry.number(name)) for name in filter(None, names[:3])]
         values = [shown(text) for text in entry.job.values.values()]
-        rows.append([entry.job.folder.name, *values, *numbers, "best" if entry in best else entry.status.state])
+        rows.append([entry.job.folder.name, *values, *numbers, said(entry, best)])
     print_numbers(rows, title=title, columns=["job", *map(spaced, columns), "status"])
 
 
@@ -70,6 +70,12 @@ def write_tables(
         numbers = [finite(entry.metrics.get(name)) for name in metrics]
         lines.writerow([entry.job.folder.name, *entry.job.values.values(), *own, *numbers])
     write_bytes(folder / "table.csv", text.getvalue().encode())
+
+
+def said(entry: Entry, best: Sequence[Entry]) -> str:
+    """A job's status; times of one that was interrupted are those since."""
+    again = f", attempt {entry.status.attempt}" if entry.status.attempt > 1 else ""
+    return ("best" if entry in best else entry.status.state) + again
 
 
 def figure(number: float | None) -> str:
