@@ -30,7 +30,7 @@ SCALE = ("devices", "processes", "coordinator", "process_id")
 PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not decide the result."""
 CHANGEABLE = ("seconds",)
-"""Arguments that may be given anew to --resume."""
+"""Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""
 
 SceneName = Annotated[str, choice(SCENES)]
 
@@ -177,12 +177,13 @@ def with_stored_arguments(given: Arguments) -> Arguments:
         raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
     unset = stored_arguments(type(given)())
     stored = checked_arguments(folder / CONFIG, type(given), unset)
+    changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
     for key, value in stored_arguments(given).items():
-        if key not in CHANGEABLE and value not in (stored[key], unset[key]):
+        if key not in changeable and value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
             raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
     hints = get_type_hints(type(given))
-    stored |= {key: getattr(given, key) for key in CHANGEABLE if getattr(given, key, None) is not None}
+    stored |= {key: getattr(given, key) for key in changeable if getattr(given, key, None) is not None}
     for key, value in stored.items():
         if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
             stored[key] = Path(value)
