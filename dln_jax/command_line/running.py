@@ -18,6 +18,7 @@ from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
 from dln_jax.data.schema import needs_from_text
 from dln_jax.files import is_file, matches, read_json, write_json
+from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, Needs
@@ -85,6 +86,11 @@ def in_words(prog: str, given: Any) -> Iterator[None]:
         yield
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except (RuntimeError, AssertionError):
+        if (line := unusable_platform()) is None:
+            raise
+        print(f"error: {line}", file=sys.stderr)
         raise SystemExit(2) from None
     except BrokenPipeError:
         # Whoever read the output has gone; the interpreter must not try to flush it once more.

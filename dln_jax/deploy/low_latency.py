@@ -27,8 +27,12 @@ def enable_low_latency() -> None:
     """Computes on the CPU in the calling thread from now on; the rest of the process included.
 
     Raises:
-        InputError: a backend has started already (any array, or a list of devices, starts it).
+        InputError: a backend has started already (any array, or a list of devices, starts it), or JAX is to compute on
+            something other than the CPU.
     """
+    platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
+    if platforms and platforms.split(",")[0] != "cpu":
+        raise InputError(_only_on_cpu(platforms.split(",")[0]))
     if not jax.config.read(_SETTING):
         return
     devices = getattr(jax.config, "jax_num_cpu_devices")  # noqa: B009  JAX adds its settings as it starts
@@ -56,9 +60,11 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
             for each argument) and results device arrays; another shape or type compiles anew.
 
     Raises:
-        InputError: no examples, or with `numpy` ones of several types; from the callable with `numpy`, an argument of
-            another shape than its example.
+        InputError: no examples, or with `numpy` ones of several types; a default device that is no CPU; from the
+            callable with `numpy`, an argument of another shape than its example.
     """
+    if (platform := jax.default_backend()) != "cpu":
+        raise InputError(_only_on_cpu(platform))
     if not examples:
         raise InputError("low_latency got no example; give one argument of each kind that calls will have")
     if not numpy:
@@ -72,6 +78,13 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
     if len(types) > 1:
         raise InputError(f"the examples have types {', '.join(sorted(types))}; give them one, or leave numpy=False")
     return _packed(function, arrays)
+
+
+def _only_on_cpu(platform: str) -> str:
+    return (
+        f"low-latency mode is for the CPU, and JAX computes on {platform}: there every call waits for a launch and for "
+        "copies both ways, whatever it computes; set JAX_PLATFORMS=cpu before JAX is imported, or export C (export_c)"
+    )
 
 
 def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:

@@ -23,6 +23,7 @@ from dln_jax.runs.dynamics_task import Task, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
 from dln_jax.runs.results import settings_of
+from dln_jax.scale.devices import device_lines
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -92,6 +93,8 @@ def announce_model(task: Task) -> None:
     if task.solver is not None:
         why = f" ({task.solver.reason})" if task.solver.reason else ""
         print(f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}")
+    for line in device_lines(task.precision):
+        print(line)
 
 
 def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:

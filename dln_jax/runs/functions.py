@@ -27,6 +27,7 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.nn.activations import activation
 from dln_jax.runs.function_task import NAMED, Options, Task, of_named, prepare
 from dln_jax.runs.results import OF_LOSSES, cost_metrics, print_numbers, settings_of, unit_of
+from dln_jax.scale.devices import device_lines
 from dln_jax.zoo.descriptions import describe
 from dln_jax.zoo.run import load, save
 
@@ -73,6 +74,8 @@ def announce(task: Task) -> None:
     print(f"{networks} {layers}, {network.activation}; {trained}")
     if network.activation == "relu" and network.derivative == 2:
         print(RELU)
+    for line in device_lines(network.precision):
+        print(line)
 
 
 def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[Network, Training, list[Trial]]:

@@ -19,6 +19,7 @@ from dln_jax.locomotion.methods import STEPS, Method, Trained, settings_of, show
 from dln_jax.locomotion.policy import WIDTH
 from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, Task, Walk, creature_named, make_task
+from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive, require_seed
@@ -80,6 +81,8 @@ def announce(task: Task) -> None:
     """Says what is trained."""
     size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
     print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
+    for line in device_lines("f64"):
+        print(line)
 
 
 def learned(

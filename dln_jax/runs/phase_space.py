@@ -31,6 +31,7 @@ from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.results import OF_LOSSES, losses, one_step_metrics, print_numbers, unit_of
+from dln_jax.scale.devices import device_lines
 from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, TASKS, Problem, Stated, problem_of
 from dln_jax.studies.hamiltonian.training import (
@@ -228,6 +229,8 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
         print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")
     elif problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
         print("momenta p are taken as qd, per unit of inertia")
+    for each in device_lines("f64"):
+        print(each)
 
 
 def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:

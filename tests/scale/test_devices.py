@@ -1,0 +1,71 @@
+"""What is done, said and refused where JAX computes on something other than the CPU; no such device is needed here."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax import compilation
+from dln_jax.deploy.low_latency import enable_low_latency, low_latency
+from dln_jax.learning.engine.problem import Problem, require_finite_start
+from dln_jax.scale import devices
+from dln_jax.types import InputError
+
+COMMAND = [sys.executable, "-m", "scripts.train_delan", "--steps", "1"]
+
+
+@pytest.fixture
+def on_gpu(monkeypatch):
+    """JAX as it answers where its default device is a GPU."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+
+def test_no_options_of_the_cpu_reach_another_compiler(on_gpu, monkeypatch):
+    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_backend_optimization_level": 1})
+    assert compilation.quick_compilation() == {}
+    given, compiled = [], jax.jit
+    monkeypatch.setattr(jax, "jit", lambda f, **options: given.append(options) or compiled(f))
+    problem = Problem(lambda w, x: w * x, jnp.ones(1), (jnp.ones((2, 1)),), lambda w: (w[0], w[0]))
+    require_finite_start(problem, problem.arrays)
+    assert [options.get("compiler_options") for options in given] == [None]
+
+
+def test_low_latency_mode_is_refused_with_the_reason(on_gpu):
+    with pytest.raises(InputError, match=r"is for the CPU, and JAX computes on gpu.*export C"):
+        low_latency(jnp.sin, np.zeros(2))
+    before = getattr(jax.config, "jax_platforms")  # noqa: B009
+    jax.config.update("jax_platforms", "cuda,cpu")
+    try:
+        with pytest.raises(InputError, match="JAX computes on cuda"):
+            enable_low_latency()
+    finally:
+        jax.config.update("jax_platforms", before)
+
+
+@pytest.mark.parametrize(
+    ("precision", "cost", "said"), [("f64", 32.0, "takes 32 times"), ("f64", 2.0, None), ("f32", 32.0, None)]
+)
+def test_advice_where_double_precision_is_dear(precision, cost, said, on_gpu, monkeypatch):
+    monkeypatch.setattr(devices, "double_precision_cost", lambda: cost)
+    first, *rest = devices.device_lines(precision)
+    assert first == devices.device_line() == "1 cpu"
+    assert len(rest) == (said is not None) and all(said in line for line in rest)
+
+
+def test_nothing_is_said_on_a_cpu_and_the_cost_is_a_ratio(monkeypatch):
+    assert devices.device_lines("f64") == []
+    monkeypatch.setattr(devices, "_ROWS", 64)
+    assert 0 < devices.double_precision_cost() < 1000
+
+
+@pytest.mark.parametrize("platform", ["rocm", "nonsense"])
+def test_a_platform_that_cannot_be_had_is_one_line(platform, tmp_path):
+    environment = {"JAX_PLATFORMS": platform, "PATH": "", "PYTHONPATH": ":".join(sys.path)}
+    result = subprocess.run(
+        [*COMMAND, "--out", str(tmp_path / "run")], capture_output=True, text=True, env=environment, timeout=100
+    )
+    assert result.returncode == 2 and result.stderr.startswith(f"error: JAX cannot start '{platform}'")
+    assert result.stderr.count("\n") == 1 and not (tmp_path / "run").exists()
