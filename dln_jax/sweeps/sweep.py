@@ -21,7 +21,7 @@ from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
 class Asked(NamedTuple):
     """How to run a sweep, and how to compare; None is the default that the command's help states."""
 
-    where: Literal["here", "slurm", "ray"] = "here"
+    where: Literal["here", "slurm", "ray", "later"] = "here"
     at_once: int | None = None
     gpus: int = 0
     slurm: str = ""
@@ -43,6 +43,11 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
         InputError: what runs the jobs is missing, or refuses them.
         KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
     """
+    if asked.where == "later":
+        write_jobs(jobs, command)
+        print(f"{len(jobs)} jobs; each is done by: python -m dln_jax.sweeps.work {folder}/jobs/NUMBER/job.json")
+        print(f"and the table is made by: --out {folder} --resume --where here")
+        return True
     left = [job for job in jobs if status_of(job.folder).state != "done"]
     if left:
         before = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""

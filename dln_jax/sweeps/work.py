@@ -118,3 +118,7 @@ def last_line(path: Path, start: int = 0) -> str:
         return ""
     errors = [line for line in lines if line.startswith("error: ")]
     return (errors or lines or [""])[-1].removeprefix("error: ")[:300]
+
+
+if __name__ == "__main__":
+    raise SystemExit(perform(Path(sys.argv[1])))
