@@ -99,4 +99,4 @@ def figure(number: float | None) -> str:
 
 def spaced(name: str) -> str:
     """A metric's or option's name as words."""
-    return name.replace("_", " ")
+    return " ".join(word.upper() if word in ("mse", "nmse") else word for word in name.split("_"))
