@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from dln_jax.figures.sweeps import Point, error_against_seconds
-from dln_jax.sweeps.results import PROBLEM, Entry, Group, Names, problem_of, shown
+from dln_jax.sweeps.results import ERRORS, PROBLEM, Entry, Group, Names, problem_of, shown
 from dln_jax.sweeps.tables import spaced
 
 MOST_PANELS = 6
@@ -59,7 +59,7 @@ def drawn(
     return error_against_seconds(
         points,
         x=f"{names.seconds.removesuffix('_seconds').replace('train', 'training')}, s{side}",
-        y=f"test {spaced(names.error)}",
+        y="test " * (names.error in ERRORS) + spaced(names.error),
         colour=spaced(colour),
         marker=spaced(marker),
         note=undone(found),

@@ -71,7 +71,7 @@ def engine(monkeypatch):
     monkeypatch.setattr(work, "exit_code", trained)
     monkeypatch.setattr(engines, "SECONDS_BETWEEN_LOOKS", 0.0)
     made = Engine(start, lambda path: "OUT_OF_MEMORY", lambda paths: None, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder: contextlib.nullcontext(made))
+    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
     return begun
 
 
@@ -155,7 +155,7 @@ def test_an_interrupt_ends_the_jobs(tmp_path, engine, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     made = Engine(list, interrupted, stopped.extend, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder: contextlib.nullcontext(made))
+    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
     assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
