@@ -34,8 +34,9 @@ class Arguments(Resumable):
     """Options and their values: 'width=8,16 seed=0:10'."""
     fixed: str = ""
     """Options that all jobs have: 'steps=500 figures=no test=e,q,v'; a comma is part of the value."""
-    where: Unstated[Literal["here", "slurm", "ray"]] = None
-    """What runs the jobs: processes on this machine, an array of the Slurm cluster, or Ray (default: here)."""
+    where: Unstated[Literal["here", "slurm", "ray", "later"]] = None
+    """What runs the jobs: processes on this machine, an array of the Slurm cluster, Ray, or what you have: later only
+    writes the jobs (default: here)."""
     jobs: Unstated[int] = None
     """Jobs at once (default: as many as there are cores; of Slurm, what it allows). Times are those beside others."""
     gpus: Unstated[int] = None

@@ -1,7 +1,7 @@
 """Error against seconds over a grid of runs: a point for each, medians over seeds, the best in validation ringed."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -36,7 +36,7 @@ def error_against_seconds(
     Args:
         points: runs and medians.
         x, y: labels of the axes.
-        colour, marker: names of the options that these show; empty for none.
+        colour, marker: names of the options that these show; empty for none. Of many colours some are named.
         note: below the axes, for example which runs are missing.
     """
     problems = list(dict.fromkeys(point.problem for point in points)) or [""]
@@ -67,7 +67,10 @@ def error_against_seconds(
             axis.set_ylabel(y)
     for axis in list(axes.flat)[len(problems) :]:
         axis.axis("off")
-    handles = [] if not colour else [_handle("s", f"{colour} {value}", colours[value]) for value in colours]
+    listed = list(colours)[:: -(-len(colours) // MOST_COLOURS)]
+    handles = (
+        [] if not colour else [Line2D([], [], color=colours[v], linewidth=5, label=f"{colour} {v}") for v in listed]
+    )
     handles += [] if not marker else [_handle(markers[value], f"{marker} {value}", "0.4") for value in markers]
     if medians:
         handles += [_handle("o", "a run", "0.4", size=4), _handle("o", "median", "0.4", size=8)]
@@ -85,7 +88,7 @@ def _handle(marker: str, label: str, colour, *, size: float | int = 6) -> Line2D
     return Line2D([], [], linestyle="", marker=marker, color=colour, markersize=size, markeredgewidth=0, label=label)
 
 
-def _colours(values: Sequence[str]) -> dict[str, object]:
+def _colours(values: Sequence[str]) -> dict[str, Any]:
     """In turn, or along a scale where there are more values than colours."""
     if len(values) <= MOST_COLOURS:
         return {value: style.CYCLE[number] for number, value in enumerate(values)}

@@ -35,7 +35,7 @@ def print_numbers(
     rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
 ) -> None:
     """Prints lines of a quantity, its values and perhaps their unit."""
-    justify = {"quantity": "left", "joint": "left", "unit": "left", "status": "left"}
+    justify = {"quantity": "left", "joint": "left", "unit": "left"}
     table = Table(*(Column(each, justify=justify.get(each, "right")) for each in columns), title=title)  # type: ignore
     for row in rows:
         table.add_row(*row)

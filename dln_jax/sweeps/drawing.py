@@ -5,8 +5,11 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from dln_jax.figures.sweeps import Point, error_against_seconds
-from dln_jax.sweeps.results import PROBLEM, Entry, Group, Names, problem_of, shown
+from dln_jax.sweeps.results import ERRORS, PROBLEM, Entry, Group, Names, problem_of, shown
 from dln_jax.sweeps.tables import spaced
+
+MOST_PANELS = 6
+"""One for each problem, if there are not more, and each has several jobs."""
 
 
 def drawn(
@@ -30,12 +33,14 @@ def drawn(
     """
     if not names.error or not names.seconds:
         return None
-    shown_by = [name for name in found[0].job.values if name not in (*over, *PROBLEM)]
+    problems = {problem_of(entry.job.values) for entry in found}
+    panels = len(problems) <= MOST_PANELS and len(found) > len(problems)
+    shown_by = [name for name in found[0].job.values if name not in (*over, *(PROBLEM if panels else ()))]
     colour, marker = (*shown_by, "", "")[:2]
 
     def point(values: dict[str, str], seconds: float, error: float, **flags: bool) -> Point:
         looks = [shown(values[name]) if name else "" for name in (colour, marker)]
-        return Point(seconds, error, *looks, problem=", ".join(problem_of(values)), **flags)
+        return Point(seconds, error, *looks, problem=", ".join(problem_of(values)) if panels else "", **flags)
 
     points = []
     for entry in found:
@@ -53,8 +58,8 @@ def drawn(
     side = "" if beside is None else f", {beside} jobs at once" if beside > 1 else ", one job at a time"
     return error_against_seconds(
         points,
-        x=f"{spaced(names.seconds.removesuffix('_seconds'))}, s{side}",
-        y=f"test {spaced(names.error)}",
+        x=f"{names.seconds.removesuffix('_seconds').replace('train', 'training')}, s{side}",
+        y="test " * (names.error in ERRORS) + spaced(names.error),
         colour=spaced(colour),
         marker=spaced(marker),
         note=undone(found),

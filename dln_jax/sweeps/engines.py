@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from dln_jax.sweeps.status import Status, close, renew
+from dln_jax.sweeps.status import Status, close, end, renew
 from dln_jax.types import InputError
 
 SECONDS_BETWEEN_LOOKS = 0.2
@@ -52,6 +52,8 @@ def run_all(engine: Engine, paths: Sequence[Path], report: Callable[[int, int], 
                     report(len(ended), sum(each.state != "done" for each in ended))
     except BaseException:
         engine.stop(list(running.values()))
+        for path in running:
+            end(path.parent, "interrupted")
         raise
 
 

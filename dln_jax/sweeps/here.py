@@ -42,7 +42,8 @@ def here(at_once: int, gpus: int) -> Iterator[Engine]:
             executor = submitit.LocalExecutor(folder=path.parent / LOGS)
             seen = {} if gpu is None else {"gpus_per_node": 1, "visible_gpus": (gpu,)}
             executor.update_parameters(timeout_min=MINUTES, **seen)
-            with environment({"OPENBLAS_NUM_THREADS": "1", "NPROC": threads}):
+            shares = environment({"OPENBLAS_NUM_THREADS": "1", "NPROC": threads})
+            with shares, errors_to(path.parent / LOGS / "controller.txt"):
                 started.append(Started(executor.submit(Work(), str(path)), gpu))
         return started
 
@@ -62,6 +63,19 @@ def here(at_once: int, gpus: int) -> Iterator[Engine]:
         wait(handles)
 
     yield Engine(start, over, stop, at_once)
+
+
+@contextlib.contextmanager
+def errors_to(path: Path) -> Iterator[None]:
+    """Gives processes that are started a file for their errors: submitit's have a trace to say of an interrupt."""
+    kept = os.dup(2)
+    try:
+        with path.open("ab") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def cores() -> int:

@@ -26,39 +26,40 @@ IDS = "slurm.json"
 
 
 @contextlib.contextmanager
-def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Engine]:
+def slurm(folder: Path, jobs: int, at_once: int | None, options: str) -> Iterator[Engine]:
     """Yields the engine.
 
     Args:
         folder: of the sweep, which all hosts must see.
+        jobs: how many there are.
         at_once: jobs of the array that run beside each other; None: as many as Slurm allows.
         options: of sbatch, by the names that submitit has for them: "partition=gpu time=60 gpus_per_node=1".
 
     Raises:
-        InputError: no Slurm here, or an option that submitit does not know.
+        InputError: no Slurm here, more jobs than an array holds, or an option that submitit does not know.
     """
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
         raise InputError(f"--where slurm: no {missing[0]} on the PATH; call it on a host of the cluster")
+    if jobs > MOST_JOBS:
+        raise InputError(f"{jobs} jobs for one Slurm array; expected at most {MOST_JOBS}; split the grid")
     executor = submitit.SlurmExecutor(folder=folder / "submitit", max_num_timeout=TIMEOUTS)
     limit = {} if at_once is None else {"array_parallelism": at_once}
     given = parameters(options, sorted(executor._valid_parameters()))
     executor.update_parameters(**{"job_name": folder.name, "time": MINUTES, **limit, **given})
 
     def start(paths: Sequence[Path]) -> list[tuple[Path, Any]]:
-        if len(paths) > MOST_JOBS:
-            raise InputError(f"{len(paths)} jobs for one Slurm array; expected at most {MOST_JOBS}; split the grid")
         known = read_json(folder / IDS, remedy="remove it") if is_file(folder / IDS) else {}
-        jobs = {path: still_there(submitit.SlurmJob, executor.folder, known.get(path.parent.name)) for path in paths}
-        new = [path for path, job in jobs.items() if job is None]
+        found = {path: still_there(submitit.SlurmJob, executor.folder, known.get(path.parent.name)) for path in paths}
+        new = [path for path, job in found.items() if job is None]
         if new:
             try:
                 with contextlib.redirect_stderr(io.StringIO()):  # submitit prints what it raises
-                    jobs |= zip(new, executor.map_array(Work(), map(str, new)), strict=True)
+                    found |= zip(new, executor.map_array(Work(), map(str, new)), strict=True)
             except submitit.core.utils.FailedJobError as error:
                 raise InputError(f"--where slurm: {' '.join(str(error).split())[-300:]}") from None
-        write_json(folder / IDS, known | {path.parent.name: job.job_id for path, job in jobs.items()})
-        return list(jobs.items())
+        write_json(folder / IDS, known | {path.parent.name: job.job_id for path, job in found.items()})
+        return list(found.items())
 
     yield Engine(start, over, stop, at_once=10**9)
 
@@ -69,6 +70,8 @@ def parameters(options: str, known: Sequence[str]) -> dict[str, Any]:
     for name, text in found.items():
         if name not in known:
             raise InputError(f"--slurm has no {name}{closest(name, known)}; there are {', '.join(known)}")
+        if name == "time" and not text.isdigit():
+            raise InputError(f"--slurm: time is {text!r:.40}; expected whole minutes")
         found[name] = int(text) if text.isdigit() else [text] if name in ("setup", "teardown") else text
     return found
 

@@ -56,9 +56,15 @@ def close(folder: Path, word: str) -> Status:
         folder: of the job.
         word: of the engine, for example OUT_OF_MEMORY; may be empty.
     """
+    begun = status_of(folder).state != "missing"
+    how = "ended without a word" if begun else "did not start"
+    return end(folder, f"{how} ({word})" if word else how)
+
+
+def end(folder: Path, line: str) -> Status:
+    """The status of a job that is over; if it does not say so itself, it was killed, and `line` is why."""
     status = status_of(folder)
     if status.state in ("missing", "running"):
-        how = "ended without a word" if status.state == "running" else "did not start"
-        status = status._replace(state="killed", line=f"{how} ({word})" if word else how)
+        status = status._replace(state="killed", line=line)
         write_status(folder, status)
     return status

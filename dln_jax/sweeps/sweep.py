@@ -12,7 +12,7 @@ from dln_jax.sweeps.engines import Engine, run_all
 from dln_jax.sweeps.here import cores, here
 from dln_jax.sweeps.on_ray import ray
 from dln_jax.sweeps.plan import Job, write_jobs
-from dln_jax.sweeps.results import Entry, Names, best_of, entries, groups, names_in
+from dln_jax.sweeps.results import ERRORS, Entry, Names, best_of, entries, groups, names_in
 from dln_jax.sweeps.slurm import slurm
 from dln_jax.sweeps.status import status_of
 from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
@@ -21,7 +21,7 @@ from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
 class Asked(NamedTuple):
     """How to run a sweep, and how to compare; None is the default that the command's help states."""
 
-    where: Literal["here", "slurm", "ray"] = "here"
+    where: Literal["here", "slurm", "ray", "later"] = "here"
     at_once: int | None = None
     gpus: int = 0
     slurm: str = ""
@@ -43,11 +43,16 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
         InputError: what runs the jobs is missing, or refuses them.
         KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
     """
+    if asked.where == "later":
+        write_jobs(jobs, command)
+        print(f"{len(jobs)} jobs; each is done by: python -m dln_jax.sweeps.work {folder}/jobs/NUMBER/job.json")
+        print(f"and the table is made by: --out {folder} --resume --where here")
+        return True
     left = [job for job in jobs if status_of(job.folder).state != "done"]
     if left:
         before = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
         beside = "an array of the cluster" if asked.beside is None else f"{asked.beside} at once"
-        with engine_of(asked, folder) as engine, progress(len(left), "jobs") as show:
+        with engine_of(asked, folder, len(left)) as engine, progress(len(left), "jobs") as show:
             write_jobs(jobs, command)
             print(f"{command}: {len(left)} of {len(jobs)} jobs{before}; {asked.where}, {beside}", flush=True)
             run_all(engine, [job.path for job in left], lambda over, bad: show(over, f"{bad} not done" if bad else ""))
@@ -64,10 +69,10 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
     return all(entry.status.state == "done" for entry in found)
 
 
-def engine_of(asked: Asked, folder: Path) -> AbstractContextManager[Engine]:
+def engine_of(asked: Asked, folder: Path, jobs: int) -> AbstractContextManager[Engine]:
     """What runs the jobs; errors as it is entered."""
     if asked.where == "slurm":
-        return slurm(folder, asked.beside, asked.slurm)
+        return slurm(folder, jobs, asked.beside, asked.slurm)
     at_once = asked.beside or 1
     return ray(at_once, asked.gpus) if asked.where == "ray" else here(at_once, asked.gpus)
 
@@ -81,7 +86,7 @@ def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder
     for entry in best:
         values = " ".join(f"{name}={text}" for name, text in entry.job.values.items())
         print(f"best by {names.validation}: {values}, run folder {entry.job.folder / entry.status.run}")
-    if best and names.error:
+    if best and names.error in ERRORS:
         print(f"{names.error} is of the test, and took no part in the choice")
     wrong: dict[str, list[str]] = {}
     for entry in found:

@@ -6,10 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.table import Column, Table
+
 from dln_jax.files import finite, write_bytes, write_json
-from dln_jax.runs.results import print_numbers
 from dln_jax.sweeps.results import Entry, Group, Names, shown
 
+WIDTH = 200
+"""Of tables: a narrow terminal gets long lines, since numbers that are cut off say nothing."""
 MOST_ROWS = 200
 """Of a table that is printed."""
 
@@ -26,18 +30,28 @@ def print_jobs(found: Sequence[Entry], best: Sequence[Entry], names: Names, *, t
         numbers = [figure(entry.number(name)) for name in filter(None, names[:3])]
         values = [shown(text) for text in entry.job.values.values()]
         rows.append([entry.job.folder.name, *values, *numbers, said(entry, best)])
-    print_numbers(rows, title=title, columns=["job", *map(spaced, columns), "status"])
+    print_rows(rows, title=title, columns=["job", *map(spaced, columns), "status"])
 
 
 def print_groups(of: Sequence[Group], names: Names, over: Sequence[str]) -> None:
     """Prints medians and the worst over some options."""
     listed = [name for name in filter(None, names[:3]) if any(name in group.medians for group in of)]
-    columns = [*of[0].values, "done", *(spaced(name) for name in listed), *(f"worst {spaced(name)}" for name in listed)]
+    judged = [name for name in listed if name != names.seconds]
+    titles = [*map(spaced, listed), *(f"worst {spaced(name)}" for name in judged)]
     rows = []
     for group in of:
-        numbers = [figure(part.get(name)) for part in (group.medians, group.worst) for name in listed]
-        rows.append([*map(shown, group.values.values()), f"{group.done} of {group.jobs}", *numbers])
-    print_numbers(rows, title=f"medians over {', '.join(over)}, and the worst", columns=columns)
+        numbers = [*(group.medians.get(name) for name in listed), *(group.worst.get(name) for name in judged)]
+        rows.append([*map(shown, group.values.values()), f"{group.done} of {group.jobs}", *map(figure, numbers)])
+    title = f"medians over {', '.join(over)}, and the worst"
+    print_rows(rows, title=title, columns=[*map(spaced, of[0].values), "done", *titles])
+
+
+def print_rows(rows: Sequence[Sequence[str]], *, title: str, columns: Sequence[str]) -> None:
+    """Prints a table."""
+    table = Table(*(Column(each, justify="left" if each == "status" else "right") for each in columns), title=title)
+    for row in rows:
+        table.add_row(*row)
+    Console(highlight=False, soft_wrap=True, width=WIDTH).print(table)
 
 
 def write_tables(
@@ -85,4 +99,4 @@ def figure(number: float | None) -> str:
 
 def spaced(name: str) -> str:
     """A metric's or option's name as words."""
-    return name.replace("_", " ")
+    return " ".join(word.upper() if word in ("mse", "nmse") else word for word in name.split("_"))

@@ -14,7 +14,7 @@ from typing import Any
 from filelock import FileLock
 
 from dln_jax.files import read_json
-from dln_jax.sweeps.status import OUTPUT, Status, close, status_of, write_status
+from dln_jax.sweeps.status import OUTPUT, Status, end, status_of, write_status
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 REQUEUED = (-1, 144)
@@ -66,7 +66,7 @@ def perform(path: Path) -> int:
         if code == 0:
             write_status(folder, status._replace(state="done", seconds=seconds))
         elif code == INTERRUPTED:
-            close(folder, "interrupted")
+            end(folder, "interrupted")
         else:
             line = last_line(folder / OUTPUT, start)
             write_status(folder, status._replace(state="failed", line=line, seconds=seconds))
@@ -118,3 +118,7 @@ def last_line(path: Path, start: int = 0) -> str:
         return ""
     errors = [line for line in lines if line.startswith("error: ")]
     return (errors or lines or [""])[-1].removeprefix("error: ")[:300]
+
+
+if __name__ == "__main__":
+    raise SystemExit(perform(Path(sys.argv[1])))

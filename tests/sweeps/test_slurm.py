@@ -76,7 +76,7 @@ def test_a_resumed_sweep_finds_its_jobs_in_the_queue(cluster, tmp_path):
     for path in paths:
         path.parent.mkdir(parents=True)
     (tmp_path / "s" / slurm.IDS).write_text(json.dumps({"0000": "7_0", "0001": "7_1", "0002": "7_2"}))
-    with slurm.slurm(tmp_path / "s", None, "") as engine:
+    with slurm.slurm(tmp_path / "s", 3, None, "") as engine:
         handles = engine.start(paths)
         assert [job.job_id for _, job in handles] == ["7_0", "7_1", "7"]
         assert (cluster / "scripts").read_text().count("srun") == 1  # the one that is gone
@@ -94,11 +94,21 @@ def test_a_job_that_is_queued_again_is_the_same_job():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [("partion=gpu", "did you mean partition?"), ("time", "no NAME=VALUE"), ("time=5 time=6", "names time twice")],
+    [
+        ("partion=gpu", "did you mean partition?"),
+        ("time", "no NAME=VALUE"),
+        ("time=5 time=6", "names time twice"),
+        ("time=1-00:00", "whole minutes"),
+    ],
 )
 def test_options_of_sbatch_are_checked(cluster, tmp_path, capsys, options, message):
     assert message in refused(capsys, sweep, *GRID, "--slurm", options, "--out", tmp_path / "s")
     assert not (tmp_path / "s").exists()
+
+
+def test_an_array_has_an_end(cluster, tmp_path, capsys):
+    line = refused(capsys, sweep, "--grid", "seed=0:1001", "--where", "slurm", "--out", tmp_path / "s")
+    assert "1001 jobs for one Slurm array" in line and not (tmp_path / "s").exists()
 
 
 def test_what_sbatch_refuses_is_one_line(cluster, tmp_path, capsys):

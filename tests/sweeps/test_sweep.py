@@ -71,7 +71,7 @@ def engine(monkeypatch):
     monkeypatch.setattr(work, "exit_code", trained)
     monkeypatch.setattr(engines, "SECONDS_BETWEEN_LOOKS", 0.0)
     made = Engine(start, lambda path: "OUT_OF_MEMORY", lambda paths: None, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder: contextlib.nullcontext(made))
+    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
     return begun
 
 
@@ -111,6 +111,16 @@ def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, engine, c
     assert len(engine) == 11
 
 
+def test_jobs_for_later_are_done_by_anything(tmp_path, engine, capsys):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=2,4 seed=0", "--where", "later", "--out", out)
+    assert "python -m dln_jax.sweeps.work" in capsys.readouterr().out and not (out / "sweep.json").exists()
+    for path in sorted((out / "jobs").glob("*/job.json")):
+        assert work.perform(path) == 0
+    command(sweep, "--out", out, "--resume", "--where", "here")
+    assert not engine and "best by validation_error: width=4" in capsys.readouterr().out
+
+
 def test_what_cannot_be_continued_is_begun_anew(tmp_path, engine):
     for attempt in (1, 2):
         with contextlib.suppress(SystemExit):
@@ -145,7 +155,7 @@ def test_an_interrupt_ends_the_jobs(tmp_path, engine, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     made = Engine(list, interrupted, stopped.extend, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder: contextlib.nullcontext(made))
+    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
     assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
