@@ -2,16 +2,17 @@
 
 The Hessians of learned energies need not be definite, so that Cholesky does not apply. The matrices of mechanics have a
 few rows and come in batches. Written out, they fuse with what surrounds them, which is faster than one library call per
-matrix up to a dozen rows; and several batched LAPACK calls in one program can wait for each other for ever on a machine
-with few cores (seen with jaxlib 0.10.2 on two).
+matrix up to a dozen rows.
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
+
+from dln_jax.solvers import lapack
 
 # Beyond this size the library call is faster, and the written-out program slow to compile.
 _WRITTEN_OUT_ROWS = 16
@@ -24,13 +25,26 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[A
     """
     if b.shape[0] == 1:
         return b / matrix[0]
+    product = functools.partial(jnp.matmul, matrix)
     if b.shape[0] > _WRITTEN_OUT_ROWS:
-        return jnp.linalg.solve(matrix, b)
+        factors = lapack.lu_factors(jax.lax.stop_gradient(matrix))
+
+        def by_lapack(right: Array, transposed: bool) -> Array:
+            columns = right.reshape(len(right), -1)
+            return lapack.solve_lu(factors, columns, transposed=transposed).reshape(right.shape)
+
+        return _linear_solve(product, b, by_lapack)
+
+    def by_rows(right: Array, transposed: bool) -> Array:
+        return _eliminate(matrix.T if transposed else matrix, right)
+
+    return _linear_solve(product, b, by_rows)
+
+
+def _linear_solve(product: Callable[[Array], Array], b: Array, solve: Callable[[Array, bool], Array]) -> Array:
+    """x with product(x) = b by solve(b, transposed), differentiated by the product."""
     return jax.lax.custom_linear_solve(
-        functools.partial(jnp.matmul, matrix),
-        b,
-        lambda _, right: _eliminate(matrix, right),
-        transpose_solve=lambda _, right: _eliminate(matrix.T, right),
+        product, b, lambda _, right: solve(right, False), transpose_solve=lambda _, right: solve(right, True)
     )
 
 
@@ -58,7 +72,13 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
 def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
     if b.shape[0] > _WRITTEN_OUT_ROWS:
-        return solve_triangular(factor, b, lower=True)
+        lower = jnp.tril(factor)
+
+        def by_lapack(right: Array, transposed: bool) -> Array:
+            fixed = jax.lax.stop_gradient(lower)
+            return lapack.substitute(fixed, right[:, None], transposed=transposed)[:, 0]
+
+        return _linear_solve(functools.partial(jnp.matmul, lower), b, by_lapack)
     x = []
     for i in range(b.shape[0]):
         remainder = b[i]

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.lax.linalg import cholesky as batched_cholesky
-from jax.lax.linalg import triangular_solve
-from jaxtyping import Array, Float
+from jax.lax.linalg import eigh, lu, triangular_solve
+from jaxtyping import Array, Float, Int
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -50,6 +50,40 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return batched_cholesky(matrix, symmetrize_input=False)
 
 
+@one_by_one
+def symmetric_eigen(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues, ascending, and eigenvectors (columns) of a symmetric matrix, from its lower triangle."""
+    vectors, values = eigh(matrix, lower=True, symmetrize_input=False)
+    return values, vectors
+
+
+@one_by_one
+def lu_factors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Int[Array, " n"]]:
+    """L below the diagonal and U of P A = L U, and the permutation: row i of P A is row permutation[i] of A."""
+    factors, _, permutation = lu(matrix)
+    return factors, permutation
+
+
+def solve_lu(
+    factors: tuple[Float[Array, "n n"], Int[Array, " n"]], b: Float[Array, "n k"], *, transposed: bool = False
+) -> Float[Array, "n k"]:
+    """x with A x = b, or Aᵀ x = b if `transposed`, from the factors of A."""
+    return (_solve_lu_transposed if transposed else _solve_lu)(*factors, b)
+
+
+@one_by_one
+def _solve_lu(factors: Array, permutation: Array, b: Array) -> Array:
+    y = triangular_solve(factors, b[permutation], left_side=True, lower=True, unit_diagonal=True)
+    return triangular_solve(factors, y, left_side=True, lower=False)
+
+
+@one_by_one
+def _solve_lu_transposed(factors: Array, permutation: Array, b: Array) -> Array:
+    y = triangular_solve(factors, b, left_side=True, lower=False, transpose_a=True)
+    x = triangular_solve(factors, y, left_side=True, lower=True, unit_diagonal=True, transpose_a=True)
+    return x[jnp.argsort(permutation)]
+
+
 def substitute(
     factor: Float[Array, "n n"], b: Float[Array, "n k"], *, transposed: bool = False, right: bool = False
 ) -> Float[Array, "n k"]:
@@ -62,20 +96,28 @@ def substitute(
 
 @functools.cache
 def _substitution(transposed: bool, right: bool) -> Callable[[Array, Array], Array]:
-    with_one = one_by_one(functools.partial(triangular_solve, left_side=not right, lower=True, transpose_a=transposed))
+    one = one_by_one(functools.partial(triangular_solve, left_side=not right, lower=True, transpose_a=transposed))
+    return shared_or_batched(one, jax.vmap(one), side=0 if right else 1)
+
+
+def shared_or_batched(
+    one: Callable[[Array, Array], Array], many: Callable[[Array, Array], Array], *, side: int = 1
+) -> Callable[[Array, Array], Array]:
+    """The solve (matrix, b) -> x of `one`, which `many` does for a batch of both.
+
+    Where only b is a batch, it becomes columns (its axis `side`) of one b.
+    """
 
     @jax.custom_batching.custom_vmap
-    def solve(factor: Array, b: Array) -> Array:
-        return with_one(factor, b)
+    def solve(matrix: Array, b: Array) -> Array:
+        return one(matrix, b)
 
     @solve.def_vmap
-    def solve_many(size: int, batched: Sequence[bool], factor: Array, b: Array) -> tuple[Array, bool]:
+    def solve_many(size: int, batched: Sequence[bool], matrix: Array, b: Array) -> tuple[Array, bool]:
         if batched[0]:
-            return jax.vmap(with_one, in_axes=tuple(0 if each else None for each in batched))(factor, b), True
-        # One factor for all: their right-hand sides are columns of one.
-        side = 0 if right else 1
+            return many(matrix, b if batched[1] else jnp.broadcast_to(b, (size, *b.shape))), True
         columns = jnp.moveaxis(b, 0, side)
-        every = solve(factor, lax.collapse(columns, side, side + 2))
+        every = solve(matrix, lax.collapse(columns, side, side + 2))
         return jnp.moveaxis(every.reshape(columns.shape), side, 0), True
 
     return solve
