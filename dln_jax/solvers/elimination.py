@@ -6,7 +6,6 @@ matrix up to a dozen rows.
 """
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -25,26 +24,13 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[A
     """
     if b.shape[0] == 1:
         return b / matrix[0]
-    product = functools.partial(jnp.matmul, matrix)
     if b.shape[0] > _WRITTEN_OUT_ROWS:
-        factors = lapack.lu_factors(jax.lax.stop_gradient(matrix))
-
-        def by_lapack(right: Array, transposed: bool) -> Array:
-            columns = right.reshape(len(right), -1)
-            return lapack.solve_lu(factors, columns, transposed=transposed).reshape(right.shape)
-
-        return _linear_solve(product, b, by_lapack)
-
-    def by_rows(right: Array, transposed: bool) -> Array:
-        return _eliminate(matrix.T if transposed else matrix, right)
-
-    return _linear_solve(product, b, by_rows)
-
-
-def _linear_solve(product: Callable[[Array], Array], b: Array, solve: Callable[[Array, bool], Array]) -> Array:
-    """x with product(x) = b by solve(b, transposed), differentiated by the product."""
+        return lapack.solve(matrix, b)
     return jax.lax.custom_linear_solve(
-        product, b, lambda _, right: solve(right, False), transpose_solve=lambda _, right: solve(right, True)
+        functools.partial(jnp.matmul, matrix),
+        b,
+        lambda _, right: _eliminate(matrix, right),
+        transpose_solve=lambda _, right: _eliminate(matrix.T, right),
     )
 
 
@@ -73,12 +59,13 @@ def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Arr
     """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
     if b.shape[0] > _WRITTEN_OUT_ROWS:
         lower = jnp.tril(factor)
-
-        def by_lapack(right: Array, transposed: bool) -> Array:
-            fixed = jax.lax.stop_gradient(lower)
-            return lapack.substitute(fixed, right[:, None], transposed=transposed)[:, 0]
-
-        return _linear_solve(functools.partial(jnp.matmul, lower), b, by_lapack)
+        fixed = jax.lax.stop_gradient(lower)
+        return jax.lax.custom_linear_solve(
+            functools.partial(jnp.matmul, lower),
+            b,
+            lambda _, right: lapack.substitute(fixed, right[:, None])[:, 0],
+            transpose_solve=lambda _, right: lapack.substitute(fixed, right[:, None], transposed=True)[:, 0],
+        )
     x = []
     for i in range(b.shape[0]):
         remainder = b[i]

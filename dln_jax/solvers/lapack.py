@@ -2,8 +2,8 @@
 
 On a processor, JAX hands a batch to a library call that splits it over the threads that also run the programs of other
 devices. Where those wait for each other, all wait for ever (seen with jaxlib 0.10.2: two devices of one process, or
-several batched calls in one program on two cores); and a loop over the matrices is as fast. Elsewhere, a batch is one
-call. None of the functions has derivatives: callers know those of the solution.
+several batched calls in one program on two cores). Elsewhere, a batch is one call. Factors have no derivatives: callers
+know those of the solution.
 """
 
 import functools
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.lax.linalg import cholesky as batched_cholesky
 from jax.lax.linalg import eigh, lu, triangular_solve
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -57,18 +57,25 @@ def symmetric_eigen(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Fl
     return values, vectors
 
 
+def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
+    """x with A x = b, by LU factors of A; derivatives of every order are those of the solution."""
+    factors = _lu_factors(lax.stop_gradient(matrix))
+
+    def columns(one: Callable[..., Array], right: Array) -> Array:
+        return one(*factors, right.reshape(right.shape[0], -1)).reshape(right.shape)
+
+    return lax.custom_linear_solve(
+        functools.partial(jnp.matmul, matrix),
+        b,
+        lambda _, right: columns(_solve_lu, right),
+        transpose_solve=lambda _, right: columns(_solve_lu_transposed, right),
+    )
+
+
 @one_by_one
-def lu_factors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Int[Array, " n"]]:
-    """L below the diagonal and U of P A = L U, and the permutation: row i of P A is row permutation[i] of A."""
+def _lu_factors(matrix: Array) -> tuple[Array, Array]:
     factors, _, permutation = lu(matrix)
     return factors, permutation
-
-
-def solve_lu(
-    factors: tuple[Float[Array, "n n"], Int[Array, " n"]], b: Float[Array, "n k"], *, transposed: bool = False
-) -> Float[Array, "n k"]:
-    """x with A x = b, or Aᵀ x = b if `transposed`, from the factors of A."""
-    return (_solve_lu_transposed if transposed else _solve_lu)(*factors, b)
 
 
 @one_by_one
@@ -85,11 +92,11 @@ def _solve_lu_transposed(factors: Array, permutation: Array, b: Array) -> Array:
 
 
 def substitute(
-    factor: Float[Array, "n n"], b: Float[Array, "n k"], *, transposed: bool = False, right: bool = False
-) -> Float[Array, "n k"]:
+    factor: Float[Array, "n n"], b: Float[Array, "rows columns"], *, transposed: bool = False, right: bool = False
+) -> Float[Array, "rows columns"]:
     """x with L x = b, or Lᵀ x = b if `transposed`, for the lower triangle L of a matrix.
 
-    `right` puts the triangle on the right of x: x L = b, or x Lᵀ = b, with b [k, n].
+    `right` puts the triangle on the right of x: x L = b, or x Lᵀ = b.
     """
     return _substitution(transposed, right)(factor, b)
 

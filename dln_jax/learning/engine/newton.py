@@ -79,7 +79,7 @@ def _compile(
     def score(parameters: Any) -> Array:
         return jnp.stack(problem.score(parameters))
 
-    # One seed after the other: a score that calls LAPACK must not do so for a batch (see the solver).
+    # One seed after the other: a score that calls LAPACK must not do so for a batch (see `solvers.lapack`).
     evaluate = jax.jit((lambda stacked: lax.map(score, stacked)) if problem.several else score)
     evaluate = evaluate.lower(state.solver.parameters).compile()
     keep = jax.jit(jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of)
