@@ -73,7 +73,7 @@ def start(
     Raises:
         InputError: a process does not come, they do not agree, the coordinator's port is taken, or JAX has been used.
     """
-    _require_unused()
+    require_unused()
     own = own_sign(facts(place, arguments))
     with sign_folder(folder, place.process, own.token):
         try:
@@ -120,7 +120,7 @@ def join(place: Place, devices: int | None, limits: Limits) -> None:
         print(f"{place.processes} processes on {many} ({place.found}), {local} {kind} device{'s' * (local > 1)} each")
 
 
-def _require_unused() -> None:
+def require_unused() -> None:
     """Raises `InputError` if JAX has been used: it then refuses another number of devices."""
     devices = jax.config.values["jax_num_cpu_devices"]
     try:
