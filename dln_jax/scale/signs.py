@@ -28,7 +28,7 @@ class Limits(NamedTuple):
     """For all processes to be started, from the first one on."""
     joining: float = 60.0
     """For all to reach process 0's port."""
-    silent: float = 40.0
+    silent: float = 30.0
     """Without a sign, after which a process is taken for gone or stuck."""
     grace: float = 3.0
     """For a process to end by itself once another has."""

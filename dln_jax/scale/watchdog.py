@@ -86,9 +86,9 @@ def _next(own: Sign, worker: Worker) -> Sign:
 
 def _stuck(worker: Worker, limits: Limits) -> End | None:
     if worker.silent > limits.silent:
-        return End(LOST, f"has given no sign of life for {limits.silent:g} s (stopped?)", shown=False)
+        return End(LOST, f"no sign of life for {limits.silent:g} s (stopped)", shown=False)
     if worker.idle > limits.idle:
-        return End(LOST, f"has made no progress for {limits.idle:g} s", shown=False)
+        return End(LOST, f"no progress for {limits.idle:g} s (stuck, or it waits for one that is)", shown=False)
     return None
 
 
@@ -100,8 +100,8 @@ def _trouble(others: Mapping[int, Peer], joined: bool, limits: Limits) -> Verdic
             refused = sign.code == 2 and not joined
             return Verdict(2 if refused else LOST, f"process {k} on {host}: {sign.said}")
         if silent > limits.silent:
-            why = f"has given no sign of life for {limits.silent:g} s (killed, stopped or cut off)"
-            return Verdict(LOST, f"process {k} on {host} {why}")
+            why = f"no sign of life for {limits.silent:g} s (killed, stopped or cut off)"
+            return Verdict(LOST, f"process {k} on {host}: {why}")
     return None
 
 
@@ -115,7 +115,7 @@ def _judged(
     limits: Limits,
 ) -> Verdict | None:
     """How the run ends, `None` while it does not; `waited` is the time for which there has been an end or trouble."""
-    lost = Verdict(LOST, f"process {place.process} on {own.host} has lost the connection to the others", own=True)
+    lost = Verdict(LOST, f"process {place.process} on {own.host}: lost the connection to the others", own=True)
     if end is None or end.cut_off:
         first = others.get(0)
         if first and first.sign and first.sign.stage == "over":
@@ -163,7 +163,7 @@ def _signals(child: int) -> Iterator[list[End]]:
     told: list[End] = []
 
     def end(number: int, _: object) -> None:
-        told.append(End(128 + number, f"was ended by {signal.Signals(number).name}", shown=False))
+        told.append(End(128 + number, f"ended by {signal.Signals(number).name}", shown=False))
 
     def hand_on(number: int, _: object) -> None:
         os.kill(child, number)

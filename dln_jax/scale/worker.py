@@ -138,7 +138,7 @@ def _died(code: int, held: bytes) -> End:
         return End(3, f"left with exit status {code}", shown=False, more=held.decode(errors="replace"))
     name = signal.Signals(-code).name
     by_runtime = -code == signal.SIGABRT
-    return End(3, f"was ended by {name}", cut_off=by_runtime, shown=False, more=held.decode(errors="replace"))
+    return End(3, f"ended by {name}", cut_off=by_runtime, shown=False, more=held.decode(errors="replace"))
 
 
 def _with_chatter(worker: Worker, text: bytes) -> Worker:
@@ -202,7 +202,8 @@ def _end_of(work: Callable[[], None]) -> End:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         reason = stop.__cause__ or stop.__context__
-        end = End(code, _line(reason) if reason else f"exit status {code}")
+        said = "interrupted" if isinstance(reason, KeyboardInterrupt) else _line(reason or stop)
+        end = End(code, said)
     except KeyboardInterrupt:
         end = End(130, "interrupted", shown=False)
     except BaseException as error:

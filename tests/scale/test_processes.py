@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 TINY = '''
 """A command that iterates a map whose every step needs all devices, and in which a process may be lost."""
-import dataclasses, os, signal, sys
+import dataclasses, os, signal, sys, time
 from pathlib import Path
 
 import jax
@@ -30,7 +30,8 @@ from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import load_tree, save_tree
 
 LOST, JOINING = os.environ.get("LOST", ""), float(os.environ.get("JOINING", "30"))
-LIMITS = Limits(beat=0.1, silent=5.0, grace=0.5, meeting=JOINING, joining=JOINING)
+IDLE = 6.0 if "idle" in LOST else 600.0
+LIMITS = Limits(beat=0.1, silent=5.0, grace=0.5, meeting=JOINING, joining=JOINING, idle=IDLE)
 
 @dataclasses.dataclass(frozen=True)
 class Arguments(Resumable, Scaled):
@@ -42,6 +43,8 @@ def lose(process):
     who, _, how = LOST.partition(" ")
     if who != str(process):
         return
+    if how == "idle":
+        time.sleep(1000)
     if how == "error":
         raise InputError("the disk is full")
     victims = os.getppid(), os.getpid()
@@ -154,7 +157,7 @@ def slurm_pair(*more):
 @pytest.fixture(scope="module")
 def trained(run_tiny):
     """One process, two, two by Slurm, and two of which one is lost in each of several ways."""
-    lost = ("1 SIGKILL", "1 SIGSTOP", "0 SIGKILL", "1 error")
+    lost = ("1 SIGKILL", "1 SIGSTOP", "0 SIGKILL", "1 error", "1 idle")
     runs = [([((), {})], {}, None), (pair(), {}, None), (slurm_pair("--devices", "2"), {}, None)]
     started = run_tiny(*runs, *((pair(), {"LOST": how}, None) for how in lost))
     return dict(zip(("alone", "two", "slurm", *lost), started, strict=True))
@@ -188,9 +191,10 @@ def test_the_first_process_alone_prints_and_writes(trained, way):
 
 
 LOSSES = {
-    "1 SIGKILL": ((3, -9), "process 1 on {host} has given no sign of life"),
-    "1 SIGSTOP": ((3, -9), "process 1 on {host} has given no sign of life"),
-    "0 SIGKILL": ((-9, 3), "process 0 on {host} has given no sign of life"),
+    "1 SIGKILL": ((3, -9), "process 1 on {host}: no sign of life"),
+    "1 SIGSTOP": ((3, -9), "process 1 on {host}: no sign of life"),
+    "0 SIGKILL": ((-9, 3), "process 0 on {host}: no sign of life"),
+    "1 idle": ((3, 3), "process 0 on {host}: no progress"),
     "1 error": ((3, 2), "process 1 on {host}: the disk is full"),
 }
 
