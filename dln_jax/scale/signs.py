@@ -28,7 +28,7 @@ class Limits(NamedTuple):
     """For all processes to be started, from the first one on."""
     joining: float = 60.0
     """For all to reach process 0's port."""
-    silent: float = 40.0
+    silent: float = 30.0
     """Without a sign, after which a process is taken for gone or stuck."""
     grace: float = 3.0
     """For a process to end by itself once another has."""
@@ -85,6 +85,11 @@ def read(folder: Path, process: int) -> Sign | None:
         return Sign(**json.loads(_file(folder, process).read_text()))
     except (OSError, ValueError, TypeError):
         return None
+
+
+def has_left(folder: Path, process: int) -> bool:
+    """Whether a process has removed what it said; a file that is being written is there."""
+    return not _file(folder, process).exists()
 
 
 def looked_at(peer: Peer, folder: Path, process: int, seconds: float) -> Peer:

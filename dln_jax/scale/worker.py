@@ -110,7 +110,11 @@ def heard(worker: Worker, wait: float, seconds: float) -> Worker:
     worker = worker._replace(unread=unread)
     for line in lines:
         told = json.loads(line)
-        worker = worker._replace(**told | ({"end": End(*told["end"])} if "end" in told else {}))
+        if "end" in told:
+            told = {
+                "end": worker.end or End(*told["end"])
+            }  # the first one is its own, and may be the cause of the next
+        worker = worker._replace(**told)
     silent = 0.0 if worker.beats != before.beats else before.silent + seconds
     stuck = worker.progress is not None and worker.progress == before.progress
     worker = worker._replace(silent=silent, idle=before.idle + seconds if stuck else 0.0)
@@ -134,7 +138,7 @@ def _died(code: int, held: bytes) -> End:
         return End(3, f"left with exit status {code}", shown=False, more=held.decode(errors="replace"))
     name = signal.Signals(-code).name
     by_runtime = -code == signal.SIGABRT
-    return End(3, f"was ended by {name}", cut_off=by_runtime, shown=False, more=held.decode(errors="replace"))
+    return End(3, f"ended by {name}", cut_off=by_runtime, shown=False, more=held.decode(errors="replace"))
 
 
 def _with_chatter(worker: Worker, text: bytes) -> Worker:
@@ -198,7 +202,8 @@ def _end_of(work: Callable[[], None]) -> End:
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         reason = stop.__cause__ or stop.__context__
-        end = End(code, _line(reason) if reason else f"exit status {code}")
+        said = "interrupted" if isinstance(reason, KeyboardInterrupt) else _line(reason or stop)
+        end = End(code, said)
     except KeyboardInterrupt:
         end = End(130, "interrupted", shown=False)
     except BaseException as error:
