@@ -126,7 +126,8 @@ def check_direct_options(given: Options, others: tuple[str, ...], model: str, wh
     """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
     if given.seeds > 1:
         raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
-    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
+    of_networks = (*OF_NETWORKS, *OF_ADAM, "steps", "target", "processes")
+    refuse_given(given, (*of_networks, *others), f"for networks; {model} {why}")
     if given.optimizer != "auto":
         raise InputError(f"{model} {why}; leave --optimizer out")
 

@@ -53,7 +53,8 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
     """
     devices = 1 if mesh is None else mesh.size
     if count % devices:
-        raise InputError(f"{count} {what} cannot be split over {devices} devices; give a multiple of {devices}")
+        remedy = f"give a multiple of {devices}, or fewer devices"
+        raise InputError(f"{count} {what} cannot be split over {devices} devices; {remedy}")
     return count // devices
 
 

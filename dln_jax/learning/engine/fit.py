@@ -48,13 +48,13 @@ def fit(
             dispatches, of which there is one at least. The learning rate falls as it would have without it.
         must_start: whether a loss that is not finite to begin with is an error, rather than a result.
         mesh: devices that share the training. Several seeds are split over them, and each device trains its own. Of one
-            seed the samples are split: those of a step's batch for Adam, all for Gauss-Newton. What is stored does not
-            depend on the devices, and a run may continue on others; results are those of one device to rounding, which
-            a long training by Adam amplifies. Each device has the whole score.
+            seed the samples are split: those of a step's batch for Adam, all for Gauss-Newton; each device works out
+            the whole score. What is stored does not depend on the devices, and a run may continue on others. Results
+            are those of one device to rounding, which parameters amplify that the data hardly determine.
 
     Raises:
         InputError: settings out of range, a loss that is not finite to begin with, a checkpoint that does not fit, or
-            devices that divide neither the seeds nor the batch.
+            devices that do not divide the samples of a batch.
     """
     began = time.perf_counter()
     require_positive(seconds=seconds)

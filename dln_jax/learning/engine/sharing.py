@@ -7,7 +7,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.learning.engine.problem import Problem
-from dln_jax.scale.mesh import on_devices, shares, spread
+from dln_jax.scale.mesh import on_devices, spread
 from dln_jax.types import InputError
 
 
@@ -15,7 +15,7 @@ class Sharing(NamedTuple):
     """What is split over a mesh; one of both at most."""
 
     seeds: Mesh | None
-    """Each device trains its own, as it would alone: nothing is sent but the results."""
+    """Each device trains its own, as it would alone: nothing is sent but the results. Some may have one more."""
     samples: Mesh | None
     """Each device sums over its own, and the sums are added up in every step."""
 
@@ -24,11 +24,9 @@ def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
     """What the devices of a mesh share of a problem.
 
     Raises:
-        InputError: seeds that they do not divide, or a loss that is not the mean of those of parts of a batch.
+        InputError: one seed, of a loss that is not the mean of those of parts of a batch.
     """
-    seeds = np.size(problem.seed)
-    if mesh is None or seeds > 1:
-        shares(mesh, seeds, "seeds")
+    if mesh is None or np.size(problem.seed) > 1:
         return Sharing(mesh, None)
     if problem.loss is not None and not problem.loss_is_mean:
         raise InputError("the loss is of a whole batch, whose samples cannot be split: train it on one device")
