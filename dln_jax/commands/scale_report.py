@@ -17,7 +17,7 @@ from dln_jax.files import finite, write_json
 from dln_jax.studies.case import draw, measure, rows_in
 from dln_jax.studies.report import conditions, publish
 from dln_jax.studies.scale.cases import cases
-from dln_jax.studies.scale.hosts import NETWORKS
+from dln_jax.studies.scale.hosts import CASES, NETWORKS, table
 from dln_jax.types import InputError, require_positive
 
 SUBJECTS = ("crawlers", "training", "accelerator")
@@ -57,7 +57,9 @@ def main(given: Arguments) -> None:
             dtype="float64, and float32 where a case says so", seeds=[0], networks=networks, assumed=assumed
         )
         write_json(folder / "metrics.json", {f"{row.case}/{row.quantity}": finite(row.value) for row in rows})
-        publish(folder, rows, facts)
+        modelled = [row for row in rows if row.case.startswith(CASES)]
+        shown = [row for row in rows if row not in modelled]
+        publish(folder, rows, facts, shown=shown, tables=[table(modelled)] if modelled else [])
 
 
 def lanes_in(text: str | None) -> tuple[int, ...] | None:

@@ -57,8 +57,8 @@ def measure_crawlers(lanes: Sequence[int], steps: int, turns: int, count: int) -
             rows += [Row(case, name, facts[name]) for name in ("useful_iterations_share", "converged_share")]
             curves[str(number)] = gains(found)
     generation = max(lanes)
-    modelled = hosts.rows("hosts/evolution", generation * EPISODE * alone, hosts.of_results(generation))
-    return Findings(rows + modelled, {"measured": curves, "modelled": {"evolution": points(modelled)}})
+    modelled = hosts.rows("evolution", generation * EPISODE * alone, hosts.of_results(generation))
+    return Findings(rows + modelled, {"measured": curves, "modelled": {"evolution": hosts.curves(modelled)}})
 
 
 def measure_training(samples: int, turns: int, count: int) -> Findings:
@@ -73,9 +73,9 @@ def measure_training(samples: int, turns: int, count: int) -> Findings:
             rows += compared(f"training/{name}", found, "seconds_per_step", facts["steps"])
             rows.append(Row(f"training/{name}", "parameters", parameters))
             exchange = hosts.of_gradient(parameters) if name == "adam" else hosts.of_normal_equations(parameters)
-            modelled = hosts.rows(f"hosts/{name}", found[BASE].seconds / facts["steps"], exchange)
+            modelled = hosts.rows(name, found[BASE].seconds / facts["steps"], exchange)
             rows += modelled
-            curves[name], lines[name] = gains(found), points(modelled)
+            curves[name], lines[name] = gains(found), hosts.curves(modelled)
     return Findings(rows, {"measured": curves, "modelled": lines})
 
 
@@ -118,11 +118,6 @@ def compared(case: str, found: Mapping[str, Measured], quantity: str, count: flo
 def gains(found: Mapping[str, Measured]) -> dict[str, float]:
     """How many times as fast as one device the others are."""
     return {name: found[BASE].seconds / each.seconds for name, each in found.items() if name != BASE}
-
-
-def points(modelled: Sequence[Row]) -> dict[str, list[float]]:
-    """Of modelled rows the speed-ups by network."""
-    return {name: [row.value for row in modelled if row.quantity == f"speed_up_{name}"] for name in hosts.NETWORKS}
 
 
 def draw(x: str, curves: dict[str, Any]) -> Figure:

@@ -9,9 +9,16 @@ clusters of workstations"). C is what one device takes. Left out is what all hos
 normal equations, and that lanes which wait for each other wait less in smaller groups.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+from rich.table import Table
+
+from dln_jax.studies.case import by_case
 from dln_jax.studies.report import Row
+
+CASES = "hosts/"
+"""Beginning of the cases of modelled rows."""
 
 HOSTS = (1, 2, 4, 8, 16, 64)
 NUMBER = 8
@@ -69,11 +76,28 @@ def speed_up(seconds: float, exchange: Exchange, hosts: int, network: Network) -
     return seconds / (seconds / hosts + exchange_seconds(exchange, hosts, network))
 
 
-def rows(case: str, seconds: float, exchange: Exchange) -> list[Row]:
-    """The speed-up of a step on each number of hosts."""
-    moved = Row(case, "megabytes_moved_per_step", (exchange.gathered + exchange.summed) / 1e6, "MB")
+def rows(work: str, seconds: float, exchange: Exchange) -> list[Row]:
+    """The speed-up of a step on each number of hosts, as cases hosts/WORK/NETWORK."""
+    case = f"{CASES}{work}"
+    moved = Row(case, "megabytes_per_step", (exchange.gathered + exchange.summed) / 1e6, "MB")
     return [Row(case, "seconds_per_step_of_one", seconds, "s"), moved] + [
-        Row(f"{case}/{hosts}-hosts", f"speed_up_{name}", speed_up(seconds, exchange, hosts, network))
-        for hosts in HOSTS
+        Row(f"{case}/{name}", f"speed_up_of_{hosts}", speed_up(seconds, exchange, hosts, network))
         for name, network in NETWORKS.items()
+        for hosts in HOSTS
     ]
+
+
+def curves(modelled: Sequence[Row]) -> dict[str, list[float]]:
+    """By network, the speed-ups in rows of one work."""
+    return {name: [row.value for row in modelled if row.case.endswith(f"/{name}")] for name in NETWORKS}
+
+
+def table(modelled: Sequence[Row]) -> Table:
+    """A line for each work and network, a column for each number of hosts."""
+    titles = [f"{hosts} host{'s' if hosts > 1 else ''}" for hosts in HOSTS]
+    shown = Table("times as fast as one", *titles, caption="modelled, not measured: see the conditions in report.json")
+    for case, numbers in by_case(modelled).items():
+        values = [f"{numbers[name]:.3g}" for hosts in HOSTS if (name := f"speed_up_of_{hosts}") in numbers]
+        if values:
+            shown.add_row(case.removeprefix(CASES), *values)
+    return shown

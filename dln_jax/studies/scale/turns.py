@@ -68,10 +68,12 @@ def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
                     print(json.dumps(question), file=worker.stdin, flush=True)
                 except BrokenPipeError:
                     raise _silent(error) from None
-            return [_answer(*pair) for pair in zip(workers, said, strict=True)]
+            return answers()
 
-        hello = [_answer(*pair) for pair in zip(workers, said, strict=True)]
-        yield ask, hello[0]
+        def answers() -> list[dict[str, Any]]:
+            return [_answer(worker, error) for worker, error in zip(workers, said, strict=True)]
+
+        yield ask, answers()[0]
 
 
 def taken_in_turns(teams: Mapping[str, Team], work: Mapping[str, Any], repetitions: int) -> dict[str, Measured]:
