@@ -87,7 +87,7 @@ def taken_in_turns(teams: Mapping[str, Team], work: Mapping[str, Any], repetitio
             turns[name].append((seconds, sum(each["processor_seconds"] for each in answers) / seconds))
     # The first turn warms up.
     medians = {name: np.median(each[1:], axis=0) for name, each in turns.items()}
-    return {name: Measured(*map(float, medians[name]), facts[name]) for name in teams}
+    return {name: Measured(float(medians[name][0]), float(medians[name][1]), facts[name]) for name in teams}
 
 
 def teams_of(stack: contextlib.ExitStack, layouts: Mapping[str, Layout]) -> dict[str, Team]:
