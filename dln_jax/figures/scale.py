@@ -26,7 +26,7 @@ def speed_ups(
         hosts: these numbers.
         x: what tells the works of the bars apart.
     """
-    figure, [[bars, lines]] = style.figure(1, 2, height=3.2)
+    figure, [[bars, lines]] = style.figure(1, 2, height=3.6)
     _draw_bars(bars, measured)
     bars.set(xlabel=x, ylabel="times as fast as one device")
     style.title(bars, "measured on this machine")
@@ -34,7 +34,7 @@ def speed_ups(
     colours = style.colours_of(modelled)
     for work, networks in modelled.items():
         for dash, (network, values) in zip(DASHES, networks.items(), strict=False):
-            label = f"{work}, {network.replace('_', ' ')}/s"
+            label = f"{work}, {network.replace('_gbit', ' Gbit/s')}"
             lines.plot(hosts, values, dash, color=colours[work], marker="o", markersize=3, linewidth=1.4, label=label)
     lines.set_xscale("log", base=2)
     lines.set_yscale("log", base=2)
@@ -42,7 +42,7 @@ def speed_ups(
         axis.set_major_formatter("{x:g}")
     lines.set(xlabel="hosts", ylabel="times as fast as one")
     style.title(lines, "modelled, not measured")
-    style.legend(lines)
+    style.legend(figure, *lines.get_legend_handles_labels(), loc="outside lower right", ncols=3)
     return figure
 
 

@@ -105,7 +105,7 @@ def measure_accelerator(quick: bool, lanes: int, turns: int) -> Findings:
     return Findings(rows)
 
 
-def compared(case: str, found: Mapping[str, Measured], quantity: str, count: float) -> list[Row]:
+def compared(case: str, found: Mapping[str, Measured], quantity: str, count: float | int) -> list[Row]:
     """What each layout takes for one of `count`, how many cores were busy, and how many times as fast it is."""
     rows = []
     for name, each in found.items():
