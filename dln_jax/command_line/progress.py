@@ -18,7 +18,10 @@ ROOM_FOR_RATE = 110
 def progress(
     total: int, unit: str = "steps", *, console: Console | None = None
 ) -> Iterator[Callable[[int, str], None]]:
-    """Yields `show(done, text)`, a sign of life to other processes too; count, text and time left are whole at 80 columns, and the bar takes what is over."""
+    """Yields `show(done, text)`, also a sign of progress to whoever watches this process.
+
+    Count, text and time left are whole at 80 columns, and the bar takes what is over.
+    """
     with reporting(), _shown(total, unit, console or Console()) as shown:
 
         def show(done: int, text: str) -> None:

@@ -15,6 +15,8 @@ from dln_jax.scale.signs import Limits, Peer, Sign, looked_at, require_own, writ
 from dln_jax.types import InputError
 
 ABSENT = "nothing"
+PATIENCE = 5.0
+"""s, after which a user is told who is waited for."""
 
 
 def versions() -> dict[str, str]:
@@ -62,7 +64,7 @@ def meet(folder: Path, place: Place, own: Sign, limits: Limits) -> Sign:
             return own._replace(stage="met")
         if now - since > limits.meeting:
             raise InputError(_absent(place, others, here, folder, limits))
-        if not asked and now - since > 5 * limits.beat and place.process == 0:
+        if not asked and now - since > PATIENCE and place.process == 0:
             print(f"waiting for {_named(others.keys() - here)} of {place.processes}", file=sys.stderr, flush=True)
             asked = True
 

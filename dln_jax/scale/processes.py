@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 from dln_jax.scale.meeting import facts, meet
 from dln_jax.scale.mesh import batch_mesh, gathered, shard
 from dln_jax.scale.places import Place, address
-from dln_jax.scale.signs import USUAL, Limits, Sign, own_sign, read, sign_folder, write
+from dln_jax.scale.signs import USUAL, Limits, Sign, has_left, own_sign, read, sign_folder, write
 from dln_jax.scale.watchdog import watched
 from dln_jax.scale.worker import say_joined
 from dln_jax.types import InputError
@@ -71,8 +71,9 @@ def start(
         limits: after which times what happens.
 
     Raises:
-        InputError: a process does not come, they do not agree, or the coordinator's port is taken.
+        InputError: a process does not come, they do not agree, the coordinator's port is taken, or JAX has been used.
     """
+    require_unused()
     own = own_sign(facts(place, arguments))
     with sign_folder(folder, place.process, own.token):
         try:
@@ -117,6 +118,16 @@ def join(place: Place, devices: int | None, limits: Limits) -> None:
         kind, local = jax.default_backend(), jax.local_device_count()
         many = f"{hosts} host{'s' * (hosts > 1)}"
         print(f"{place.processes} processes on {many} ({place.found}), {local} {kind} device{'s' * (local > 1)} each")
+
+
+def require_unused() -> None:
+    """Raises `InputError` if JAX has been used: it then refuses another number of devices."""
+    devices = jax.config.values["jax_num_cpu_devices"]
+    try:
+        jax.config.update("jax_num_cpu_devices", devices + 1)
+        jax.config.update("jax_num_cpu_devices", devices)
+    except RuntimeError:
+        raise InputError("JAX has been used in this process; several are started before it is") from None
 
 
 def _in_program(work: Callable[[], None], place: Place, devices: int | None, limits: Limits) -> None:
@@ -164,11 +175,16 @@ def _require_reachable(host: str, port: int, limits: Limits) -> None:
 
 
 def _refuse(folder: Path, place: Place, own: Sign, why: str, limits: Limits) -> None:
-    """Says why, until the others must have read it."""
-    for _ in range(6):
+    """Says why, until the others have refused too, or must have read it."""
+    others = [k for k in range(place.processes) if k != place.process and (k == 0 or place.process == 0)]
+    until = time.monotonic() + 2 * (limits.beat + limits.grace)
+    while time.monotonic() < until:
         last = read(folder, place.process)
         if last is not None and last.token != own.token:
             return
         own = own._replace(stage="ended", code=2, said=why, beat=own.beat + 1)
         write(folder, place.process, own)
         time.sleep(limits.beat / 2)
+        signs = {k: read(folder, k) for k in others}
+        if all(has_left(folder, k) or (sign and sign.stage in ("ended", "over")) for k, sign in signs.items()):
+            return

@@ -87,6 +87,11 @@ def read(folder: Path, process: int) -> Sign | None:
         return None
 
 
+def has_left(folder: Path, process: int) -> bool:
+    """Whether a process has removed what it said; a file that is being written is there."""
+    return not _file(folder, process).exists()
+
+
 def looked_at(peer: Peer, folder: Path, process: int, seconds: float) -> Peer:
     """What is known of a process after another look, `seconds` after the last."""
     sign = read(folder, process)

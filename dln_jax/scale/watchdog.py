@@ -3,7 +3,6 @@
 Process 0 looks at all others, and they at process 0, which says what it has seen: n processes read 2 n files a beat.
 """
 
-import math
 import os
 import signal
 import sys
@@ -15,7 +14,7 @@ from typing import NamedTuple
 
 from dln_jax.scale.meeting import peers_of
 from dln_jax.scale.places import Place
-from dln_jax.scale.signs import Limits, Peer, Sign, looked_at, read, remove, require_own, write
+from dln_jax.scale.signs import Limits, Peer, Sign, has_left, looked_at, remove, require_own, write
 from dln_jax.scale.worker import End, Worker, ended, heard, spawn
 
 LOST = 3
@@ -26,7 +25,10 @@ class Verdict(NamedTuple):
     """How a run ends."""
 
     code: int
+    """Exit status."""
     said: str = ""
+    own: bool = False
+    """Whether it is this process's own end."""
 
 
 def watched(work: Callable[[], None], place: Place, folder: Path, own: Sign, limits: Limits, remedy: str) -> int:
@@ -69,6 +71,8 @@ def watched(work: Callable[[], None], place: Place, folder: Path, own: Sign, lim
         code = verdict.code if verdict.code == 0 or (verdict.code == 2 and not worker.joined) else LOST
         over = own._replace(stage="over", code=code, said=verdict.said)
         _leave_last(folder, over, others, limits)
+    elif others[0].silent > limits.silent:
+        remove(folder, 0)
     return verdict.code
 
 
@@ -111,7 +115,7 @@ def _judged(
     limits: Limits,
 ) -> Verdict | None:
     """How the run ends, `None` while it does not; `waited` is the time for which there has been an end or trouble."""
-    lost = Verdict(LOST, f"process {place.process} on {own.host} has lost the connection to the others")
+    lost = Verdict(LOST, f"process {place.process} on {own.host} has lost the connection to the others", own=True)
     if end is None or end.cut_off:
         first = others.get(0)
         if first and first.sign and first.sign.stage == "over":
@@ -119,7 +123,7 @@ def _judged(
         if trouble and waited > limits.grace:
             return trouble
         return lost if end and waited > limits.silent + 3 * limits.grace else None
-    mine = Verdict(end.code, f"process {place.process} on {own.host}: {end.said}" if end.code else "")
+    mine = Verdict(end.code, f"process {place.process} on {own.host}: {end.said}" if end.code else "", own=True)
     if place.process:
         sign = others[0].sign
         if sign and sign.stage == "over":
@@ -135,7 +139,7 @@ def _tell(end: End | None, verdict: Verdict, remedy: str) -> None:
     """Tells the user what the child has not."""
     if end and end.shown and end.code:
         return
-    if end and end.more and not (end.cut_off and verdict.said and "lost the connection" not in verdict.said):
+    if end and end.more and verdict.own:
         print(end.more.rstrip(), file=sys.stderr)
     if verdict.said:
         after = "" if verdict.code == 2 else f"; all processes have ended, {remedy}"
@@ -144,13 +148,11 @@ def _tell(end: End | None, verdict: Verdict, remedy: str) -> None:
 
 def _leave_last(folder: Path, over: Sign, others: Mapping[int, Peer], limits: Limits) -> None:
     """Says how the run ended until the others have read it, which then remove their files, and removes what is left."""
-    here = [k for k, peer in others.items() if peer.silent <= limits.silent]
-    for _ in range(math.ceil(2 * limits.grace / limits.beat) + 4):
+    while any(peer.silent <= limits.silent and not has_left(folder, k) for k, peer in others.items()):
         over = over._replace(beat=over.beat + 1)
         write(folder, 0, over)
-        if all(read(folder, k) is None for k in here):
-            break
         time.sleep(limits.beat / 2)
+        others = {k: looked_at(peer, folder, k, limits.beat / 2) for k, peer in others.items()}
     for k in others:
         remove(folder, k)
 

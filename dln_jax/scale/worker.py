@@ -110,7 +110,11 @@ def heard(worker: Worker, wait: float, seconds: float) -> Worker:
     worker = worker._replace(unread=unread)
     for line in lines:
         told = json.loads(line)
-        worker = worker._replace(**told | ({"end": End(*told["end"])} if "end" in told else {}))
+        if "end" in told:
+            told = {
+                "end": worker.end or End(*told["end"])
+            }  # the first one is its own, and may be the cause of the next
+        worker = worker._replace(**told)
     silent = 0.0 if worker.beats != before.beats else before.silent + seconds
     stuck = worker.progress is not None and worker.progress == before.progress
     worker = worker._replace(silent=silent, idle=before.idle + seconds if stuck else 0.0)

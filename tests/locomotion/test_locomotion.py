@@ -254,11 +254,13 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("make_learner", [make_gradient_learner, make_evolution_learner])
-def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy, make_learner):
+@pytest.mark.parametrize(
+    ("make_learner", "settings"), [(make_gradient_learner, QUICK), (make_evolution_learner, EvolutionSettings())]
+)
+def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy, make_learner, settings):
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
-        make_learner(task, policy, mesh=mesh)
+        make_learner(task, policy, settings, mesh=mesh)
 
 
 def test_medians_and_the_crossover():
