@@ -76,7 +76,7 @@ def workplace(tmp_path_factory):
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     pytest.importorskip("mujoco")
     given = train_delan.Arguments(model="auto", data=Path("rigid.npz"), robot=Path("arm.xml"), velocity_scale=0.01)
-    task, training = climb_ladder(given, read(given), workplace)
+    task, training = climb_ladder(given, read(given), workplace, mesh=None)
     said, stored = capsys.readouterr().out, json.loads((workplace / "ladder.json").read_text())
     assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
     assert "│ rigid-tree " in said and [rung["tried"] for rung in stored["rungs"]].count(True) == 1

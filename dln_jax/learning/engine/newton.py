@@ -31,9 +31,9 @@ class State(NamedTuple):
     best: Best
 
     @property
-    def step(self) -> Array:
-        """[] iterations done, of several seeds the most."""
-        return self.earlier + jnp.max(self.solver.iteration)
+    def step(self) -> int:
+        """Iterations done, of several seeds the most."""
+        return int(self.earlier) + int(np.max(np.asarray(self.solver.iteration)))
 
 
 def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[Stage]:
@@ -65,14 +65,14 @@ def _stage(
             parameters = problem.parameters
             best, earlier = of_seeds(no_best)(jax.tree.map(jnp.array, parameters)), jnp.zeros((), int)
         else:
-            parameters, best, earlier = before.best.parameters, before.best, before.step
+            parameters, best, earlier = before.best.parameters, before.best, jnp.asarray(before.step)
         return State(of_seeds(levenberg_marquardt.init)(parameters), earlier, best)
 
     def ended(state: State) -> Stop | None:
         if np.all(np.asarray(state.solver.status) == Status.NON_FINITE):
-            return Stop("not finite", int(state.step))
+            return Stop("not finite", state.step)
         done = not _remaining(state, iterations) or np.all(np.asarray(state.best.validation) <= optimiser.target)
-        return Stop("finished", int(state.step)) if done else None
+        return Stop("finished", state.step) if done else None
 
     return Stage(
         name, start, functools.partial(_compile, problem, optimiser, shared, iterate, arrays, iterations), ended
@@ -102,7 +102,7 @@ def _compile(
         # One seed after the other: a score that calls LAPACK must not do so for a batch (see the solver).
         scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)
         better = jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of
-        best = better(best, solver.parameters, scores[..., 0], step.astype(jnp.int32))
+        best = better(best, solver.parameters, scores[..., 0], jnp.asarray(step, jnp.int32))
         return best, jnp.concatenate([solver.loss[..., None], scores], axis=-1)
 
     def score(parameters: Any) -> Array:
