@@ -2,8 +2,8 @@
 
 On a processor, JAX hands a batch to a library call that splits it over the threads that also run the programs of other
 devices. Where those wait for each other, all wait for ever (seen with jaxlib 0.10.2: two devices of one process, or
-several batched calls in one program on two cores); and a loop over the matrices is as fast. Elsewhere, a batch is one
-call. None of the functions has derivatives: callers know those of the solution.
+several batched calls in one program on two cores). Elsewhere, a batch is one call. Factors have no derivatives: callers
+know those of the solution.
 """
 
 import functools
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.lax.linalg import cholesky as batched_cholesky
-from jax.lax.linalg import triangular_solve
+from jax.lax.linalg import eigh, lu, triangular_solve
 from jaxtyping import Array, Float
 
 
@@ -50,32 +50,81 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return batched_cholesky(matrix, symmetrize_input=False)
 
 
+@one_by_one
+def symmetric_eigen(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues, ascending, and eigenvectors (columns) of a symmetric matrix, from its lower triangle."""
+    vectors, values = eigh(matrix, lower=True, symmetrize_input=False)
+    return values, vectors
+
+
+def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
+    """x with A x = b, by LU factors of A; derivatives of every order are those of the solution."""
+    factors = _lu_factors(lax.stop_gradient(matrix))
+
+    def columns(one: Callable[..., Array], right: Array) -> Array:
+        return one(*factors, right.reshape(right.shape[0], -1)).reshape(right.shape)
+
+    return lax.custom_linear_solve(
+        functools.partial(jnp.matmul, matrix),
+        b,
+        lambda _, right: columns(_solve_lu, right),
+        transpose_solve=lambda _, right: columns(_solve_lu_transposed, right),
+    )
+
+
+@one_by_one
+def _lu_factors(matrix: Array) -> tuple[Array, Array]:
+    factors, _, permutation = lu(matrix)
+    return factors, permutation
+
+
+@one_by_one
+def _solve_lu(factors: Array, permutation: Array, b: Array) -> Array:
+    y = triangular_solve(factors, b[permutation], left_side=True, lower=True, unit_diagonal=True)
+    return triangular_solve(factors, y, left_side=True, lower=False)
+
+
+@one_by_one
+def _solve_lu_transposed(factors: Array, permutation: Array, b: Array) -> Array:
+    y = triangular_solve(factors, b, left_side=True, lower=False, transpose_a=True)
+    x = triangular_solve(factors, y, left_side=True, lower=True, unit_diagonal=True, transpose_a=True)
+    return x[jnp.argsort(permutation)]
+
+
 def substitute(
-    factor: Float[Array, "n n"], b: Float[Array, "n k"], *, transposed: bool = False, right: bool = False
-) -> Float[Array, "n k"]:
+    factor: Float[Array, "n n"], b: Float[Array, "rows columns"], *, transposed: bool = False, right: bool = False
+) -> Float[Array, "rows columns"]:
     """x with L x = b, or Lᵀ x = b if `transposed`, for the lower triangle L of a matrix.
 
-    `right` puts the triangle on the right of x: x L = b, or x Lᵀ = b, with b [k, n].
+    `right` puts the triangle on the right of x: x L = b, or x Lᵀ = b.
     """
     return _substitution(transposed, right)(factor, b)
 
 
 @functools.cache
 def _substitution(transposed: bool, right: bool) -> Callable[[Array, Array], Array]:
-    with_one = one_by_one(functools.partial(triangular_solve, left_side=not right, lower=True, transpose_a=transposed))
+    one = one_by_one(functools.partial(triangular_solve, left_side=not right, lower=True, transpose_a=transposed))
+    return shared_or_batched(one, jax.vmap(one), side=0 if right else 1)
+
+
+def shared_or_batched(
+    one: Callable[[Array, Array], Array], many: Callable[[Array, Array], Array], *, side: int = 1
+) -> Callable[[Array, Array], Array]:
+    """The solve (matrix, b) -> x of `one`, which `many` does for a batch of both.
+
+    Where only b is a batch, it becomes columns (its axis `side`) of one b.
+    """
 
     @jax.custom_batching.custom_vmap
-    def solve(factor: Array, b: Array) -> Array:
-        return with_one(factor, b)
+    def solve(matrix: Array, b: Array) -> Array:
+        return one(matrix, b)
 
     @solve.def_vmap
-    def solve_many(size: int, batched: Sequence[bool], factor: Array, b: Array) -> tuple[Array, bool]:
+    def solve_many(size: int, batched: Sequence[bool], matrix: Array, b: Array) -> tuple[Array, bool]:
         if batched[0]:
-            return jax.vmap(with_one, in_axes=tuple(0 if each else None for each in batched))(factor, b), True
-        # One factor for all: their right-hand sides are columns of one.
-        side = 0 if right else 1
+            return many(matrix, b if batched[1] else jnp.broadcast_to(b, (size, *b.shape))), True
         columns = jnp.moveaxis(b, 0, side)
-        every = solve(factor, lax.collapse(columns, side, side + 2))
+        every = solve(matrix, lax.collapse(columns, side, side + 2))
         return jnp.moveaxis(every.reshape(columns.shape), side, 0), True
 
     return solve

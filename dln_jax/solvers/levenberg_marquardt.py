@@ -118,8 +118,7 @@ def run(
     """So many iterations, fewer where the status says so, or an iteration lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds are taken one after the other instead of all in lockstep: no seed repeats
-    another's failed trials, memory is that of one, and LAPACK is never called for a batch (several such calls in one
-    program can wait for each other for ever on a machine with few cores, seen with jaxlib 0.10.2).
+    another's failed trials, memory is that of one, and LAPACK is never called for a batch (see `solvers.lapack`).
 
     Raises:
         InputError: parameters or residuals that are not float64, or arrays of different length.

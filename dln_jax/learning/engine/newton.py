@@ -99,7 +99,7 @@ def _compile(
 
     def judge(step: Array, given: tuple[Best, levenberg_marquardt.State]) -> tuple[Best, Array]:
         best, solver = given
-        # One seed after the other: a score that calls LAPACK must not do so for a batch (see the solver).
+        # One seed after the other: a score that calls LAPACK must not do so for a batch (see `solvers.lapack`).
         scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)
         better = jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of
         best = better(best, solver.parameters, scores[..., 0], jnp.asarray(step, jnp.int32))
