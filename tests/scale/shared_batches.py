@@ -15,6 +15,7 @@ from dln_jax import compilation
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import fit_residual
 from dln_jax.control.optimal.value_networks import value_network
 from dln_jax.learning.soft_body_identification import ObservedMotions, identify
 from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
@@ -74,6 +75,17 @@ def value(mesh):
     return found.parameters, [(at.loss, at.validation) for at in found.history]
 
 
+def equation(mesh):
+    """Parameters of a value by the equation, and how many rounds that took; nine samples do not divide."""
+    network = value_network(LINE, widths=())
+    start, given = network.init(jax.random.key(2)), {"samples": 9, "validation": 4, "iterations": 2, "rounds": 2}
+    start = jax.tree.map(lambda leaf: leaf.astype(float), start)
+    found = fit_residual(
+        LINE, network.value_and_gradient, start, jax.random.key(3), discounts=[1.0, 0.2], mesh=mesh, **given
+    )
+    return found.parameters, found.validation, len(found.stages)
+
+
 def main(folder, name):
     mesh, task = batch_mesh(), block()
     policy = make_policy(task, width=2)
@@ -88,6 +100,7 @@ def main(folder, name):
         "gradient": walked(folder, "gradient", by_gradient),
         "stiffness": stiffness(mesh),
         "value": value(mesh),
+        "equation": equation(mesh),
     }
     arrays = {
         f"{subject} {number}": np.asarray(leaf)

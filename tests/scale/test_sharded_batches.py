@@ -44,7 +44,7 @@ def test_each_ran_on_its_devices(results):
 
 
 @pytest.mark.parametrize("name", ["four devices", "first of two", "second of two"])
-@pytest.mark.parametrize("subject", ["evolution", "gradient", "stiffness", "value"])
+@pytest.mark.parametrize("subject", ["evolution", "gradient", "stiffness", "value", "equation"])
 def test_results_are_those_of_one_device(results, name, subject):
     expected, found = results["one device"], results[name]
     keys = [key for key in expected if key.startswith(subject)]
