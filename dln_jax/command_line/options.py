@@ -52,8 +52,8 @@ class Scaled:
     """Devices and processes that share the work."""
 
     devices: Unstated[int] = None
-    """Devices of every process that share the batches (default: all that JAX sees; without accelerators 1). Of a
-    processor any number: its cores then work side by side."""
+    """Devices of every process that share the batches (default: 1 of one process, of several all that each sees). A
+    processor makes any number, whose work then goes side by side."""
     processes: Unstated[int] = None
     """Processes, on one host or several, that are one run: start the same command in each, with --coordinator and
     --process-id (default: the tasks of a Slurm step, else 1)."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 from jax.sharding import Mesh
 
 from dln_jax.command_line.options import Scaled
@@ -27,10 +28,13 @@ Arguments = TypeVar("Arguments")
 def mesh_of(given: Scaled) -> Mesh | None:
     """The devices that share a command's batches, `None` where that is one alone.
 
+    One process takes one device unless it is asked for more: most networks are small, and lose by being shared.
+
     Raises:
         InputError: there are not so many.
     """
-    return batch_mesh(given.devices)
+    alone = jax.process_count() == 1
+    return batch_mesh(1 if alone and given.devices is None else given.devices)
 
 
 def place_in(given: Any) -> Place | None:
