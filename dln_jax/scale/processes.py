@@ -109,11 +109,14 @@ def join(place: Place, devices: int | None, limits: Limits) -> None:
             heartbeat_timeout_seconds=FOR_EVER,
             shutdown_timeout_seconds=FOR_EVER,
         )
-        mesh = batch_mesh(devices)
-    except RuntimeError as error:
+        # Devices find each other when they first exchange numbers, and wait for 30 s: now all are at one place.
+        hosts = _hosts(batch_mesh(devices))
+    except InputError:
+        raise
+    except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0][:200]
-        raise InputError(f"cannot join {place.coordinator}: {reason}; look at the other processes' lines") from None
-    hosts = _meet_devices(mesh)
+        remedy = f"every host's name must lead the others to it ({socket.gethostname()} is this one's)"
+        raise InputError(f"cannot join {place.coordinator}: {reason}; {remedy}") from None
     if place.process == 0:
         kind, local = jax.default_backend(), jax.local_device_count()
         many = f"{hosts} host{'s' * (hosts > 1)}"
@@ -144,18 +147,14 @@ def _in_program(work: Callable[[], None], place: Place, devices: int | None, lim
 
 def wait_for_all(mesh: Mesh | None) -> None:
     """Waits until all processes are here."""
-    _meet_devices(mesh)
+    _hosts(mesh)
 
 
-def _meet_devices(mesh: Mesh | None) -> int:
-    """Lets all devices talk for the first time, which must be at one time, and counts their hosts."""
-    name = zlib.crc32(socket.gethostname().encode())
-    try:
-        return len(np.unique(np.asarray(gathered(shard(np.full(1 if mesh is None else mesh.size, name), mesh)))))
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).splitlines()[0][:200]
-        remedy = f"every host's name must lead the others to it ({socket.gethostname()} is this one's)"
-        raise InputError(f"cannot exchange numbers with the other processes: {reason}; {remedy}") from None
+def _hosts(mesh: Mesh | None) -> int:
+    """How many hosts there are; all devices take part in counting them."""
+    name = zlib.crc32(socket.gethostname().encode()) % 2**31
+    names = shard(np.full(1 if mesh is None else mesh.size, name), mesh)
+    return len(np.unique(np.asarray(gathered(names))))
 
 
 def _require_reachable(host: str, port: int, limits: Limits) -> None:
