@@ -7,6 +7,7 @@ rounding, depends on their number. A function of `on_devices` does that itself, 
 `mean` and `first`. Where there is no mesh (`None`), all are the function or the arrays themselves.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dln_jax.types import InputError
@@ -83,7 +83,7 @@ def gathered(tree: Any) -> Any:
         split = isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
         if not split:
             return leaf
-        return jax.jit(lambda x: x, out_shardings=NamedSharding(leaf.sharding.mesh, WHOLE))(leaf)  # pyright: ignore[reportAttributeAccessIssue]
+        return _gathering(leaf.sharding.mesh)(leaf)  # pyright: ignore[reportAttributeAccessIssue]
 
     return jax.tree.map(whole, tree)
 
@@ -104,7 +104,10 @@ def local(tree: Any, mesh: Mesh | None) -> Any:
 
 def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
     """A number that processes may see differently, such as a time, as the first one sees it."""
-    return value if mesh is None else type(value)(multihost_utils.broadcast_one_to_all(np.asarray(value)))
+    if mesh is None:
+        return value
+    # Through the connections of all devices together, which are there: others would have to be made, at one time.
+    return type(value)(np.asarray(gathered(shard(np.full(mesh.size, value), mesh)))[0])
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
@@ -172,6 +175,11 @@ def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
         return array
     size = array.shape[axis] // mesh.size
     return lax.dynamic_slice_in_dim(array, lax.axis_index(AXIS) * size, size, axis)
+
+
+@functools.cache
+def _gathering(mesh: Mesh) -> Callable[[jax.Array], jax.Array]:
+    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, WHOLE))
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:

@@ -19,6 +19,7 @@ from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree
 from dln_jax.runs import direct_fits
 from dln_jax.runs.dynamics_data import read
 from dln_jax.runs.dynamics_ladder import climb_ladder
+from dln_jax.runs.dynamics_options import check_options
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
@@ -147,3 +148,9 @@ def test_a_mistake_is_one_line(workplace, capsys, mistake):
         pytest.importorskip("mujoco")
     assert message in refused(capsys, train_delan, *arguments, "--out", workplace / "refused")
     assert not (workplace / "refused").exists()
+
+
+@pytest.mark.parametrize("model", ["auto", "trigonometric", "trigonometric-kernel", "learned-tree"])
+def test_a_fit_that_processes_do_not_share_is_refused(model):
+    with pytest.raises(InputError, match="--processes is for networks"):
+        check_options(train_delan.Arguments(model=model, processes=2), model)
