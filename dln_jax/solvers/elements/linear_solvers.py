@@ -32,8 +32,10 @@ from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
 # Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160
-# Of many at once: up to here, their bands are factorised faster than each matrix by LAPACK.
+# Of so many at once, bands up to here are factorised faster than each matrix by LAPACK; as measured with 56 to 120
+# unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
+_FEWEST_BANDS = 4
 # Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
 # rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
 # unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
@@ -134,9 +136,13 @@ def _one_or_many(
         x = solve_bands(lower, b.transpose(1, 2, 0)[order])
         return x[np.argsort(order)].transpose(2, 0, 1)
 
-    return shared_or_batched(
-        one, lambda values, b: lax.platform_dependent(values, b, cpu=by_bands, default=jax.vmap(one))
-    )
+    def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
+        each = jax.vmap(one)
+        if len(values) < _FEWEST_BANDS:
+            return each(values, b)
+        return lax.platform_dependent(values, b, cpu=by_bands, default=each)
+
+    return shared_or_batched(one, many)
 
 
 def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
