@@ -4,11 +4,10 @@ import ast
 import importlib
 import importlib.util
 import os
-import pkgutil
 import sys
 from pathlib import Path
 
-from dln_jax import commands
+from dln_jax.commands import command_names
 
 
 def command(name: str, prog: str) -> None:
@@ -54,11 +53,6 @@ def main() -> None:
         raise SystemExit(2)
     del sys.argv[1]
     command(name, f"{prog} {name}")
-
-
-def command_names() -> list[str]:
-    """Names of all commands, sorted."""
-    return sorted(module.name for module in pkgutil.iter_modules(commands.__path__))
 
 
 def first_line(name: str) -> str:

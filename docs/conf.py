@@ -71,6 +71,7 @@ ROOMS = {
     "locomotion": "Locomotion",
     "nn": "Networks",
     "solvers": "Solvers",
+    "scale": "Scale: several devices and processes",
     "precision": "Precision",
 }
 """Folders and modules of dln_jax that the API pages show, in the order of the contents."""

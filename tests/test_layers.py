@@ -34,9 +34,10 @@ FLOORS = {
     "command_line": 8,
     "studies": 9,
     "runs": 10,
-    "commands": 11,
-    "__main__": 12,
-    "__init__": 12,  # the public names, gathered from every floor
+    "sweeps": 11,
+    "commands": 12,
+    "__main__": 13,
+    "__init__": 13,  # the public names, gathered from every floor
 }
 MODULES = sorted((ROOT / "dln_jax").rglob("*.py"))
 

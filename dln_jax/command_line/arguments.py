@@ -6,7 +6,7 @@ import inspect
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -50,8 +50,10 @@ def choice(names: Iterable[str], *, several: bool = False, unstated: bool = Fals
     )
 
 
-def parse(arguments: type[Arguments], *, prog: str, description: str | None) -> Arguments:
-    """The arguments of this process's command line; `--help` prints the text and exits.
+def parse(
+    arguments: type[Arguments], *, prog: str, description: str | None, line: Sequence[str] | None = None
+) -> Arguments:
+    """The arguments of a command's `line`, by default this process's; `--help` prints the text and exits.
 
     Raises:
         InputError: what cannot be parsed.
@@ -59,7 +61,7 @@ def parse(arguments: type[Arguments], *, prog: str, description: str | None) -> 
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(arguments, prog=prog, description=description, registry=_rules)
+            return tyro.cli(arguments, prog=prog, description=description, args=line, registry=_rules)
     except SystemExit as stop:
         if not stop.code:
             raise

@@ -45,3 +45,19 @@ class SingleCalls:
 
     low_latency: bool = True
     """Time single calls also in low-latency mode, in a process of its own (about 2 s)."""
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """Devices and processes that share the work."""
+
+    devices: Unstated[int] = None
+    """Devices of every process that share the batches (default: 1 of one process, of several all that each sees). A
+    processor makes any number, whose work then goes side by side."""
+    processes: Unstated[int] = None
+    """Processes, on one host or several, that are one run: start the same command in each, with --coordinator and
+    --process-id (default: the tasks of a Slurm step, else 1)."""
+    coordinator: Unstated[str] = None
+    """host:port of process 0, with a free port, which all processes can reach."""
+    process_id: Unstated[int] = None
+    """Which of --processes this one is, from 0; 0 prints and writes the results."""

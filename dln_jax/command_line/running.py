@@ -15,50 +15,75 @@ import tyro
 
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
+from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
 from dln_jax.data.schema import needs_from_text
 from dln_jax.files import is_file, matches, read_json, write_json
 from dln_jax.scale.devices import unusable_platform
+from dln_jax.scale.signs import USUAL, Limits
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
-PLACES = ("out", "resume", "figures", "low_latency", "uncertainty")
+SCALE = ("devices", "processes", "coordinator", "process_id")
+"""Arguments that say where a result is computed."""
+PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not decide the result."""
 CHANGEABLE = ("seconds",)
-"""Arguments that may be given anew to --resume."""
+"""Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""
 
 SceneName = Annotated[str, choice(SCENES)]
 
 Arguments = TypeVar("Arguments")
 
 
-def run(main: Callable[[Arguments], None], arguments: type[Arguments], *, prog: str, from_shell: bool = False) -> None:
+def run(
+    main: Callable[[Arguments], None],
+    arguments: type[Arguments],
+    *,
+    prog: str,
+    from_shell: bool = False,
+    limits: Limits = USUAL,
+) -> None:
     """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130.
 
-    `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs.
+    `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs;
+    `limits` are those of several processes, of which each works in a child.
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
-    given = None
-    try:
+    with in_words(prog, None):
         description = sys.modules[main.__module__].__doc__
         refuse_moved(arguments)
         whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
         given = whole.own
         require_storable(given)
+        place = place_in(given)
         if getattr(given, "resume", False):
             given = with_stored_arguments(given)
-        if from_shell:
-            before = compilation_cache.compilation()
-            unkept = compilation_cache.keep(whole.compilation_cache)
+        before = compilation_cache.compilation() if from_shell else None
+        unkept = compilation_cache.keep(whole.compilation_cache) if from_shell else ""
+
+    def work(given: Arguments) -> None:
+        with in_words(prog, given):
             main(given)
-            if line := compilation_cache.summary(before, unkept):
+            if before and (line := compilation_cache.summary(before, unkept)):
                 print(line)
-        else:
-            main(given)
-        sys.stdout.flush()
+            sys.stdout.flush()
+
+    if place is None:
+        work(given)
+        return
+    with in_words(prog, given):
+        raise SystemExit(in_processes(work, given, place, limits))
+
+
+@contextlib.contextmanager
+def in_words(prog: str, given: Any) -> Iterator[None]:
+    """Turns a user's mistake into one line and exit status 2, and an interrupt into 130."""
+    try:
+        yield
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -127,7 +152,11 @@ def needs_from_option(text: str) -> Needs:
 @contextlib.contextmanager
 def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
     """Yields the run folder of a command, with its arguments in config.json, and beside them what they came to."""
-    with run_folder(given.out, command, resume=getattr(given, "resume", False)) as folder:
+    resume = getattr(given, "resume", False)
+    folder_of_run = run_folder(given.out, command, resume=resume) if is_first(given) else copied_folder(given, resume)
+    with folder_of_run as folder:
+        if resume:
+            wait_for_all(given)
         write_config(folder, given, **chosen)
         yield folder
 
@@ -154,12 +183,13 @@ def with_stored_arguments(given: Arguments) -> Arguments:
         raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
     unset = stored_arguments(type(given)())
     stored = checked_arguments(folder / CONFIG, type(given), unset)
+    changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
     for key, value in stored_arguments(given).items():
-        if key not in CHANGEABLE and value not in (stored[key], unset[key]):
+        if key not in changeable and value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
             raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
     hints = get_type_hints(type(given))
-    stored |= {key: getattr(given, key) for key in CHANGEABLE if getattr(given, key, None) is not None}
+    stored |= {key: getattr(given, key) for key in changeable if getattr(given, key, None) is not None}
     for key, value in stored.items():
         if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
             stored[key] = Path(value)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.command_line.arguments import Unstated
-from dln_jax.command_line.options import Drawn, Folder
+from dln_jax.command_line.options import Drawn, Folder, Scaled
 from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.methods import METHODS, settings_of
@@ -21,7 +22,7 @@ from dln_jax.studies.report import conditions, print_report, write_report
 
 
 @dataclass(frozen=True)
-class Arguments(Options, Folder, Drawn):
+class Arguments(Options, Folder, Drawn, Scaled):
     """What to compare, and where the results go."""
 
     MEASURES_COMPILATION: ClassVar = True
@@ -34,21 +35,23 @@ class Arguments(Options, Folder, Drawn):
 
 def main(given: Arguments) -> None:
     """Trains by all methods, prints and writes."""
-    task = prepare(given, METHODS)
+    mesh = mesh_of(given)
+    task = prepare(given, METHODS, mesh)
     with command_folder(given, "compare_locomotion") as folder:
         announce(task)
         curves, numbers = {}, {}
         for method in METHODS:
-            trained = learned(task, method, given)
+            trained = learned(task, method, given, mesh)
             (folder / method).mkdir()
             found = write_run(folder / method, task, method, trained, given, figures=given.figures)
             numbers |= {f"{method}_{name}": value for name, value in found.items()}
             curves[method] = [of.records for of in trained.learned]
+        settings = {method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS}
         rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
             seeds=list(range(given.seed, given.seed + given.seeds)),
-            settings={method: settings_of(method, given.creature, given.window)._asdict() for method in METHODS},
+            settings={method: numbers._asdict() for method, numbers in settings.items()},
             goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
             counted="environment steps of learning; one episode after each evaluation is apart",
             seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from dln_jax.command_line.arguments import refuse_given
-from dln_jax.command_line.options import Drawn, Resumable
+from dln_jax.command_line.options import Drawn, Resumable, Scaled
 from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.runs.locomotion import Options, announce, learned, prepare, write_run
 from dln_jax.runs.results import print_numbers
 from dln_jax.types import InputError
@@ -22,7 +23,7 @@ UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
 
 
 @dataclass(frozen=True)
-class Arguments(Options, Resumable, Drawn):
+class Arguments(Options, Resumable, Drawn, Scaled):
     """What to train, how, and where the results go."""
 
     MOVED: ClassVar = {"--compare": "compare_locomotion"}
@@ -41,10 +42,11 @@ def main(given: Arguments) -> None:
     refuse_given(given, UNUSED[given.method], f"not used by --method {given.method}")
     if given.resume and not given.continues:
         raise InputError("--resume is for gradient and evolution; train again without it")
-    task = prepare(given, [given.method])
+    mesh = mesh_of(given)
+    task = prepare(given, [given.method], mesh)
     with command_folder(given, "train_locomotion") as folder:
         announce(task)
-        trained = learned(task, given.method, given, directory=folder, resume=given.resume)
+        trained = learned(task, given.method, given, mesh, directory=folder, resume=given.resume)
         numbers = write_run(folder, task, given.method, trained, given, figures=given.figures)
         rows = [(name.replace("_", " "), f"{value:.4g}") for name, value in numbers.items()]
         print_numbers(rows, title=f"{given.creature}, {given.method}", columns=("quantity", "value"))

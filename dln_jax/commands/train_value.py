@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.command_line.arguments import Unstated, choice, require_positive_if_given
-from dln_jax.command_line.options import Folder
+from dln_jax.command_line.options import Folder, Scaled
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.control.optimal.fitted import Iteration
 from dln_jax.files import finite, write_json
 from dln_jax.precision import with_float64
@@ -41,7 +43,7 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 
 @dataclass(frozen=True)
-class Arguments(Folder):
+class Arguments(Folder, Scaled):
     """What to train a value function of, how, and where it goes."""
 
     plant: Annotated[str, choice(PLANTS)] = "pendulum"
@@ -70,6 +72,7 @@ class Arguments(Folder):
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
+    mesh = mesh_of(given)
     require_positive(seeds=given.seeds, starts=given.starts)
     require_seed(given.seed, given.seeds)
     require_positive_if_given(given, ("width", "depth", "members", "iterations"))
@@ -85,7 +88,7 @@ def main(given: Arguments) -> None:
     family = Family((width,) * depth, given.members or 1, scale=fit.scale)
     with command_folder(given, "train_value", family=family._asdict()) as folder:
         print(f"{given.plant}: {given.method}, {family.members} x {depth} layers of {width}")
-        trained = train(given, plant, family, fit.numbers)
+        trained = train(given, plant, family, fit.numbers, mesh)
         best = min(trained, key=lambda each: each.validation)
         save_value(folder, given.plant, goal, family, best.parameters)
         numbers = {"train_seconds": best.train_seconds, "validation": best.validation}
@@ -94,7 +97,7 @@ def main(given: Arguments) -> None:
         finish(folder, ValueRun(plant, family_of(plant, family), with_float64(best.parameters)), given, numbers)
 
 
-def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteration) -> list[Trained]:
+def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteration, mesh: Mesh | None) -> list[Trained]:
     """The trainings of all seeds, with their progress."""
     seeds = range(given.seed, given.seed + given.seeds)
     with contextlib.ExitStack() as stack:
@@ -106,10 +109,9 @@ def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteratio
             show[0](done, text)
 
         if given.method == "residual":
-            return by_equation(plant, family, given.iterations or ITERATIONS, seeds, report)
-        return by_iteration(
-            plant, family, numbers._replace(iterations=given.iterations or numbers.iterations), seeds, report
-        )
+            return by_equation(plant, family, given.iterations or ITERATIONS, seeds, report, mesh)
+        numbers = numbers._replace(iterations=given.iterations or numbers.iterations)
+        return by_iteration(plant, family, numbers, seeds, report, mesh)
 
 
 def over_seeds(trained: list[Trained]) -> dict[str, float]:

@@ -18,6 +18,7 @@ from jax import Array
 
 from dln_jax.control.finite import where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, Vector
 
 
@@ -63,7 +64,7 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
         M = plant.mass_matrix(q)
         h = plant.inverse_dynamics(q, qd, jnp.zeros_like(qd))
         coupling = M[np.ix_(active, passive)]
-        others = -jnp.linalg.solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
+        others = -solve(M[np.ix_(passive, passive)], coupling.T @ a + h[passive])
         return where_finite(M[np.ix_(active, active)] @ a + coupling @ others + h[active], q, qd)
 
     return forces

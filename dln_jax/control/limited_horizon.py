@@ -14,6 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.solvers.elimination import solve
+from dln_jax.solvers.lapack import cholesky
+
 CENTRING = 0.1
 """Of s z, what a step aims at."""
 SHORT_OF_LIMITS = 0.995
@@ -113,11 +116,11 @@ def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
         F, missed, of_cost, curvature, beside, weight = now
         q, Q = of_cost + F.T @ (g + S @ missed), curvature + F.T @ S @ F
         qu, Quu, Qux = q[n:] + beside, Q[n:, n:] + jnp.diag(weight), Q[n:, :n]
-        both = -jnp.linalg.solve(Quu, jnp.concatenate([qu[:, None], Qux], axis=1))
+        both = -solve(Quu, jnp.concatenate([qu[:, None], Qux], axis=1))
         k, K = both[:, 0], both[:, 1:]
         before = Q[:n, :n] + Qux.T @ K
         # Where there is no minimum, there is no solution.
-        convex = jnp.isfinite(jnp.linalg.cholesky(Quu)).all()
+        convex = jnp.isfinite(cholesky(Quu)).all()
         return (q[:n] + Qux.T @ k, jnp.where(convex, (before + before.T) / 2, jnp.nan)), (k, K, g, S)
 
     stages = horizon.slopes, horizon.missed, horizon.gradients, horizon.curvatures, gradient, weight

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.limited_horizon import Horizon, least_cost
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, Problem
+from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 2.0**-12
@@ -202,6 +203,6 @@ def _not_negative(curvatures: Array, end: Array) -> tuple[Array, Array]:
     """Hessians without their negative eigenvalues."""
     n = len(end)
     every = jnp.concatenate([curvatures, jnp.zeros_like(curvatures[:1]).at[0, :n, :n].set(end)])
-    sizes, axes = jnp.linalg.eigh(every)
+    sizes, axes = jax.vmap(symmetric_eigen)(every)
     kept = jnp.einsum("kij,kj,klj->kil", axes, jnp.maximum(sizes, 0.0), axes)
     return kept[:-1], kept[-1, :n, :n]

@@ -18,6 +18,7 @@ from jaxtyping import Bool
 
 from dln_jax.control.finite import where_finite
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.solvers.lapack import cholesky
 from dln_jax.types import Vector
 
 
@@ -119,7 +120,7 @@ def trusted(
 
 def definite(plant: Dynamics, q: Vector) -> Bool[Array, ""]:
     """Whether the mass matrix is positive definite."""
-    return jnp.isfinite(jnp.linalg.cholesky(plant.mass_matrix(q))).all()
+    return jnp.isfinite(cholesky(plant.mass_matrix(q))).all()
 
 
 def _times(gain: Any, error: Any) -> Array:

@@ -18,6 +18,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from dln_jax.control.finite import where_finite
+from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -192,9 +193,9 @@ def _limited_quadratic(Q: Array, q: Array, cross: Array, low: Array, high: Array
 
     def newton(k: Array, _: Any) -> tuple[Array, None]:
         fixed = pinned(k)
-        change = jnp.linalg.solve(free_part(fixed), jnp.where(fixed, 0.0, Q @ k + q))
+        change = solve(free_part(fixed), jnp.where(fixed, 0.0, Q @ k + q))
         return jnp.clip(k - change, low, high), None
 
     k, _ = jax.lax.scan(newton, jnp.clip(jnp.zeros_like(q), low, high), length=1 if len(q) == 1 else PROJECTED_STEPS)
     fixed = pinned(k)
-    return k, -jnp.linalg.solve(free_part(fixed), jnp.where(fixed[:, None], 0.0, cross))
+    return k, -solve(free_part(fixed), jnp.where(fixed[:, None], 0.0, cross))

@@ -129,4 +129,5 @@ def problem(
         score=score,
         seed=seed,
         loss=lambda parameters, batch: loss(model, matching, parameters, *batch),
+        loss_is_mean=not matching.relative,  # variances of a batch are not the means of its parts'
     )

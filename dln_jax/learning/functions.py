@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from dln_jax.data.functions import FunctionSamples, SampleSplit
@@ -132,12 +133,14 @@ def train(
     *,
     checkpoint: Checkpoint | None = None,
     report: Report = silent,
+    mesh: Mesh | None = None,
 ) -> Training:
     """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
 
     The result's parameters are layers with the ensemble's members on the leading axis, also when there is one. Adam
     shows all members the same batches and keeps one step for all; Gauss-Newton keeps the best of each. Reports and
-    history are means over the members.
+    history are means over the members. Devices of a mesh share the members where Gauss-Newton trains several, else the
+    samples.
 
     Raises:
         InputError: what `targets` and `fit` refuse.
@@ -150,7 +153,7 @@ def train(
         )
 
     given = problem(sets, network, each_member_by_itself=not isinstance(optimiser, Adam))
-    training = fit(given, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)))
+    training = fit(given, optimiser, checkpoint=checkpoint, report=lambda at: report(mean(at)), mesh=mesh)
     return training._replace(history=[mean(at) for at in training.history], best_step=int(np.max(training.best_step)))
 
 

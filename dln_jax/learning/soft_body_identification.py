@@ -15,10 +15,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optimistix
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.rollout import rollout
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.softbody.scene import Params, SoftScene
 from dln_jax.softbody.step import Stepper, static_solve
 from dln_jax.types import require_positive
@@ -56,6 +58,7 @@ def identify(
     *,
     noise: float = 1e-3,
     iterations: int = 30,
+    mesh: Mesh | None = None,
 ) -> Fitted:
     """theta at which the simulated motions are nearest to the observed ones.
 
@@ -66,6 +69,7 @@ def identify(
         motions: what was observed.
         noise: of the positions, in m: the unit of the residuals.
         iterations: of Levenberg-Marquardt at most.
+        mesh: devices that share the motions, of which each then simulates its own.
 
     Raises:
         InputError: numbers that are not positive.
@@ -79,7 +83,8 @@ def identify(
         _, x = rollout(advance, init(x0, v0), given, steps=observed.shape[0], observe=lambda state, info: state.x)
         return _seen_difference(x, observed) / noise
 
-    return _fitted(lambda theta: jax.vmap(functools.partial(residual, theta))(*motions), guess, iterations)
+    residuals = spread(lambda theta, motions: jax.vmap(functools.partial(residual, theta))(*motions), mesh)
+    return _fitted(lambda theta: residuals(theta, motions), guess, iterations, mesh)
 
 
 def design(
@@ -113,11 +118,10 @@ def _seen_difference(x: Array, given: Array) -> Array:
     return jnp.where(seen, x - jnp.where(seen, given, 0), 0)
 
 
-def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int) -> Fitted:
+def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh: Mesh | None = None) -> Fitted:
     # Forward mode: a handful of parameters against thousands of residuals.
     solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
-    @functools.partial(jax.jit, compiler_options=quick_compilation())
     def solve(guess: Any) -> tuple[Any, Array, Array]:
         found = optimistix.least_squares(
             lambda theta, _: residual(theta), solver, guess, options={"jac": "fwd"}, max_steps=iterations, throw=False
@@ -125,5 +129,5 @@ def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int) -> Fi
         misfit = jnp.sqrt(jnp.mean(residual(found.value) ** 2))
         return found.value, misfit, found.stats["num_steps"]
 
-    theta, misfit, count = solve(guess)
-    return Fitted(theta, float(misfit), int(count))
+    theta, misfit, count = program(solve, mesh, compiler_options=quick_compilation())(guess)
+    return Fitted(local(theta, mesh), float(misfit), int(count))

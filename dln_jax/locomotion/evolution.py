@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
-from dln_jax.locomotion.learning import Learner
+from dln_jax.locomotion.learning import LANES, Learner
 from dln_jax.locomotion.policy import Policy
 from dln_jax.locomotion.task import Task, run_episode
+from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import require_positive
 
 
@@ -31,6 +33,11 @@ class EvolutionSettings(NamedTuple):
     """Of Adam."""
     generations: int = 1
     """Between two evaluations."""
+
+    @property
+    def lanes(self) -> int:
+        """Creatures side by side."""
+        return 2 * self.pairs
 
 
 class EvolutionState(NamedTuple):
@@ -57,9 +64,20 @@ def centred_ranks(fitness: Float[Array, " m"]) -> Float[Array, " m"]:
     return order / (len(fitness) - 1) - 0.5
 
 
-def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettings = EvolutionSettings()) -> Learner:  # noqa: B008
-    """The learner; episodes with a step that does not converge rank last and count as skipped."""
+def make_evolution_learner(
+    task: Task,
+    policy: Policy,
+    settings: EvolutionSettings = EvolutionSettings(),  # noqa: B008
+    *,
+    mesh: Mesh | None = None,
+) -> Learner:
+    """The learner; episodes with a step that does not converge rank last and count as skipped.
+
+    Raises:
+        InputError: settings that are not positive, or a mesh that does not divide the lanes.
+    """
     require_positive(**settings._asdict())
+    shares(mesh, settings.lanes, LANES)
     like, unravel = ravel_pytree(policy.init(jax.random.key(0)))
     optimiser = optax.adam(settings.learning_rate)
 
@@ -71,11 +89,13 @@ def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettin
     def fitness(parameters: Float[Array, " p"]) -> Float[Array, ""]:
         return run_episode(task, lambda seen: policy.apply(unravel(parameters), seen)).total_reward
 
+    fitnesses = spread(lambda theta, moves: jax.vmap(fitness)(theta + moves), mesh)
+
     def generation(state: EvolutionState, _: None) -> tuple[EvolutionState, None]:
         key = jax.random.fold_in(jax.random.key(state.seed), state.generation)
         noise = jax.random.normal(key, (settings.pairs, *like.shape), like.dtype)
         moves = settings.deviation * jnp.concatenate([noise, -noise])
-        found = jax.vmap(fitness)(state.parameters + moves)
+        found = fitnesses(state.parameters, moves)
         plus, minus = jnp.split(centred_ranks(found), 2)
         gradient = estimate(plus, minus, noise, settings.deviation)
         change, moments = optimiser.update(-gradient, state.optimiser, state.parameters)
@@ -87,5 +107,5 @@ def make_evolution_learner(task: Task, policy: Policy, settings: EvolutionSettin
         start=start,
         improve=lambda state: jax.lax.scan(generation, state, length=settings.generations)[0],
         parameters=lambda state: unravel(state.parameters),
-        steps=settings.generations * 2 * settings.pairs * task.episode,
+        steps=settings.generations * settings.lanes * task.episode,
     )

@@ -6,6 +6,7 @@ Each lane walks H steps from where its last window ended, with parameters of its
 of the window and no further, so that they neither explode nor vanish over the length of an episode (Xu et al. 2022,
 "Accelerated policy learning with parallel differentiable simulation"). Windows are longer than the clock's period, so
 that what a step does for the next stride is seen and no value function is needed. Lanes come in pairs, +eps and -eps.
+The gradient is the mean of the lanes' own, in their order, so that it does not depend on which device has which.
 """
 
 from typing import Any, NamedTuple
@@ -13,11 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Int
 
-from dln_jax.locomotion.learning import Learner, chosen, finite
+from dln_jax.locomotion.learning import LANES, Learner, chosen, finite
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import FALLEN, Place, Task, beginning, walk
+from dln_jax.scale.mesh import shares, spread
 from dln_jax.types import InputError, require_positive
 
 
@@ -34,6 +37,11 @@ class GradientSettings(NamedTuple):
     """Of Adam, after clipping the gradient's norm at 1 body length per episode."""
     updates: int = 5
     """Between two evaluations."""
+
+    @property
+    def lanes(self) -> int:
+        """Creatures side by side."""
+        return 2 * self.pairs
 
 
 class GradientState(NamedTuple):
@@ -55,14 +63,21 @@ def check(settings: GradientSettings, episode: int) -> None:
         raise InputError(f"a window has {settings.window} steps; expected a divisor of the episode's {episode}")
 
 
-def make_gradient_learner(task: Task, policy: Policy, settings: GradientSettings = GradientSettings()) -> Learner:  # noqa: B008
+def make_gradient_learner(
+    task: Task,
+    policy: Policy,
+    settings: GradientSettings = GradientSettings(),  # noqa: B008
+    *,
+    mesh: Mesh | None = None,
+) -> Learner:
     """The learner.
 
     Raises:
-        InputError: what `check` finds.
+        InputError: what `check` finds, or a mesh that does not divide the lanes.
     """
     check(settings, task.episode)
-    lanes, window = 2 * settings.pairs, settings.window
+    shares(mesh, settings.lanes, LANES)
+    lanes, window = settings.lanes, settings.window
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(settings.learning_rate, b2=0.95))
 
     def start(seed: int) -> GradientState:
@@ -73,21 +88,21 @@ def make_gradient_learner(task: Task, policy: Policy, settings: GradientSettings
         zero = jnp.asarray(0)
         return GradientState(parameters, optimiser.init(parameters), places, jnp.asarray(seed), zero, zero)
 
-    def loss(parameters: Parameters, noise: Parameters, places: Place) -> tuple[Array, Any]:
-        def lane(sign: Array, noise: Parameters, place: Place) -> tuple[Array, Any]:
-            own = jax.tree.map(lambda p, eps: p + sign * settings.deviation * eps, parameters, noise)
-            end, seen = walk(task, lambda observation: policy.apply(own, observation), place, window)
-            usable = seen.converged.all() & (jnp.abs(seen.tilt[-1]) < FALLEN)
-            return seen.reward.sum() * task.episode / window, (end, usable)
+    def loss(parameters: Parameters, sign: Array, noise: Parameters, place: Place) -> tuple[Array, Any]:
+        own = jax.tree.map(lambda p, eps: p + sign * settings.deviation * eps, parameters, noise)
+        end, seen = walk(task, lambda observation: policy.apply(own, observation), place, window)
+        usable = seen.converged.all() & (jnp.abs(seen.tilt[-1]) < FALLEN)
+        return -seen.reward.sum() * task.episode / window, (end, usable)
 
-        signs = jnp.tile(jnp.asarray([1.0, -1.0]), settings.pairs)
-        rewards, after = jax.vmap(lane)(signs, noise, places)
-        return -rewards.mean(), after
+    of_lanes = jax.vmap(jax.grad(loss, has_aux=True), (None, 0, 0, 0))
+    descents = spread(lambda parameters, lanes: of_lanes(parameters, *lanes), mesh)
+    signs = jnp.tile(jnp.asarray([1.0, -1.0]), settings.pairs)
 
     def update(state: GradientState, _: None) -> tuple[GradientState, None]:
         key = jax.random.fold_in(jax.random.key(state.seed), state.updates)
         noise = _pairs_of_noise(key, state.parameters, settings.pairs)
-        gradient, (ends, usable_ends) = jax.grad(loss, has_aux=True)(state.parameters, noise, state.lanes)
+        gradients, (ends, usable_ends) = descents(state.parameters, (signs, noise, state.lanes))
+        gradient = jax.tree.map(lambda of_lanes: of_lanes.mean(axis=0), gradients)
         # A step that does not converge has NaN for a gradient.
         usable = finite(gradient)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)

@@ -12,17 +12,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
+from jaxtyping import Array
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
 CHECKPOINT = "checkpoint"
 """Beginning of the names of the files from which a seed can continue."""
+LANES = "creatures side by side"
+"""What devices share."""
 
 
 class Record(NamedTuple):
@@ -63,6 +68,8 @@ class Compiled(NamedTuple):
     episode: int
     seconds: float
     """That compiling took."""
+    mesh: Mesh | None = None
+    """On whose devices they run."""
 
 
 class Learned(NamedTuple):
@@ -93,18 +100,25 @@ class Goal(NamedTuple):
 Report = Callable[[Record], None]
 
 
-def compile_learner(task: Task, learner: Learner) -> Compiled:
-    """Compiles what a learner runs."""
+def compile_learner(task: Task, learner: Learner, mesh: Mesh | None = None) -> Compiled:
+    """Compiles what a learner runs, for the mesh that it was made for."""
     began = time.perf_counter()
     state = jax.eval_shape(lambda: learner.start(0))
-    improve = jax.jit(learner.improve).lower(state).compile(quick_compilation())
-    evaluate = compile_evaluation(task, learner.policy, jax.eval_shape(learner.parameters, state))
-    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)
+    improve = program(learner.improve, mesh).lower(state).compile(quick_compilation())
+    evaluate = compile_evaluation(task, learner.policy, jax.eval_shape(learner.parameters, state), mesh)
+    return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began, mesh)
 
 
-def compile_evaluation(task: Task, policy: Policy, parameters: Parameters) -> Callable[[Parameters], Any]:
-    """Parameters -> body lengths in one episode from rest."""
-    judge = jax.jit(lambda parameters: run_episode(task, lambda seen: policy.apply(parameters, seen)).distance)
+def compile_evaluation(
+    task: Task, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
+) -> Callable[[Parameters], Any]:
+    """Parameters -> body lengths in one episode from rest; every device walks, and the first one's counts for all."""
+
+    def judged(parameters: Parameters, ones: Array) -> Array:
+        return ones * run_episode(task, lambda seen: policy.apply(parameters, seen)).distance
+
+    # Devices of other makes may round differently, and must come to the same decisions.
+    judge = program(lambda parameters: spread(judged, mesh)(parameters, jnp.ones(1))[0], mesh)
     return judge.lower(parameters).compile(quick_compilation())
 
 
@@ -154,7 +168,7 @@ def learn(
             stored = {**identity, "records": rows}
             checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
         report(records[-1])
-    return Learned(best, records, compiled.seconds, len(records) * compiled.episode)
+    return Learned(local(best, compiled.mesh), records, compiled.seconds, len(records) * compiled.episode)
 
 
 def finite(tree: Any) -> Any:

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
@@ -48,8 +49,10 @@ def train(
     goal: Goal,
     width: int = WIDTH,
     window: int | None = None,
+    lanes: int | None = None,
     directory: Path | None = None,
     resume: bool = False,
+    mesh: Mesh | None = None,
     report: Report = lambda seed, record: None,
 ) -> Trained:
     """Learns with each seed; settings are the same for all seeds and, but for the window, for all creatures.
@@ -61,23 +64,26 @@ def train(
         goal: when each ends.
         width: of the hidden layer of a policy that is learned by gradients or evolution.
         window: steps that gradients go back (default: those of `WINDOWS`).
+        lanes: creatures side by side, an even number for gradients and evolution (default: those of `SETTINGS`).
         directory: where gradients and evolution store their states.
         resume: continue what is stored there.
+        mesh: devices that share the creatures which are stepped side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings.
+        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings, a
+            mesh that does not divide the creatures.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
-    chosen = settings_of(method, task.creature.name, window)
+    chosen = settings_of(method, task.creature.name, window, lanes)
     if method == "ppo":
         if resume:
             raise InputError("runs of ppo are not stored on their way; train again without --resume")
-        compiled, directory = compile_ppo(task, chosen), None
+        compiled, directory = compile_ppo(task, chosen, mesh=mesh), None
     else:
         make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
-        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen))
+        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen, mesh=mesh), mesh)
     settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
     settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
     settings |= chosen._asdict()
@@ -85,11 +91,20 @@ def train(
     return Trained(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
-def settings_of(method: Method, creature: str, window: int | None = None) -> Any:
-    """Settings of a method for a creature; only the window of gradients depends on it."""
+def settings_of(method: Method, creature: str, window: int | None = None, lanes: int | None = None) -> Any:
+    """Settings of a method for a creature; only the window of gradients depends on it.
+
+    Raises:
+        InputError: an odd number of lanes, for a method that takes them in pairs.
+    """
+    settings = SETTINGS[method]
+    if lanes is not None and method != "ppo" and lanes % 2:
+        raise InputError(f"{lanes} creatures are no pairs, in which {method} takes them; give an even number")
+    if lanes is not None:
+        settings = settings._replace(lanes=lanes) if method == "ppo" else settings._replace(pairs=lanes // 2)
     if method != "gradient":
-        return SETTINGS[method]
-    return SETTINGS[method]._replace(window=window or WINDOWS.get(creature, GradientSettings().window))
+        return settings
+    return settings._replace(window=window or WINDOWS.get(creature, GradientSettings().window))
 
 
 def shown_walk(task: Task, policy: Policy, parameters: Parameters, steps: int) -> Walk:

@@ -9,6 +9,7 @@ import time
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from dln_jax.locomotion.learning import Compiled, Learner, compile_evaluation
@@ -72,11 +73,19 @@ def actor_parameters(model: Any) -> Parameters:
     )
 
 
-def compile_ppo(task: Task, settings: PPOSettings = PPOSettings()) -> Compiled:  # noqa: B008
+def compile_ppo(
+    task: Task,
+    settings: PPOSettings = PPOSettings(),  # noqa: B008
+    *,
+    mesh: Mesh | None = None,
+) -> Compiled:
     """The learner with its programs; each update is one of `settings.steps` of every lane.
 
+    Devices of a mesh share the lanes. The networks are trained by every process, alike, because all see the same lanes
+    and draw the same numbers.
+
     Raises:
-        InputError: stable-baselines3 is not installed.
+        InputError: stable-baselines3 is not installed, or a mesh that does not divide the lanes.
     """
     require_stable_baselines3()
     import torch  # pyright: ignore[reportMissingImports]
@@ -88,7 +97,7 @@ def compile_ppo(task: Task, settings: PPOSettings = PPOSettings()) -> Compiled: 
     # Networks this small are slower on several threads.
     torch.set_num_threads(1)
     # Body lengths per second: rewards of a size that suits the critic.
-    lanes = VectorEnvironment(task, settings.lanes, reward_scale=1.0 / TIME_STEP)
+    lanes = VectorEnvironment(task, settings.lanes, reward_scale=1.0 / TIME_STEP, mesh=mesh)
 
     def start(seed: int) -> Any:
         return PPO(
@@ -112,5 +121,5 @@ def compile_ppo(task: Task, settings: PPOSettings = PPOSettings()) -> Compiled: 
 
     steps, actor = settings.steps * settings.lanes, make_actor(task)
     learner = Learner(actor, start, improve, actor_parameters, steps, skipped=lambda model: 0)
-    evaluate = compile_evaluation(task, actor, actor_parameters(start(0)))
+    evaluate = compile_evaluation(task, actor, actor_parameters(start(0)), mesh)
     return Compiled(learner, improve, evaluate, task.episode, time.perf_counter() - began)

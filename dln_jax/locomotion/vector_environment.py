@@ -6,17 +6,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 from dln_jax.locomotion.environment import spaces
-from dln_jax.locomotion.learning import chosen
+from dln_jax.locomotion.learning import LANES, chosen
 from dln_jax.locomotion.task import FALLEN, Place, Task, actuation_of, advance, beginning, observe
+from dln_jax.scale.mesh import program, shares, spread
 
 
 class VectorEnvironment(VecEnv):
-    """Lanes of `CreatureEnvironment`, with rewards times a constant."""
+    """Lanes of `CreatureEnvironment`, with rewards times a constant; devices share them if a mesh divides them.
 
-    def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0):
+    Raises `InputError` for a mesh that does not.
+    """
+
+    def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0, mesh: Mesh | None = None):
+        shares(mesh, lanes, LANES)
         self.render_mode = None
         super().__init__(lanes, *spaces(task))
         self._scale = reward_scale
@@ -32,7 +38,9 @@ class VectorEnvironment(VecEnv):
             return kept, (first, seen.reward.astype(jnp.float32), terminated, truncated, last)
 
         actions = jnp.zeros(self._actions.shape, self._places.state.x.dtype)
-        self._advance = jax.jit(jax.vmap(one)).lower(self._places, actions).compile()
+        advanced = spread(lambda _, lanes: jax.vmap(one)(*lanes), mesh)
+        stepped = program(lambda places, actions: advanced(None, (places, actions)), mesh)
+        self._advance = stepped.lower(self._places, actions).compile()
         self._first = np.asarray(jax.jit(jax.vmap(lambda place: observe(task, place)))(self._start), np.float32)
 
     def reset(self) -> np.ndarray:

@@ -36,7 +36,6 @@ def definiteness(
         raise InputError("definiteness: the model has no mass matrix; give one that comes from an energy")
     if len(q) == 0:
         raise InputError("definiteness: q has no states; give at least one row")
-    # Eigenvalues by NumPy: batched LAPACK calls within one compiled program may wait for each other for ever.
     masses = np.asarray(jax.jit(jax.vmap(dynamics.mass_matrix))(q, qd))
     rounding = masses.shape[-1] * np.finfo(masses.dtype).eps
     finite = np.isfinite(masses).all(axis=(1, 2))

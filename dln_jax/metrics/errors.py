@@ -1,32 +1,35 @@
 """Errors of a model on trajectories."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics import hamiltonian
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import Canonical, Driven, dynamics, hamiltonian_of
+from dln_jax.scale.mesh import spread
 from dln_jax.types import Hamiltonian
 
 DECOMPOSITION = ("inertial", "coriolis", "gravity")
 
 
-def predictions(system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None) -> dict[str, np.ndarray]:
+def predictions(
+    system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None, mesh: Mesh | None = None
+) -> dict[str, np.ndarray]:
     """What energies say of every sample: `tau`, `qdd`, and the parts of the torque, each [N, d] in float64.
 
     With a Hamiltonian, the given one or that of a system in momenta, and recorded momenta also `tau_from_momenta` =
     pd + dH/dq + friction: as published results of Hamiltonian models were computed.
+
+    Devices of a mesh share the samples.
     """
     functions = dynamics(system)
     if isinstance(system, Canonical):
         H = hamiltonian_of(system)
     recorded = () if data.p is None or data.pd is None or H is None else (data.p, data.pd)
 
-    @jax.jit
-    @jax.vmap
     def answer(q, qd, qdd, tau, momenta):
         parts = functions.decompose(q, qd, qdd)
         answers = {
@@ -39,8 +42,9 @@ def predictions(system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | N
             answers["tau_from_momenta"] = hamiltonian.inverse(H, q, *momenta) + friction
         return answers
 
-    momenta = tuple(jnp.asarray(array, dtype) for array in recorded)
-    answers = answer(*(jnp.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)), momenta)
+    momenta = tuple(np.asarray(array, dtype) for array in recorded)
+    samples = *(np.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)), momenta
+    answers = jax.jit(spread(lambda _, samples: jax.vmap(answer)(*samples), mesh))(None, samples)
     return {key: np.asarray(array, np.float64) for key, array in answers.items()}
 
 

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.running import command_folder, write_config
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam
@@ -34,7 +36,7 @@ def run(given: Options, command: str) -> None:
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
-    recorded = read(given)
+    mesh, recorded = mesh_of(given), read(given)
     chosen = None
     if given.model == AUTO:
         check_options(given, AUTO)
@@ -43,10 +45,10 @@ def run(given: Options, command: str) -> None:
     with command_folder(given, command) as folder:
         announce(recorded)
         if chosen is None:
-            task, training = climb_ladder(given, recorded, folder)
+            task, training = climb_ladder(given, recorded, folder, mesh)
         else:
             announce_model(chosen)
-            task, training = trained(chosen, given, folder)
+            task, training = trained(chosen, given, folder, mesh)
         if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
@@ -56,7 +58,7 @@ def run(given: Options, command: str) -> None:
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
         unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures)
+        metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
@@ -95,13 +97,13 @@ def announce_model(task: Task) -> None:
         print(line)
 
 
-def trained(task: Task, given: Options, folder: Path) -> tuple[Task, Training]:
+def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """The task's model, and the task with whatever of it the fit has chosen."""
     if task.solver is None:
         return fit_directly(task, given)
     if given.target is not None:
-        return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume)
-    return task, train(task, task.solver, folder, resume=given.resume)
+        return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
+    return task, train(task, task.solver, folder, resume=given.resume, mesh=mesh)
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:

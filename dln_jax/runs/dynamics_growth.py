@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
@@ -19,6 +20,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_results import latency_of
 from dln_jax.runs.dynamics_task import Task
+from dln_jax.scale.mesh import of_first_process
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 
@@ -46,7 +48,7 @@ class Candidate(NamedTuple):
 
 
 def grow_to_target(
-    task: Task, optimiser: Optimiser, target: float, folder: Path, *, resume: bool
+    task: Task, optimiser: Optimiser, target: float, folder: Path, *, resume: bool, mesh: Mesh | None
 ) -> tuple[Task, Training]:
     """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
 
@@ -57,7 +59,7 @@ def grow_to_target(
     for width in WIDTHS:
         for depth, shared in itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)):
             description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
-            tried.append(_try(task._replace(description=description), optimiser, folder, resume=resume))
+            tried.append(_try(task._replace(description=description), optimiser, folder, resume=resume, mesh=mesh))
             candidate = tried[-1][0]
             met = candidate.validation_error <= target
             enough += tried[-1:] * met
@@ -80,7 +82,9 @@ def grow_to_target(
     return chosen[1], chosen[2]
 
 
-def _try(task: Task, optimiser: Optimiser, folder: Path, *, resume: bool) -> tuple[Candidate, Task, Training]:
+def _try(
+    task: Task, optimiser: Optimiser, folder: Path, *, resume: bool, mesh: Mesh | None
+) -> tuple[Candidate, Task, Training]:
     """Trains one candidate and measures it."""
     model, wanted = build(task.description), task.description
     networks = 1 if wanted["shared_trunk"] else 2
@@ -91,6 +95,7 @@ def _try(task: Task, optimiser: Optimiser, folder: Path, *, resume: bool) -> tup
         optimiser,
         checkpoint=Checkpoint(folder, identity, resume, name),
         seconds=task.seconds,
+        mesh=mesh,
     )
     system = compiled(dynamics(model.energies(training.parameters)), data_type(task.precision))
     candidate = Candidate(
@@ -100,6 +105,7 @@ def _try(task: Task, optimiser: Optimiser, folder: Path, *, resume: bool) -> tup
         parameters=sum(jnp.size(leaf) for leaf in jax.tree.leaves(training.parameters)),
         validation_error=float(training.validation),
         train_seconds=training.train_seconds + training.compile_seconds,
-        one_step_us=latency_of(system, task, calls=2000).p50_us,
+        # By it a model is chosen, and in all processes the same.
+        one_step_us=of_first_process(latency_of(system, task, calls=2000).p50_us, mesh),
     )
     return candidate, task, training

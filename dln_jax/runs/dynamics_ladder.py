@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 from rich.table import Table
 
@@ -43,8 +44,10 @@ BESIDE = "-residual"
 """Behind the name of a model to which a network is added."""
 
 
-def climb_ladder(given: Options, recorded: Recorded, folder: Path) -> tuple[Task, Training]:
+def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """The model that validation chooses, trained; prints the ladder, and writes it as `ladder.json`.
+
+    Devices of a mesh share the network of the last rung; the others are fits that one device does.
 
     Raises:
         InputError: no model could be fitted.
@@ -58,7 +61,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path) -> tuple[Task
         print(f"friction of every model: {', '.join(laws)} in each joint")
     noise = noise_of(train_set.tau, train_set.trajectory)
     found = climb(
-        _rungs(given, recorded, folder),
+        _rungs(given, recorded, folder, mesh),
         train_set,
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
@@ -107,7 +110,7 @@ def as_json(found: Climb) -> dict[str, Any]:
     return {"kept": found.chosen.name, "ended": found.ended, "rungs": rungs}
 
 
-def _rungs(given: Options, recorded: Recorded, folder: Path) -> list[Rung]:
+def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Rung]:
     """Those that state most first."""
     bases: dict[str, Fitted] = {}
 
@@ -119,7 +122,7 @@ def _rungs(given: Options, recorded: Recorded, folder: Path) -> list[Rung]:
         return [Rung(name, base), Rung(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left))]
 
     def by_name(name: str) -> Callable[[float], Fitted]:
-        return lambda left: _by_name(name, given, recorded, folder, left)
+        return lambda left: _by_name(name, given, recorded, folder, mesh, left)
 
     robot = recorded.robot
     known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
@@ -144,7 +147,7 @@ def _too_large(size: int | None) -> Callable[[float], str]:
     return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
 
-def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, left: float) -> Fitted:
+def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
     """A model that `--model` names, as it would be trained alone."""
     limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
     own = dataclasses.replace(given, model=name, seconds=limit)
@@ -152,7 +155,7 @@ def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, left: 
     if task.solver is None:
         task, training = fit_directly(task, own)
     else:
-        training = train(task, task.solver, folder, resume=given.resume)
+        training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
     return Fitted(build(task.description), training.parameters, (task, training))
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, require_positive_if_given
 from dln_jax.command_line.encoders import Filtered
-from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
+from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.scenes.registry import SCENES
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -19,7 +19,7 @@ OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 
 
 @dataclass(frozen=True)
-class Options(Filtered, Limited, Resumable, Drawn, SingleCalls):
+class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go."""
 
     model: str = "structured-delan"
@@ -126,7 +126,8 @@ def check_direct_options(given: Options, others: tuple[str, ...], model: str, wh
     """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
     if given.seeds > 1:
         raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
-    refuse_given(given, (*OF_NETWORKS, *OF_ADAM, "steps", "target", *others), f"for networks; {model} {why}")
+    of_networks = (*OF_NETWORKS, *OF_ADAM, "steps", "target", "processes")
+    refuse_given(given, (*of_networks, *others), f"for networks; {model} {why}")
     if given.optimizer != "auto":
         raise InputError(f"{model} {why}; leave --optimizer out")
 

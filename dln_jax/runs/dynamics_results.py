@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax import figures as drawing
 from dln_jax.data.schema import Trajectories
@@ -63,18 +64,20 @@ MEANINGS = {
 """Of the metrics' names; others say it themselves."""
 
 
-def evaluate(folder: Path, task: Task, training: Training, *, seeds: int, figures: bool) -> dict[str, float | int]:
+def evaluate(
+    folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
+) -> dict[str, float | int]:
     """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
     dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
     functions, model = run.dynamics, build(task.description)
-    predicted = predictions(run.energies, test, dtype)
+    predicted = predictions(run.energies, test, dtype, mesh=mesh)
     latency = latency_of(functions, task)
     if figures:
         draw(folder, task, training, functions, predicted)
     spread = {}
     if seeds > 1:
         models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
-        of_seeds = [errors(predictions(each, test, dtype), test)["torque_mse"] for each in models]
+        of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
     return {
         **errors(predicted, test),

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.command_line.progress import progress
 from dln_jax.learning import dynamics
@@ -13,8 +14,8 @@ from dln_jax.runs.dynamics_task import Solver, Task
 from dln_jax.runs.results import losses
 
 
-def train(task: Task, solver: Solver, folder: Path, *, resume: bool) -> Training:
-    """Trains the task's model, one seed or several."""
+def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh | None) -> Training:
+    """Trains the task's model, one seed or several, by the devices of the mesh."""
     total = solver.optimiser.steps
     identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
@@ -24,4 +25,5 @@ def train(task: Task, solver: Solver, folder: Path, *, resume: bool) -> Training
             checkpoint=Checkpoint(folder, identity, resume),
             report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
             seconds=task.seconds,
+            mesh=mesh,
         )

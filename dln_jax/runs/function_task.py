@@ -7,7 +7,7 @@ import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, refuse_given, resolved
 from dln_jax.command_line.optimisers import optimiser_named
-from dln_jax.command_line.options import Drawn, Resumable
+from dln_jax.command_line.options import Drawn, Resumable, Scaled
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit
 from dln_jax.learning.engine.optimisers import GaussNewton, Optimiser
@@ -29,7 +29,7 @@ SHARE_OF_DATA = 0.75
 
 
 @dataclass(frozen=True)
-class Options(Resumable, Drawn):
+class Options(Resumable, Drawn, Scaled):
     """What to train on, how, and where the results go."""
 
     MOVED: ClassVar = {"--table": "diffnet_table"}

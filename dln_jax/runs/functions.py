@@ -5,11 +5,13 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, write_config
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve
@@ -37,10 +39,10 @@ RELU = (
 
 def run(given: Options, command: str) -> None:
     """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ..."""
-    task = prepare(given)
+    task, mesh = prepare(given), mesh_of(given)
     with command_folder(given, command) as folder:
         announce(task)
-        network, training, trials = fit(task, folder, resume=given.resume)
+        network, training, trials = fit(task, folder, resume=given.resume, mesh=mesh)
         task = task._replace(network=network)
         write_config(folder, given, **network._asdict(), **settings_of(task.optimiser), **of_named(given))
         if training.stop.reason == "not finite":
@@ -76,7 +78,7 @@ def announce(task: Task) -> None:
         print(line)
 
 
-def fit(task: Task, folder: Path, *, resume: bool) -> tuple[Network, Training, list[Trial]]:
+def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[Network, Training, list[Trial]]:
     """Trains at the width asked for, or at growing ones: the network chosen, its training, and all trials."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     optimiser, total = task.optimiser, task.optimiser.steps
@@ -93,7 +95,7 @@ def fit(task: Task, folder: Path, *, resume: bool) -> tuple[Network, Training, l
                 losses = f"loss {at.loss:.3e}  validation {at.validation:.3e}"
                 show(min(at.step, total), f"width {network.width}{stage}: {losses}")
 
-            return train(standard, network, optimiser, checkpoint=checkpoint, report=report)
+            return train(standard, network, optimiser, checkpoint=checkpoint, report=report, mesh=mesh)
 
     if not task.grown:
         return task.network, train_one(task.network), []

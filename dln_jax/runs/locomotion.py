@@ -7,18 +7,20 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.command_line.arguments import Unstated, require_positive_if_given
 from dln_jax.command_line.progress import progress
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion import comparison, gradient
-from dln_jax.locomotion.learning import Goal, Record
+from dln_jax.locomotion.learning import LANES, Goal, Record
 from dln_jax.locomotion.methods import STEPS, Method, Trained, settings_of, shown_walk, train
 from dln_jax.locomotion.policy import WIDTH
 from dln_jax.locomotion.ppo import require_stable_baselines3
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, Task, Walk, creature_named, make_task
 from dln_jax.scale.devices import device_lines
+from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.parameter_files import save_tree
@@ -52,15 +54,21 @@ class Options:
     """gradient: steps that gradients go back; divides the episode (default: 40, of the biped 80)."""
     width: Unstated[int] = None
     """gradient, evolution: hidden units of the policy (default: 32)."""
+    lanes: Unstated[int] = None
+    """Creatures side by side, which devices share; in pairs but for ppo (default: 2 by gradient, 32 by evolution, 16 by
+    ppo)."""
 
 
-def prepare(given: Options, methods: Sequence[Method]) -> Task:
-    """The task; refuses what cannot be trained by these methods, before anything is written."""
+def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Task:
+    """The task; refuses what cannot be trained by these methods and devices, before anything is written."""
     require_positive(episode=given.episode, clock_period=given.clock_period)
-    require_positive_if_given(given, ["seeds", "steps", "until", "window", "width"])
+    require_positive_if_given(given, ["seeds", "steps", "until", "window", "width", "lanes"])
     require_seed(given.seed, given.seeds)
-    if "gradient" in methods:
-        gradient.check(settings_of("gradient", given.creature, given.window), given.episode)
+    for method in methods:
+        settings = settings_of(method, given.creature, given.window, given.lanes)
+        shares(mesh, settings.lanes, f"{LANES} (--lanes)")
+        if method == "gradient":
+            gradient.check(settings, given.episode)
     if not (math.isfinite(given.upright) and given.upright >= 0):
         raise InputError(f"--upright is {given.upright}; expected 0 or a positive number")
     if "ppo" in methods:
@@ -78,7 +86,13 @@ def announce(task: Task) -> None:
 
 
 def learned(
-    task: Task, method: Method, given: Options, *, directory: Path | None = None, resume: bool = False
+    task: Task,
+    method: Method,
+    given: Options,
+    mesh: Mesh | None,
+    *,
+    directory: Path | None = None,
+    resume: bool = False,
 ) -> Trained:
     """All seeds of one method, stored in a folder where one is given."""
     steps = given.steps or STEPS[method]
@@ -96,6 +110,8 @@ def learned(
             goal=Goal(steps, given.until or math.inf),
             width=given.width or WIDTH,
             window=given.window,
+            lanes=given.lanes,
+            mesh=mesh,
             directory=directory,
             resume=resume,
             report=report,
@@ -115,7 +131,7 @@ def write_run(
         "width": given.width or WIDTH,
         "precision": "f64",
         "clock_period": task.clock_period,
-        "settings": settings_of(method, creature, given.window)._asdict(),
+        "settings": settings_of(method, creature, given.window, given.lanes)._asdict(),
     }
     save_tree(folder, MODEL, best.parameters, {"model": description})
     seen = shown_walk(task, trained.policy, best.parameters, task.episode)

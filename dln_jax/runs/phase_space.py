@@ -19,9 +19,10 @@ from dln_jax.command_line.arguments import (
 )
 from dln_jax.command_line.encoders import checked
 from dln_jax.command_line.optimisers import optimiser_named
-from dln_jax.command_line.options import Drawn, Limited, Resumable, SingleCalls
+from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, needs_from_option
+from dln_jax.command_line.scaled import mesh_of
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH
@@ -60,7 +61,7 @@ LOSSES = {
 
 
 @dataclass(frozen=True)
-class Options(Limited, Resumable, Drawn, SingleCalls):
+class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go. What is not given is the task's own choice."""
 
     task: Annotated[str, choice(TASKS)] = "spring"
@@ -150,7 +151,7 @@ def check_suited(given: Options, problem: Problem, description: dict[str, Any]) 
         linear = "for networks; the polynomial model's fit of rates is one least-squares problem"
         refuse_given(given, ["width", "depth", "activation"], linear)
         if MOTIONS not in stages_of(problem, description):
-            refuse_given(given, ["steps", "seconds"], linear)
+            refuse_given(given, ["steps", "seconds", "processes"], linear)
         if given.optimizer == "adam":
             raise InputError("the polynomial model is one least-squares problem; leave --optimizer out")
 
@@ -162,11 +163,13 @@ def run(given: Options, command: str) -> None:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
     problem, description, training = prepare(given)
+    mesh = mesh_of(given)
     truth = problem.truth[0]
     with command_folder(given, command, **description) as folder:
         announce(problem, description)
         with stage_progress(stages_of(problem, description, training["steps"])) as report:
-            trained = train(problem, description, **training, directory=folder, resume=given.resume, report=report)
+            kept = {"directory": folder, "resume": given.resume}
+            trained = train(problem, description, **training, **kept, report=report, mesh=mesh)
         if not np.isfinite(trained.result.validation):
             raise InputError(f"{trained.stopped}; {folder} holds no model")
         save(folder, description, trained.result.parameters)

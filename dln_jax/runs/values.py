@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.control.balance import Law
 from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
@@ -114,15 +115,20 @@ def usual(name: str, method: str) -> Fit:
 
 
 def by_iteration(
-    plant: ValuePlant, family: Family, numbers: Iteration, seeds: Sequence[int], report: Report
+    plant: ValuePlant,
+    family: Family,
+    numbers: Iteration,
+    seeds: Sequence[int],
+    report: Report,
+    mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by fitted value iteration, one for each seed."""
+    """Values by fitted value iteration, one for each seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
     def told(at: Progress) -> None:
         report(next(done), total, f"cost and misfit {at.validation:.4g}")
 
-    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, report=told)
+    fits = fit_values(plant.problem, family_of(plant, family), seeds, numbers=numbers, mesh=mesh, report=told)
     return [
         Trained(fit.parameters, min(at.validation for at in fit.history), fit.train_seconds + fit.compile_seconds)
         for fit in fits
@@ -130,9 +136,14 @@ def by_iteration(
 
 
 def by_equation(
-    plant: ValuePlant, family: Family, iterations: int, seeds: Sequence[int], report: Report
+    plant: ValuePlant,
+    family: Family,
+    iterations: int,
+    seeds: Sequence[int],
+    report: Report,
+    mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed."""
+    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed; devices share the samples."""
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     each = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []
@@ -146,7 +157,7 @@ def by_equation(
 
         found = fit_residual(
             plant.problem, network.value_and_gradient, network.init(of_parameters), of_samples,
-            discounts=discounts, iterations=iterations, rounds=ROUNDS, report=told,
+            discounts=discounts, iterations=iterations, rounds=ROUNDS, mesh=mesh, report=told,
         )  # fmt: skip
         trained.append(Trained(found.parameters, found.validation, time.perf_counter() - began))
     return trained

@@ -3,9 +3,11 @@
 A mesh has one axis. What is shared, such as parameters, lies whole on every device; a batch is split along axis 0, and
 each device works at its share. `spread` brings the results together again, in the order of the batch, so that what is
 done with them afterwards is the same program on any number of devices; `summed` adds them up, whose order, and so the
-rounding, depends on their number. Where there is no mesh (`None`), both are the function itself.
+rounding, depends on their number. A function of `on_devices` does that itself, wherever it needs to: by `total`,
+`mean` and `first`. Where there is no mesh (`None`), all are the function or the arrays themselves.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -51,7 +53,8 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
     """
     devices = 1 if mesh is None else mesh.size
     if count % devices:
-        raise InputError(f"{count} {what} cannot be split over {devices} devices; give a multiple of {devices}")
+        remedy = f"give a multiple of {devices}, or fewer devices"
+        raise InputError(f"{count} {what} cannot be split over {devices} devices; {remedy}")
     return count // devices
 
 
@@ -80,9 +83,31 @@ def gathered(tree: Any) -> Any:
         split = isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
         if not split:
             return leaf
-        return jax.jit(lambda x: x, out_shardings=NamedSharding(leaf.sharding.mesh, WHOLE))(leaf)  # pyright: ignore[reportAttributeAccessIssue]
+        return _gathering(leaf.sharding.mesh)(leaf)  # pyright: ignore[reportAttributeAccessIssue]
 
     return jax.tree.map(whole, tree)
+
+
+def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> Any:
+    """`jax.jit` of a function whose arguments and results lie whole on every device of the mesh.
+
+    Arguments may be arrays of this process alone, if every process gives the same. `options` are those of `jax.jit`.
+    """
+    whole = {} if mesh is None else dict.fromkeys(("in_shardings", "out_shardings"), NamedSharding(mesh, WHOLE))
+    return jax.jit(function, **whole, **options)
+
+
+def local(tree: Any, mesh: Mesh | None) -> Any:
+    """Copies of arrays that lie whole on every device, on this process's first device alone."""
+    return tree if mesh is None else jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
+
+
+def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
+    """A number that processes may see differently, such as a time, as the first one sees it."""
+    if mesh is None:
+        return value
+    # Through the connections of all devices together, which are there: others would have to be made, at one time.
+    return type(value)(np.asarray(gathered(shard(np.full(mesh.size, value), mesh)))[0])
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
@@ -98,7 +123,7 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
     def on_one(shared: Any, batch: Any) -> Any:
         return jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS, tiled=True), function(shared, batch))
 
-    on_all = _on_devices(on_one, mesh)
+    on_all = on_devices(on_one, mesh)
 
     def on_batch(shared: Any, batch: Any) -> Any:
         count = jax.tree.leaves(batch)[0].shape[0]
@@ -115,14 +140,46 @@ def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
     The mesh divides the batch. Take derivatives inside of it.
     """
+    return on_devices(lambda shared, batch: total(function(shared, batch), mesh), mesh)
+
+
+def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
+    """A function that each device works out on its share, and that gives the same on all by `total`, `mean` or `first`.
+
+    The mesh divides the batch. Where loops or branches bring anything together, their conditions must agree.
+    """
     if mesh is None:
         return function
-    return _on_devices(lambda shared, batch: lax.psum(function(shared, batch), AXIS), mesh)
-
-
-def _on_devices(function: OfBatch, mesh: Mesh) -> OfBatch:
     # Loops of different length on each device have no types in common over the mesh: what varies is not checked.
     return jax.shard_map(function, mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False)
+
+
+def total(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: the sum over devices."""
+    return tree if mesh is None else lax.psum(tree, AXIS)
+
+
+def mean(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: the mean over devices."""
+    return tree if mesh is None else lax.pmean(tree, AXIS)
+
+
+def first(tree: Any, mesh: Mesh | None) -> Any:
+    """Within a function of `on_devices`: what the first device has; others may have rounded otherwise."""
+    return tree if mesh is None else jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS)[0], tree)
+
+
+def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
+    """Within a function of `on_devices`: this device's part of an array that is whole, along an axis."""
+    if mesh is None:
+        return array
+    size = array.shape[axis] // mesh.size
+    return lax.dynamic_slice_in_dim(array, lax.axis_index(AXIS) * size, size, axis)
+
+
+@functools.cache
+def _gathering(mesh: Mesh) -> Callable[[jax.Array], jax.Array]:
+    return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, WHOLE))
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:

@@ -2,16 +2,16 @@
 
 The Hessians of learned energies need not be definite, so that Cholesky does not apply. The matrices of mechanics have a
 few rows and come in batches. Written out, they fuse with what surrounds them, which is faster than one library call per
-matrix up to a dozen rows; and several batched LAPACK calls in one program can wait for each other for ever on a machine
-with few cores (seen with jaxlib 0.10.2 on two).
+matrix up to a dozen rows.
 """
 
 import functools
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
+
+from dln_jax.solvers import lapack
 
 # Beyond this size the library call is faster, and the written-out program slow to compile.
 _WRITTEN_OUT_ROWS = 16
@@ -25,7 +25,7 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[A
     if b.shape[0] == 1:
         return b / matrix[0]
     if b.shape[0] > _WRITTEN_OUT_ROWS:
-        return jnp.linalg.solve(matrix, b)
+        return lapack.solve(matrix, b)
     return jax.lax.custom_linear_solve(
         functools.partial(jnp.matmul, matrix),
         b,
@@ -58,7 +58,14 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
 def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
     if b.shape[0] > _WRITTEN_OUT_ROWS:
-        return solve_triangular(factor, b, lower=True)
+        lower = jnp.tril(factor)
+        fixed = jax.lax.stop_gradient(lower)
+        return jax.lax.custom_linear_solve(
+            functools.partial(jnp.matmul, lower),
+            b,
+            lambda _, right: lapack.substitute(fixed, right[:, None])[:, 0],
+            transpose_solve=lambda _, right: lapack.substitute(fixed, right[:, None], transposed=True)[:, 0],
+        )
     x = []
     for i in range(b.shape[0]):
         remainder = b[i]

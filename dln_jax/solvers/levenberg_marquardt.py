@@ -17,6 +17,9 @@ F over that which the quadratic model predicts for v.
 Normal equations square the condition number of J. They are solved by Cholesky while the damped matrix is regular in
 working precision, else by eigenvalues (`normal_equations.factorise`), which the state counts as a fallback. All
 functions are pure; the caller compiles them.
+
+Devices of a mesh share the samples: each sums J Jᵀ, J r, J w and |r|² over its own, and all solve the same equations.
+The sums are brought together once in an iteration, P² / 2 numbers, and three times in a trial, P + 2.
 """
 
 import enum
@@ -27,9 +30,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 
+from dln_jax.scale.mesh import on_devices, total
 from dln_jax.solvers import normal_equations as equations
-from dln_jax.solvers.normal_equations import SampleResidual
+from dln_jax.solvers.normal_equations import Chunks, SampleResidual
 
 Arrays = tuple[Any, ...]
 """Samples on axis 0; `None` is handed on as it is."""
@@ -113,29 +118,64 @@ def run(
     """So many iterations, fewer where the status says so, or an iteration lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds are taken one after the other instead of all in lockstep: no seed repeats
-    another's failed trials, memory is that of one, and LAPACK is never called for a batch (several such calls in one
-    program can wait for each other for ever on a machine with few cores, seen with jaxlib 0.10.2).
+    another's failed trials, memory is that of one, and LAPACK is never called for a batch (see `solvers.lapack`).
 
     Raises:
         InputError: parameters or residuals that are not float64, or arrays of different length.
     """
+    chunks, samples = in_chunks(arrays), len(arrays[0])
+    return run_on_chunks(sample_residual, state, chunks, iterations, samples=samples, improvement=improvement)
+
+
+def in_chunks(arrays: Arrays, mesh: Mesh | None = None) -> Chunks:
+    """Samples as `run_on_chunks` takes them, which `scale.mesh.shard` splits over the devices of the mesh.
+
+    Raises:
+        InputError: arrays of different length.
+    """
+    return equations.split(arrays, CHUNK, devices=1 if mesh is None else mesh.size)
+
+
+def run_on_chunks(
+    sample_residual: SampleResidual,
+    state: State,
+    chunks: Chunks,
+    iterations: Any,
+    *,
+    samples: int,
+    improvement: float = 0.0,
+    mesh: Mesh | None = None,
+) -> State:
+    """What `run` does for so many samples, by the devices of a mesh together, each with its chunks of them."""
 
     @jax.custom_batching.sequential_vmap
-    def run_one(state: State, arrays: Arrays, iterations: Array) -> State:
+    def run_one(state: State, chunks: Chunks, iterations: Array) -> State:
         end = state.iteration + iterations
         return lax.while_loop(
             lambda state: (state.status == Status.RUNNING) & (state.iteration < end),
-            lambda state: iterate(sample_residual, state, arrays, improvement=improvement),
+            lambda state: _iterate(sample_residual, state, chunks, samples, improvement=improvement, mesh=mesh),
             state,
         )
 
-    over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
-    return over_seeds(state, arrays, jnp.asarray(iterations))
+    def on_one(shared: tuple[State, Array], chunks: Chunks) -> State:
+        state, iterations = shared
+        over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
+        return over_seeds(state, chunks, iterations)
+
+    return on_devices(on_one, mesh)((state, jnp.asarray(iterations)), chunks)
 
 
-def iterate(sample_residual: SampleResidual, state: State, arrays: Arrays, *, improvement: float = 0.0) -> State:
-    """One iteration of one seed, whatever its status; arguments as of `run`."""
-    at = _linearise(sample_residual, state.parameters, arrays)
+def _iterate(
+    sample_residual: SampleResidual,
+    state: State,
+    chunks: Chunks,
+    samples: int,
+    *,
+    improvement: float,
+    mesh: Mesh | None,
+) -> State:
+    """One iteration of one seed, whatever its status. Loops and branches depend on sums over all devices alone."""
+    at = _linearise(sample_residual, state.parameters, chunks, samples, mesh)
     largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(at.matrix)), state.scale)
     finite = jnp.isfinite(at.loss) & jnp.all(jnp.isfinite(at.gradient))
     flat = jnp.all(at.gradient == 0)
@@ -144,7 +184,7 @@ def iterate(sample_residual: SampleResidual, state: State, arrays: Arrays, *, im
     last = lax.while_loop(
         lambda trial: finite & ~flat & ~trial.accepted & (trial.tried < TRIALS),
         # Where no parameter has an effect the scale is zero: any positive number will do, for the step is zero.
-        lambda trial: _try(sample_residual, at, jnp.where(largest > 0, largest, 1.0), trial),
+        lambda trial: _try(sample_residual, at, jnp.where(largest > 0, largest, 1.0), trial, mesh),
         start,
     )
     stalled = jnp.where(jnp.isfinite(last.loss), int(Status.STALLED), int(Status.NON_FINITE))
@@ -173,8 +213,9 @@ class _Linearised(NamedTuple):
     x: Array
     """The same as a vector [P]."""
     unravel: Callable[[Array], Any]
-    chunks: equations.Chunks
+    chunks: Chunks
     samples: int
+    """Of all devices."""
     matrix: Array
     """A [P, P]."""
     gradient: Array
@@ -184,12 +225,15 @@ class _Linearised(NamedTuple):
     """Of all samples, where it is small enough to be kept."""
 
 
-def _linearise(sample_residual: SampleResidual, parameters: Any, arrays: Arrays) -> _Linearised:
-    samples, residuals = equations.check_data(sample_residual, parameters, arrays)
+def _linearise(
+    sample_residual: SampleResidual, parameters: Any, chunks: Chunks, samples: int, mesh: Mesh | None
+) -> _Linearised:
     x, unravel = ravel_pytree(parameters)
-    chunks = equations.split(arrays, CHUNK)
-    keep = 8 * x.size * samples * residuals <= KEPT_BYTES
-    matrix, vector, squares, jacobian = equations.normal_equations(sample_residual, parameters, chunks, keep=keep)
+    rows = chunks.weights.size * equations.residual_count(sample_residual, parameters, chunks)
+    keep = 8 * x.size * rows <= KEPT_BYTES
+    matrix, vector, squares, jacobian = equations.normal_equations(
+        sample_residual, parameters, chunks, keep=keep, mesh=mesh
+    )
     matrix, vector, squares = matrix / samples, vector / samples, squares / samples
     return _Linearised(parameters, x, unravel, chunks, samples, matrix, vector, squares, jacobian)
 
@@ -207,7 +251,7 @@ class _Trial(NamedTuple):
     fallbacks: Array
 
 
-def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: _Trial) -> _Trial:
+def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: _Trial, mesh: Mesh | None) -> _Trial:
     """The step with the damping of the last trial, whether it lowers the loss, and the next damping."""
     damped = trial.damping * scale
     factor, fell_back = equations.factorise(at.matrix + damped * jnp.eye(at.x.size))
@@ -215,7 +259,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
 
     def accelerated(probed: Array) -> Array:
         """v + a, by the residuals at x + h v."""
-        product = equations.pull_back(sample_residual, at.parameters, at.chunks, at.jacobian, probed)
+        product = equations.pull_back(sample_residual, at.parameters, at.chunks, at.jacobian, probed, mesh=mesh)
         slope = product / at.samples
         # Finite or NaN; the selection keeps the rounding of the division, which a fused multiply-add would skip.
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
@@ -228,7 +272,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
         point = jnp.where(phase == 0, PROBE * velocity, step)
         values = equations.residuals(sample_residual, at.unravel(at.x + point), at.chunks)
         step = lax.cond(phase == 0, lambda: accelerated(values), lambda: step)
-        return step, jnp.sum(values**2) / at.samples
+        return step, total(jnp.sum(values**2), mesh) / at.samples
 
     # One loop body for probe and trial: the residual function is compiled once for both.
     step, loss = lax.fori_loop(0, 2, evaluate, (velocity, at.loss))

@@ -15,8 +15,10 @@ import numpy as np
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
+from jax.sharding import Mesh
 from jaxtyping import Float
 
+from dln_jax.scale.mesh import total
 from dln_jax.types import InputError
 
 SampleResidual = Callable[..., Array]
@@ -84,25 +86,31 @@ def check_precision(tree: Any, what: str) -> None:
         )
 
 
-def check_data(sample_residual: SampleResidual, parameters: Any, arrays: tuple[Any, ...]) -> tuple[int, int]:
-    """Samples, and residuals of a sample.
+def residual_count(sample_residual: SampleResidual, parameters: Any, chunks: Chunks) -> int:
+    """Residuals of a sample.
 
     Raises:
-        InputError: something is not float64, or arrays differ in length.
+        InputError: parameters or residuals that are not float64.
     """
     check_precision(parameters, "parameters")
+    one = jax.tree.map(lambda array: array[0, 0], chunks.arrays)
+    residual = jax.eval_shape(sample_residual, parameters, *one)
+    check_precision(residual, "residuals")
+    return residual.size
+
+
+def split(arrays: tuple[Any, ...], chunk_size: int, *, devices: int = 1) -> Chunks:
+    """The samples in as few equal chunks of at most `chunk_size` as hold them, the same number for each device;
+    fillers are the first sample.
+
+    Raises:
+        InputError: arrays of different length, or of none.
+    """
     lengths = [array.shape[0] if array.ndim else 0 for array in jax.tree.leaves(arrays)]
     if len(set(lengths)) != 1 or lengths[0] == 0:
         raise InputError(f"data arrays have {lengths} samples on axis 0; expected the same positive number in each")
-    residual = jax.eval_shape(sample_residual, parameters, *jax.tree.map(lambda array: array[0], arrays))
-    check_precision(residual, "residuals")
-    return lengths[0], residual.size
-
-
-def split(arrays: tuple[Any, ...], chunk_size: int) -> Chunks:
-    """The samples in as few equal chunks of at most `chunk_size` as hold them; fillers are the first sample."""
-    samples = arrays[0].shape[0]
-    pieces = -(-samples // chunk_size)
+    samples = lengths[0]
+    pieces = devices * -(-samples // (devices * chunk_size))
     length = -(-samples // pieces)
     fillers = pieces * length - samples
     rows = jnp.concatenate([jnp.arange(samples), jnp.zeros(fillers, int)])
@@ -114,9 +122,12 @@ def split(arrays: tuple[Any, ...], chunk_size: int) -> Chunks:
 
 
 def normal_equations(
-    sample_residual: SampleResidual, parameters: Any, chunks: Chunks, *, keep: bool
+    sample_residual: SampleResidual, parameters: Any, chunks: Chunks, *, keep: bool, mesh: Mesh | None = None
 ) -> NormalEquations:
     """J Jᵀ, J r and the sum of squares at `parameters`; the Jacobian too if it is to be kept.
+
+    With a mesh this is a part of a function of `scale.mesh.on_devices`: chunks and Jacobian are this device's, the sums
+    those of all.
 
     Rows come by reverse mode, all samples of a chunk at once and one residual of each after the other, or by forward
     mode where there are no more parameters than residuals in a sample.
@@ -163,6 +174,7 @@ def normal_equations(
 
     zeros = tuple(jnp.zeros((stop - start, stop)) for start, stop in pairwise(edges))
     (matrix, vector, squares), jacobian = lax.scan(add_chunk, (zeros, jnp.zeros(size), jnp.zeros(())), chunks)
+    matrix, vector, squares = total((matrix, vector, squares), mesh)
     lower = jnp.concatenate([jnp.pad(block, ((0, 0), (0, size - block.shape[1]))) for block in matrix])
     return NormalEquations(lower, vector, squares, jacobian)
 
@@ -183,21 +195,28 @@ def pull_back(
     chunks: Chunks,
     jacobian: Array | None,
     vectors: Float[Array, "k r c"],
+    *,
+    mesh: Mesh | None = None,
 ) -> Float[Array, "P"]:
-    """J w [P] for a vector w over the residuals: from the Jacobian if it was kept, by reverse mode if not."""
+    """J w [P] for a vector w over the residuals: from the Jacobian if it was kept, by reverse mode if not.
 
-    def reverse(total: Array, piece) -> tuple[Array, None]:
+    With a mesh chunks, Jacobian and w are this device's, and the product that of all, as in `normal_equations`.
+    """
+
+    def reverse(product: Array, piece) -> tuple[Array, None]:
         samples, vector = piece
         _, pull = jax.vjp(lambda each: residuals_of(sample_residual, each, samples), parameters)
-        return total + ravel_pytree(pull(vector)[0])[0], None
+        return product + ravel_pytree(pull(vector)[0])[0], None
 
     zero = jnp.zeros(count(parameters))
     if jacobian is None:
-        return lax.scan(reverse, zero, (chunks.arrays, vectors * chunks.weights[:, None]))[0]
+        product, _ = lax.scan(reverse, zero, (chunks.arrays, vectors * chunks.weights[:, None]))
+        return total(product, mesh)
     pieces = jacobian.reshape(-1, *jacobian.shape[2:])
-    return lax.scan(
-        lambda total, piece: (total + piece[0] @ piece[1], None), zero, (pieces, vectors.reshape(len(pieces), -1))
-    )[0]
+    product, _ = lax.scan(
+        lambda product, piece: (product + piece[0] @ piece[1], None), zero, (pieces, vectors.reshape(len(pieces), -1))
+    )
+    return total(product, mesh)
 
 
 def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:

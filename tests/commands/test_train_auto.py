@@ -19,6 +19,7 @@ from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree
 from dln_jax.runs import direct_fits
 from dln_jax.runs.dynamics_data import read
 from dln_jax.runs.dynamics_ladder import climb_ladder
+from dln_jax.runs.dynamics_options import check_options
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
@@ -76,7 +77,7 @@ def workplace(tmp_path_factory):
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     pytest.importorskip("mujoco")
     given = train_delan.Arguments(model="auto", data=Path("rigid.npz"), robot=Path("arm.xml"), velocity_scale=0.01)
-    task, training = climb_ladder(given, read(given), workplace)
+    task, training = climb_ladder(given, read(given), workplace, mesh=None)
     said, stored = capsys.readouterr().out, json.loads((workplace / "ladder.json").read_text())
     assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
     assert "│ rigid-tree " in said and [rung["tried"] for rung in stored["rungs"]].count(True) == 1
@@ -147,3 +148,9 @@ def test_a_mistake_is_one_line(workplace, capsys, mistake):
         pytest.importorskip("mujoco")
     assert message in refused(capsys, train_delan, *arguments, "--out", workplace / "refused")
     assert not (workplace / "refused").exists()
+
+
+@pytest.mark.parametrize("model", ["auto", "trigonometric", "trigonometric-kernel", "learned-tree"])
+def test_a_fit_that_processes_do_not_share_is_refused(model):
+    with pytest.raises(InputError, match="--processes is for networks"):
+        check_options(train_delan.Arguments(model=model, processes=2), model)

@@ -16,6 +16,7 @@ from dln_jax.learning.engine.checkpoint import Checkpoint, fingerprint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Stop
+from dln_jax.learning.engine.sharing import Sharing
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
@@ -230,7 +231,7 @@ def test_a_target_and_time_end_a_run_between_dispatches():
 
 
 def test_dispatches_of_any_length_are_one_compilation():
-    stage = descent.stages(line(), Adam(steps=100, batch=16, steps_per_dispatch=30))[0]
+    stage = descent.stages(line(), Adam(steps=100, batch=16, steps_per_dispatch=30), Sharing(None, None))[0]
     state = stage.start(None)
     dispatch = stage.compile(state)
     steps = []

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from calls import refused
 from gymnasium.utils.env_checker import check_env
+from jax.sharding import Mesh
 
 from dln_jax.commands import compare_locomotion, train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
@@ -21,6 +22,7 @@ from dln_jax.locomotion.learning import Goal, Record, compile_learner, learn
 from dln_jax.locomotion.policy import make_policy
 from dln_jax.locomotion.ppo import make_actor
 from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, make_task, observe
+from dln_jax.scale.mesh import AXIS
 from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import lattice
@@ -201,11 +203,14 @@ def test_the_actor_is_the_network_of_tanh_layers(task):
     np.testing.assert_allclose(make_actor(task).apply(layers, jnp.asarray(seen)), expected, rtol=1e-5)
 
 
-def test_vector_lanes_are_single_environments(task, environment):
+@pytest.mark.parametrize("shared", [False, True])
+def test_vector_lanes_are_single_environments(task, environment, shared):
     pytest.importorskip("stable_baselines3", reason="PPO needs the extra [rl]")
     from dln_jax.locomotion.vector_environment import VectorEnvironment
 
-    lanes = VectorEnvironment(task, 2, reward_scale=10.0)
+    # One device shares them with nobody, by the program of several.
+    mesh = Mesh(np.array(jax.devices()[:1]), (AXIS,)) if shared else None
+    lanes = VectorEnvironment(task, 2, reward_scale=10.0, mesh=mesh)
     random = np.random.default_rng(1)
     single, _ = environment.reset(seed=0)
     np.testing.assert_array_equal(lanes.reset()[1], single)
@@ -237,6 +242,8 @@ def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
         (("--episode", "50"), "a window has 40 steps"),
         (("--window", "7"), "a window has 7 steps"),
         (("--window", "8", "--method", "evolution"), "--window is not used by --method evolution"),
+        (("--lanes", "3"), "3 creatures are no pairs, in which gradient takes them"),
+        (("--lanes", "0"), "lanes is 0"),
         (("--seed", "-1"), "seed is -1"),
         (("--seed", "4294967295", "--seeds", "2"), "and 1 after it"),
     ],
@@ -245,6 +252,15 @@ def test_mistakes_are_one_line(capsys, monkeypatch, tmp_path, arguments, message
     monkeypatch.chdir(tmp_path)
     assert message in refused(capsys, train_locomotion, *arguments)
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("make_learner", "settings"), [(make_gradient_learner, QUICK), (make_evolution_learner, EvolutionSettings())]
+)
+def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy, make_learner, settings):
+    mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
+    with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
+        make_learner(task, policy, settings, mesh=mesh)
 
 
 def test_medians_and_the_crossover():

@@ -67,7 +67,7 @@ def test_elimination_does_not_hide_a_singular_matrix():
 
 
 def cholesky(M):
-    """Written out: several batched LAPACK calls in one program can wait for each other for ever."""
+    """Written out: with derivatives, and without a batched call to LAPACK."""
     d = M.shape[0]
     L = [[jnp.zeros(())] * d for _ in range(d)]
     for j in range(d):

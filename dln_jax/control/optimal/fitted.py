@@ -24,12 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.targets import Targets, greedy, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.scale.mesh import local, program, spread
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256
@@ -96,6 +98,7 @@ def fit_value(
     parameters: Any = None,
     double: bool = False,
     disturbance: Disturbance | None = None,
+    mesh: Mesh | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Fitted:
     """Iterates, and keeps what does best from validation states that are drawn apart.
@@ -108,13 +111,14 @@ def fit_value(
         parameters: to start from; by default drawn.
         double: whether to compute in float64, which takes twice as long.
         disturbance: of an adversary, for a robust value.
+        mesh: devices that share the states from which the policy is followed; the fits are done by each.
         report: called after every iteration.
 
     Raises:
         InputError: numbers out of range, or a value that was never finite.
     """
     given = {"numbers": numbers, "parameters": parameters, "double": double, "disturbance": disturbance}
-    (found,) = fit_values(problem, network, (seed,), **given, report=report)
+    (found,) = fit_values(problem, network, (seed,), **given, mesh=mesh, report=report)
     return found
 
 
@@ -127,6 +131,7 @@ def fit_values(
     parameters: Any = None,
     double: bool = False,
     disturbance: Disturbance | None = None,
+    mesh: Mesh | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> list[Fitted]:
     """As `fit_value` for several seeds, one after the other, by a program that is compiled once."""
@@ -134,7 +139,7 @@ def fit_values(
     problem = widened(problem, numbers.margin)
     with jax.enable_x64(double):
         began = time.perf_counter()
-        programs = _compiled(problem, network, numbers, parameters, disturbance)
+        programs = _compiled(problem, network, numbers, parameters, disturbance, mesh)
         compile_seconds = time.perf_counter() - began
         return [_fit(programs, seed, numbers, parameters, report, compile_seconds) for seed in seeds]
 
@@ -144,6 +149,8 @@ class _Programs(NamedTuple):
     """(key, parameters or none) -> parameters, state of the optimiser, validation states."""
     iterate: Callable[..., tuple[Any, Any, Array]]
     score: Callable[[Any, Array], Array]
+    local: Callable[[Any], Any]
+    """What the programs give, as arrays of this process."""
 
 
 def _compiled(
@@ -152,6 +159,7 @@ def _compiled(
     numbers: Iteration,
     parameters: Any,
     disturbance: Disturbance | None,
+    mesh: Mesh | None,
 ) -> _Programs:
     rate = optax.cosine_decay_schedule(numbers.learning_rate, numbers.iterations * numbers.steps, 0.01)
     adam = optax.adam(rate, b2=0.99)
@@ -164,12 +172,13 @@ def _compiled(
 
     key = jax.random.key(0)
     parameters, state, validated = begin(key, parameters)
-    iterate = jax.jit(functools.partial(_iterate, problem, network, numbers, disturbance, adam))
-    score = jax.jit(functools.partial(_score, problem, network, numbers, disturbance))
+    iterate = program(functools.partial(_iterate, problem, network, numbers, disturbance, adam, mesh), mesh)
+    score = program(functools.partial(_score, problem, network, numbers, disturbance, mesh), mesh)
     return _Programs(
         begin,
         iterate.lower(parameters, state, key, jnp.asarray(0.0)).compile(),
         score.lower(parameters, validated).compile(),
+        functools.partial(local, mesh=mesh),
     )
 
 
@@ -195,7 +204,7 @@ def _fit(
         report(history[-1])
     if not math.isfinite(least):
         raise InputError("the cost of the policy was never finite; take a smaller dt, or a box that it can stay near")
-    return Fitted(best, history, time.perf_counter() - began, compile_seconds)
+    return Fitted(programs.local(best), history, time.perf_counter() - began, compile_seconds)
 
 
 def _iterate(
@@ -204,6 +213,7 @@ def _iterate(
     numbers: Iteration,
     disturbance: Disturbance | None,
     adam: optax.GradientTransformation,
+    mesh: Mesh | None,
     parameters: Any,
     state: Any,
     key: Array,
@@ -212,8 +222,9 @@ def _iterate(
     of_starts, of_batches = jax.random.split(key)
     steps = round(numbers.seconds / numbers.dt)
     x = drawn(problem, of_starts, numbers.starts)
-    found = jax.vmap(
-        lambda x: targets(
+
+    def of_start(parameters: Any, memory: Array, x: Array) -> Targets:
+        return targets(
             problem,
             lambda x: network.value_and_gradient(parameters, x),
             x,
@@ -222,7 +233,9 @@ def _iterate(
             memory=memory,
             disturbance=disturbance,
         )
-    )(x)
+
+    trajectories = spread(lambda shared, x: jax.vmap(functools.partial(of_start, *shared))(x), mesh)
+    found = trajectories((parameters, memory), x)
     index = np.unique((steps * (np.arange(numbers.kept) / numbers.kept) ** 2).astype(int))
     data = jax.tree.map(lambda each: each[:, index].reshape(-1, *each.shape[2:]), found)
     half = jnp.asarray((np.asarray(problem.high) - np.asarray(problem.low)) / 2, float)
@@ -258,12 +271,13 @@ def _score(
     network: ValueNetwork,
     numbers: Iteration,
     disturbance: Disturbance | None,
+    mesh: Mesh | None,
     parameters: Any,
     x: Array,
 ) -> Array:
     steps = round(numbers.seconds / numbers.dt)
 
-    def one(x: Array) -> tuple[Array, Array]:
+    def one(parameters: Any, x: Array) -> tuple[Array, Array]:
         value = lambda x: network.value_and_gradient(parameters, x)  # noqa: E731
         closed, discount = greedy(problem, value, numbers.dt, disturbance), math.exp(-problem.discount * numbers.dt)
 
@@ -277,5 +291,5 @@ def _score(
         )
         return value(x)[0], total + weight * value(last)[0]
 
-    V, cost = jax.vmap(one)(x)
+    V, cost = spread(jax.vmap(one, (None, 0)), mesh)(parameters, x)
     return jnp.mean(cost + jnp.abs(V - cost))

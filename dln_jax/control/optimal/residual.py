@@ -18,11 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.boxes import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
+from dln_jax.scale.mesh import local, of_first_process, program
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
@@ -79,6 +81,7 @@ def fit_residual(
     rounds: int = 10,
     patience: int = 2,
     disturbance: Disturbance | None = None,
+    mesh: Mesh | None = None,
     report: Callable[[Stage], None] = lambda stage: None,
 ) -> ResidualFit:
     """The value function of a family that fits the equation best, in float64.
@@ -95,6 +98,7 @@ def fit_residual(
         rounds: of new samples at the last discount, at most.
         patience: rounds without a lower validation, after which it ends.
         disturbance: of an adversary, for a robust value function.
+        mesh: devices that share the samples of a fit.
         report: called after each draw.
 
     Raises:
@@ -116,13 +120,14 @@ def fit_residual(
             left -= disturbance(x, slope, optimal_control(problem, x, slope)) @ slope
         return left / unit
 
-    @functools.partial(jax.jit, compiler_options=quick_compilation())
+    @functools.partial(program, mesh=mesh, compiler_options=quick_compilation())
     def advance(parameters: Any, x: Array, discount: Array) -> tuple[Any, Array, Array]:
-        arrays = (x, jnp.full(len(x), discount))
-        state = levenberg_marquardt.run(residual, levenberg_marquardt.init(parameters), arrays, iterations)
+        chunks = levenberg_marquardt.in_chunks((x, jnp.full(len(x), discount)), mesh)
+        start = levenberg_marquardt.init(parameters)
+        state = levenberg_marquardt.run_on_chunks(residual, start, chunks, iterations, samples=samples, mesh=mesh)
         return state.parameters, state.iteration, jnp.sqrt(state.loss)
 
-    @jax.jit
+    @functools.partial(program, mesh=mesh)
     def validated(parameters: Any, discount: Array) -> Array:
         return jnp.sqrt(jnp.mean(jax.vmap(residual, (None, 0, None))(parameters, unseen, discount) ** 2))
 
@@ -131,7 +136,9 @@ def fit_residual(
     def fitted(parameters: Any, discount: float) -> Any:
         x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
         parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
-        stages.append(Stage(discount, int(done), float(loss), float(validated(parameters, jnp.asarray(discount)))))
+        # Decides how many rounds there are, in all processes.
+        left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
+        stages.append(Stage(discount, int(done), float(loss), float(left)))
         report(stages[-1])
         return parameters
 
@@ -148,4 +155,4 @@ def fit_residual(
         raise InputError(
             "the equation is not finite at the samples; look for states in the box where the plant or a cost is not"
         )
-    return ResidualFit(best, float(lowest), stages)
+    return ResidualFit(local(best, mesh), float(lowest), stages)

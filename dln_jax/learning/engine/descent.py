@@ -4,6 +4,7 @@ One dispatch runs whole epochs in one loop on the device: each epoch draws a per
 number, so that a run that continues from a stored state takes exactly the steps of an unbroken one.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -11,10 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.learning.engine import optimisers
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, loss_of, no_best
+from dln_jax.learning.engine.sharing import Sharing, by_devices
+from dln_jax.scale.mesh import first, mean, share, shares
 
 
 class State(NamedTuple):
@@ -43,22 +47,26 @@ class Lengths(NamedTuple):
     epochs_per_dispatch: int
 
 
-def stages(problem: Problem, adam: Adam) -> list[Stage]:
-    """The one stage of a run."""
+def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
+    """The one stage of a run.
+
+    Raises:
+        InputError: devices that do not divide a batch.
+    """
     samples = problem.arrays[0].shape[0]
     batch = min(adam.batch, samples)
+    shares(shared.samples, batch, "samples of a batch")
     batches = samples // batch
     epochs = -(-adam.steps // batches)
     lengths = Lengths(batch, batches, epochs, min(epochs, -(-adam.steps_per_dispatch // batches)))
     prepare = jax.vmap if problem.several else lambda function, *axes: function
     begin = jax.jit(prepare(lambda parameters, seed: _begin(adam, parameters, seed)))
-    dispatch = jax.jit(
-        prepare(lambda state, epochs: _dispatch(problem, adam, lengths, state, epochs), (0, None)), donate_argnums=0
-    )
+    of_seeds = prepare(functools.partial(_dispatch, problem, adam, lengths, shared.samples), (None, 0))
+    dispatch = jax.jit(by_devices(of_seeds, shared), donate_argnums=1)
 
     def compile_(state: State) -> Dispatch:
-        compiled = dispatch.lower(state, lengths.epochs_per_dispatch).compile()
-        return lambda state: compiled(state, min(lengths.epochs_per_dispatch, lengths.epochs - _epoch(state)))
+        compiled = dispatch.lower(lengths.epochs_per_dispatch, state).compile()
+        return lambda state: compiled(min(lengths.epochs_per_dispatch, lengths.epochs - _epoch(state)), state)
 
     def ended(state: State) -> Stop | None:
         if np.all(np.asarray(state.failed_step) >= 0):
@@ -88,16 +96,18 @@ def _begin(adam: Adam, parameters: Any, seed: Any) -> State:
     )
 
 
-def _dispatch(problem: Problem, adam: Adam, lengths: Lengths, before: State, epochs: Array) -> tuple[State, Array]:
-    """Some epochs of one seed, and [loss, validation, monitor]."""
+def _dispatch(
+    problem: Problem, adam: Adam, lengths: Lengths, mesh: Mesh | None, epochs: Array, before: State
+) -> tuple[State, Array]:
+    """Some epochs of one seed, and [loss, validation, monitor]; devices of a mesh share the samples of every batch."""
     dtype = before.best.validation.dtype
     loss, optimiser = loss_of(problem), optimisers.transformation(adam)
-    drawn = _shuffled(problem.arrays, before, lengths)
+    drawn = _shuffled(problem.arrays, before, lengths, mesh)
 
     def step(index: Array, carry: tuple[State, Array]) -> tuple[State, Array]:
         state, total = carry
         batch = jax.tree.map(lambda a: a[index], drawn)
-        value, gradient = jax.value_and_grad(loss)(state.parameters, batch)
+        value, gradient = mean(jax.value_and_grad(loss)(state.parameters, batch), mesh)
         updates, optimiser_state = optimiser.update(gradient, state.optimiser, state.parameters)
         state = state._replace(
             parameters=optax.apply_updates(state.parameters, updates),
@@ -116,14 +126,14 @@ def _dispatch(problem: Problem, adam: Adam, lengths: Lengths, before: State, epo
     failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
     # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
     state = jax.tree.map(lambda new, old: jnp.where(failed_step < 0, new, old), state, before)
-    value, shown = problem.score(state.parameters)
+    value, shown = first(problem.score(state.parameters), mesh)
     best = better_of(state.best, state.parameters, value, state.step)
     values = jnp.stack([jnp.asarray(v, dtype) for v in (total / steps, value, shown)])
     return state._replace(failed_step=failed_step, best=best), values
 
 
-def _shuffled(arrays: Any, state: State, lengths: Lengths) -> Any:
-    """The batches of a dispatch, one permutation for each of its epochs."""
+def _shuffled(arrays: Any, state: State, lengths: Lengths, mesh: Mesh | None) -> Any:
+    """The batches of a dispatch, one permutation for each of its epochs; of devices that share them each one's part."""
     samples = jax.tree.leaves(arrays)[0].shape[0]
 
     def order(epoch: Array) -> Array:
@@ -132,7 +142,8 @@ def _shuffled(arrays: Any, state: State, lengths: Lengths) -> Any:
         return used.reshape(lengths.batches, lengths.batch)
 
     orders = jax.vmap(order)(state.epoch + jnp.arange(lengths.epochs_per_dispatch)).reshape(-1, lengths.batch)
-    return jax.tree.map(lambda a: a[orders], arrays)
+    own = share(orders, mesh, axis=1)
+    return jax.tree.map(lambda a: a[own], arrays)
 
 
 def _permutation(key: Array, count: int) -> Array:

@@ -7,11 +7,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
 from dln_jax.learning.engine.problem import NO_START, Problem, Progress, Report, Stop, Training, plain, silent
+from dln_jax.learning.engine.sharing import sharing
+from dln_jax.scale.mesh import local, of_first_process, replicate
 from dln_jax.types import InputError, require_positive
 
 
@@ -32,6 +35,7 @@ def fit(
     report: Report = silent,
     seconds: float | int = math.inf,
     must_start: bool = True,
+    mesh: Mesh | None = None,
 ) -> Training:
     """Makes a problem's loss small and keeps the parameters with the lowest score.
 
@@ -43,24 +47,34 @@ def fit(
         seconds: after which to stop, compilation included and since the call, also of a resumed run; looked at between
             dispatches, of which there is one at least. The learning rate falls as it would have without it.
         must_start: whether a loss that is not finite to begin with is an error, rather than a result.
+        mesh: devices that share the training. Several seeds are split over them, and each device trains its own. Of one
+            seed the samples are split: those of a step's batch for Adam, all for Gauss-Newton; each device works out
+            the whole score. What is stored does not depend on the devices, and a run may continue on others. Results
+            are those of one device to rounding, which parameters amplify that the data hardly determine.
 
     Raises:
-        InputError: settings out of range, a loss that is not finite to begin with, or a checkpoint that does not fit.
+        InputError: settings out of range, a loss that is not finite to begin with, a checkpoint that does not fit, or
+            devices that do not divide the samples of a batch.
     """
     began = time.perf_counter()
     require_positive(seconds=seconds)
     optimisers.check(optimiser)
-    stages = descent.stages(problem, optimiser) if isinstance(optimiser, Adam) else newton.stages(problem, optimiser)
+    shared = sharing(problem, mesh)
+    if isinstance(optimiser, Adam):
+        stages = descent.stages(problem, optimiser, shared)
+    else:
+        stages = newton.stages(problem, optimiser, shared)
     run = _Run(stages[0].start(None), jnp.asarray(0))
     run, history = restore(checkpoint, run) or (run, [])
+    run = run._replace(state=replicate(run.state, mesh))
     train_seconds = history[-1].seconds if history else 0.0
     compile_seconds, dispatched, stop = 0.0, False, Stop("finished", 0)
     for number in range(first := int(run.stage), len(stages)):
         stage, dispatch = stages[number], None
         if number > first:
-            run = _Run(stage.start(run.state), jnp.asarray(number))
+            run = _Run(replicate(stage.start(local(run.state, mesh)), mesh), jnp.asarray(number))
         while not (stop := stage.ended(run.state)):
-            if dispatched and time.perf_counter() - began >= seconds:
+            if dispatched and seconds < math.inf and of_first_process(time.perf_counter() - began >= seconds, mesh):
                 stop = Stop("time", int(np.max(run.state.step)))
                 break
             if dispatch is None:
@@ -84,5 +98,5 @@ def fit(
             break
     if must_start and stop == Stop("not finite", 0):
         raise InputError(NO_START)
-    best = run.state.best
+    best = local(run.state.best, mesh)
     return Training(best.parameters, history, stop, plain(best.step), compile_seconds)

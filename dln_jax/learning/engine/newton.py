@@ -12,6 +12,8 @@ from jax import Array, lax
 from dln_jax.compilation import quick_compilation
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, no_best
+from dln_jax.learning.engine.sharing import Sharing, by_devices
+from dln_jax.scale.mesh import first, replicate, shard, spread
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.solvers.levenberg_marquardt import Arrays, Status
 from dln_jax.types import InputError
@@ -29,18 +31,19 @@ class State(NamedTuple):
     best: Best
 
     @property
-    def step(self) -> Array:
-        """[] iterations done, of several seeds the most."""
-        return self.earlier + jnp.max(self.solver.iteration)
+    def step(self) -> int:
+        """Iterations done, of several seeds the most."""
+        return int(self.earlier) + int(np.max(np.asarray(self.solver.iteration)))
 
 
-def stages(problem: Problem, optimiser: GaussNewton) -> list[Stage]:
+def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[Stage]:
     """One stage, or two."""
     if problem.residual is None:
         raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
     arrays = jax.tree.map(jnp.asarray, problem.arrays)
-    iterate = functools.partial(levenberg_marquardt.run, problem.residual, improvement=optimiser.improvement)
-    stage = functools.partial(_stage, problem, optimiser, iterate)
+    settings = {"improvement": optimiser.improvement, "mesh": shared.samples}
+    iterate = functools.partial(levenberg_marquardt.run_on_chunks, problem.residual, **settings)
+    stage = functools.partial(_stage, problem, optimiser, shared, iterate)
     if not optimiser.has_coarse_stage(len(arrays[0])):
         return [stage("", arrays, optimiser.steps)]
     some = jax.tree.map(lambda array: array[: optimiser.coarse_samples], arrays)
@@ -48,7 +51,13 @@ def stages(problem: Problem, optimiser: GaussNewton) -> list[Stage]:
 
 
 def _stage(
-    problem: Problem, optimiser: GaussNewton, iterate: Callable, name: str, arrays: Arrays, iterations: int
+    problem: Problem,
+    optimiser: GaussNewton,
+    shared: Sharing,
+    iterate: Callable,
+    name: str,
+    arrays: Arrays,
+    iterations: int,
 ) -> Stage:
     def start(before: State | None) -> State:
         of_seeds = jax.vmap if problem.several else lambda function: function
@@ -56,40 +65,56 @@ def _stage(
             parameters = problem.parameters
             best, earlier = of_seeds(no_best)(jax.tree.map(jnp.array, parameters)), jnp.zeros((), int)
         else:
-            parameters, best, earlier = before.best.parameters, before.best, before.step
+            parameters, best, earlier = before.best.parameters, before.best, jnp.asarray(before.step)
         return State(of_seeds(levenberg_marquardt.init)(parameters), earlier, best)
 
     def ended(state: State) -> Stop | None:
         if np.all(np.asarray(state.solver.status) == Status.NON_FINITE):
-            return Stop("not finite", int(state.step))
+            return Stop("not finite", state.step)
         done = not _remaining(state, iterations) or np.all(np.asarray(state.best.validation) <= optimiser.target)
-        return Stop("finished", int(state.step)) if done else None
+        return Stop("finished", state.step) if done else None
 
-    return Stage(name, start, functools.partial(_compile, problem, optimiser, iterate, arrays, iterations), ended)
+    return Stage(
+        name, start, functools.partial(_compile, problem, optimiser, shared, iterate, arrays, iterations), ended
+    )
 
 
 def _compile(
-    problem: Problem, optimiser: GaussNewton, iterate: Callable, arrays: Arrays, iterations: int, state: State
+    problem: Problem,
+    optimiser: GaussNewton,
+    shared: Sharing,
+    iterate: Callable,
+    arrays: Arrays,
+    iterations: int,
+    state: State,
 ) -> Dispatch:
-    """Iterations, their score and the best so far: three programs, of which the first is to be compiled quickly."""
-    advance = (
-        jax.jit(iterate, compiler_options=quick_compilation()).lower(state.solver, arrays, jnp.asarray(0)).compile()
-    )
+    """Iterations, and their score and the best so far: two programs, of which the first is to be compiled quickly."""
+    chunks = jax.jit(lambda arrays: levenberg_marquardt.in_chunks(arrays, shared.samples))(arrays)
+    chunks = replicate(chunks, shared.seeds) if shared.samples is None else shard(chunks, shared.samples)
+
+    iterate = functools.partial(iterate, samples=len(arrays[0]))
+    advance = spread(lambda given, solver: iterate(solver, *given), shared.seeds)
+    advance = jax.jit(advance, compiler_options=quick_compilation())
+    advance = advance.lower((chunks, np.asarray(0)), state.solver).compile()
+
+    def judge(step: Array, given: tuple[Best, levenberg_marquardt.State]) -> tuple[Best, Array]:
+        best, solver = given
+        # One seed after the other: a score that calls LAPACK must not do so for a batch (see `solvers.lapack`).
+        scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)
+        better = jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of
+        best = better(best, solver.parameters, scores[..., 0], jnp.asarray(step, jnp.int32))
+        return best, jnp.concatenate([solver.loss[..., None], scores], axis=-1)
 
     def score(parameters: Any) -> Array:
-        return jnp.stack(problem.score(parameters))
+        return first(jnp.stack(problem.score(parameters)), shared.samples)
 
-    # One seed after the other: a score that calls LAPACK must not do so for a batch (see the solver).
-    evaluate = jax.jit((lambda stacked: lax.map(score, stacked)) if problem.several else score)
-    evaluate = evaluate.lower(state.solver.parameters).compile()
-    keep = jax.jit(jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of)
+    judged = jax.jit(by_devices(judge, shared)).lower(state.step, (state.best, state.solver)).compile()
 
     def dispatch(state: State) -> tuple[State, Array]:
         steps = min(optimiser.steps_per_dispatch, _remaining(state, iterations))
-        state = state._replace(solver=advance(state.solver, arrays, jnp.asarray(steps)))
-        scores = evaluate(state.solver.parameters)
-        best = keep(state.best, state.solver.parameters, scores[..., 0], state.step.astype(jnp.int32))
-        return state._replace(best=best), jnp.concatenate([state.solver.loss[..., None], scores], axis=-1)
+        state = state._replace(solver=advance((chunks, np.asarray(steps)), state.solver))
+        best, values = judged(state.step, (state.best, state.solver))
+        return state._replace(best=best), values
 
     return dispatch
 

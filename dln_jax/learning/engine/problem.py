@@ -32,6 +32,8 @@ class Problem(NamedTuple):
     then have a leading axis of K."""
     loss: Callable[[Any, Any], Array] | None = None
     """(parameters, batch) -> what Adam makes small, where that is not the mean of squared residuals."""
+    loss_is_mean: bool = True
+    """Whether `loss` is the mean of those of equal parts of a batch, so that devices may share its samples."""
 
     @property
     def several(self) -> bool:

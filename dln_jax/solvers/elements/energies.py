@@ -6,6 +6,7 @@ An element couples a few of the n blocks of b unknowns each (the corners of a tr
 the Hessian is sparse; `assembly` puts it together.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from dln_jax.solvers.lapack import symmetric_eigen
 
 Blocks = Float[Array, "n b"]
 Corners = Sequence[Sequence[Array]] | Float[Array, "k b"]
@@ -96,14 +99,13 @@ def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, 
 
     `shift` is what is added to the diagonals, relative to the largest eigenvalue of all.
     """
-    wholes = [square(lower) for lower in hessians]
-    largest = max(h.shape[-1] for h in wholes)
-    # One call for all: several batched LAPACK calls in one program can wait for each other for ever.
-    padded = [jnp.pad(h, ((0, 0), (0, largest - h.shape[-1]), (0, largest - h.shape[-1]))) for h in wholes]
-    stacked = jnp.concatenate(padded)
-    finite = jnp.where(jnp.isfinite(stacked), stacked, 0)
-    values, vectors = jnp.linalg.eigh(finite)
-    values = jnp.maximum(values, 0) + shift * jnp.max(values, initial=0)
-    projected = (vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2)
-    parts = jnp.split(projected, np.cumsum([len(h) for h in wholes])[:-1])
-    return tuple(lower_triangles(part[:, : h.shape[-1], : h.shape[-1]]) for part, h in zip(parts, wholes, strict=True))
+    spectra = []
+    for lower in hessians:
+        whole = square(lower)
+        spectra.append(jax.vmap(symmetric_eigen)(jnp.where(jnp.isfinite(whole), whole, 0)))
+    largest = functools.reduce(jnp.maximum, [jnp.max(values, initial=0) for values, _ in spectra])
+    projected = []
+    for values, vectors in spectra:
+        raised = jnp.maximum(values, 0) + shift * largest
+        projected.append(lower_triangles((vectors * raised[:, None, :]) @ vectors.swapaxes(-1, -2)))
+    return tuple(projected)

@@ -15,19 +15,27 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax.linalg import cholesky, triangular_solve
+from jax import lax
 from jaxtyping import Array, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.assembly import Pattern, assemble
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
+from dln_jax.solvers.elimination import solve as eliminate
+from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
 # Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
 _DENSE_UNKNOWNS = 160
+# Of so many at once, bands up to here are factorised faster than each matrix by LAPACK; as measured with 56 to 120
+# unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
+_WIDEST_BAND = 20
+_FEWEST_BANDS = 4
 # Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
 # rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
 # unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
@@ -60,6 +68,7 @@ class LinearSolver(NamedTuple):
     """The same, as accurate as a search direction has to be."""
 
 
+Columns = Float[Array, "n k"]
 LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
@@ -88,18 +97,52 @@ def least_work(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolverFa
 
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Cholesky factorisation of the whole matrix."""
+    """Cholesky factorisation of the whole matrix; under `vmap`, on a processor, of the bands of all where narrow."""
     table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
-        return cholesky(_with_constants(values)[table], symmetrize_input=False)
+        return cholesky(_with_constants(values)[table])
 
-    def solve(factor: Array, b: Blocks) -> Blocks:
+    def substituted(factor: Array, right: Columns) -> Columns:
+        return substitute(factor, substitute(factor, right), transposed=True)
+
+    def of_blocks(solve: Callable[[Array, Columns], Columns], factor: Array, b: Blocks) -> Blocks:
         right = jnp.where(at.free, b, 0).reshape(-1, 1)
-        y = triangular_solve(factor, right, left_side=True, lower=True)
-        return triangular_solve(factor, y, left_side=True, lower=True, transpose_a=True).reshape(b.shape)
+        return solve(factor, right).reshape(b.shape)
 
-    return LinearSolver(factorise, solve, solve)
+    order = (_ordering(at)[:, None] * at.width + np.arange(at.width)).ravel()
+    place = np.argsort(order)
+    band = int(np.abs(place[at.rows] - place[at.columns]).max(initial=0))
+    if band > _WIDEST_BAND:
+        solve = partial(of_blocks, substituted)
+        return LinearSolver(factorise, solve, solve)
+
+    # Factorised as it is solved, because the two ways have factors of different shapes.
+    solve = partial(of_blocks, _one_or_many(lambda values, b: substituted(factorise((), values), b), at, order, band))
+    return LinearSolver(lambda _, values: values, solve, solve)
+
+
+def _one_or_many(
+    one: Callable[[Array, Columns], Columns], at: Pattern, order: np.ndarray, band: int
+) -> Callable[[Array, Columns], Columns]:
+    """(entries, b) -> x by `one`, or for a batch by the bands of all."""
+    row, column = places(at.unknowns, band)
+    numbers = np.append(order, np.full(max(row.max(), column.max()) + 1 - at.unknowns, at.unknowns))
+    beyond = (row == column) & (row >= at.unknowns)
+    table = np.where(beyond, _one(at), _lookup(at)(numbers[row], numbers[column]))
+
+    def by_bands(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
+        lower = jax.vmap(_with_constants)(values).T[table]
+        x = solve_bands(lower, b.transpose(1, 2, 0)[order])
+        return x[np.argsort(order)].transpose(2, 0, 1)
+
+    def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
+        each = jax.vmap(one)
+        if len(values) < _FEWEST_BANDS:
+            return each(values, b)
+        return lax.platform_dependent(values, b, cpu=by_bands, default=each)
+
+    return shared_or_batched(one, many)
 
 
 def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
@@ -139,7 +182,8 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
     of_blocks = _lookup(at)(numbers[:, :, None], numbers[:, None, :])
 
     def factorise(hessians: Sequence[Array], values: Float[Array, " entries"]) -> tuple[tuple[Array, ...], Array]:
-        return tuple(map(square, hessians)), jnp.linalg.inv(_with_constants(values)[of_blocks])
+        inverse = jax.vmap(partial(eliminate, b=jnp.eye(b, dtype=values.dtype)))(_with_constants(values)[of_blocks])
+        return tuple(map(square, hessians)), inverse
 
     def run(tolerance: float, factor: tuple[tuple[Array, ...], Array], right: Blocks) -> Blocks:
         hessians, inverse = factor

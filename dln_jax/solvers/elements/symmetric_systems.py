@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.lax.linalg import cholesky, triangular_solve
 from jaxtyping import Array, Float
+
+from dln_jax.solvers.lapack import cholesky, substitute
 
 Vector = Float[Array, "..."]
 Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
@@ -26,11 +27,11 @@ def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "c
 
     def eliminate(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         d, c = blocks
-        w = triangular_solve(previous, c, lower=True, transpose_a=True)
-        factor = cholesky(d - w @ w.T, symmetrize_input=False)
+        w = substitute(previous, c, transposed=True, right=True)
+        factor = cholesky(d - w @ w.T)
         return factor, (factor, w)
 
-    first = cholesky(diagonal[0], symmetrize_input=False)
+    first = cholesky(diagonal[0])
     _, (factors, w) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
     return jnp.concatenate([first[None], factors]), jnp.concatenate([jnp.zeros_like(first)[None], w])
 
@@ -40,12 +41,12 @@ def solve_blocks(factor: Factor, b: Float[Array, "count s"]) -> Float[Array, "co
 
     def forwards(y: Array, blocks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         lower, w, right = blocks
-        y = triangular_solve(lower, (right - w @ y)[:, None], left_side=True, lower=True)[:, 0]
+        y = substitute(lower, (right - w @ y)[:, None])[:, 0]
         return y, y
 
     def backwards(carry: Array, blocks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         lower, w, y = blocks
-        x = triangular_solve(lower, (y - carry)[:, None], left_side=True, lower=True, transpose_a=True)[:, 0]
+        x = substitute(lower, (y - carry)[:, None], transposed=True)[:, 0]
         return w.T @ x, x
 
     zero = jnp.zeros_like(b[0])

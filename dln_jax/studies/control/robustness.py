@@ -41,12 +41,18 @@ HORIZON, DRAWS = 1.6, 300
 # Gains, the regulator's level, the share of a new torque and the largest one; the sweep and its period. The best of
 # hundreds drawn by how many random states come up undisturbed, then of eighty about it by disturbances that are drawn
 # likewise, but are not those of the table.
-RECOVERIES: dict[Motor, Recovery] = {
-    "elbow": Recovery(Law(jnp.array([2.89, 17.1, 41.5]), jnp.array(313.0), jnp.array(1.0), jnp.array(6.0)), 0.2, 1.5),
-    "shoulder": Recovery(Law(jnp.array([47.8, 2.15, 3.44]), jnp.array(63.9), jnp.array(1.0), jnp.array(6.0)), 0.2, 1.0),
+RECOVERIES: dict[Motor, tuple[tuple[float, float, float], float, float, float, float, float]] = {
+    "elbow": ((2.89, 17.1, 41.5), 313.0, 1.0, 6.0, 0.2, 1.5),
+    "shoulder": ((47.8, 2.15, 3.44), 63.9, 1.0, 6.0, 0.2, 1.0),
 }
 CONTROL_COSTS: dict[Motor, float] = {"elbow": 1.0, "shoulder": 10.0}
 """Of the regulators that they fall back to."""
+
+
+def recovery(motor: Motor) -> Recovery:
+    """The best that was found."""
+    *law, sweep, period = RECOVERIES[motor]
+    return Recovery(Law(*map(jnp.array, law)), sweep, period)
 
 
 def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
@@ -58,7 +64,7 @@ def controllers(motor: Motor, quick: bool) -> dict[str, Controller]:
         "ours-planned": follower(motor, weights, plan),
         "ours-by-energy": controllers_by_energy(motor)(law),
         "ours-planned-by-angles": by_angles(motor, follower(motor, weights, plan)),
-        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, CONTROL_COSTS[motor])(RECOVERIES[motor])),
+        "ours-recovering": by_angles(motor, recovering(motor, weights, plan, CONTROL_COSTS[motor])(recovery(motor))),
     }
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories, column
@@ -26,6 +27,7 @@ from dln_jax.learning.growth import grow
 from dln_jax.learning.measured_motions import Gauge, cut_measured_windows
 from dln_jax.learning.motions import Weights, cut_windows
 from dln_jax.learning.rates import match_linear
+from dln_jax.scale.mesh import of_first_process
 from dln_jax.studies.hamiltonian.recipes import RECIPES
 from dln_jax.studies.hamiltonian.tasks import Problem
 from dln_jax.types import InputError
@@ -167,11 +169,12 @@ def train(
     directory: Path | None = None,
     resume: bool = False,
     report: Report = silent,
+    mesh: Mesh | None = None,
 ) -> Trained:
     """Fits a model to rates, and then to trajectories where the recipe says so, by as many steps as it or `steps` says.
 
     `seconds` are those of both, compilation included. Where they are over after the rates, or the fit of motions is not
-    finite from its start, the fit of rates is the result.
+    finite from its start, the fit of rates is the result. Devices of a mesh share the samples of both.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build(description)
@@ -183,8 +186,8 @@ def train(
             own = own._replace(patience=own.steps, batch=WINDOWS_OF_A_STEP if stage == MOTIONS else own.batch)
         known = identity(own, numbers, model=description, seed=seed, samples=recipe.samples)
         kept = None if directory is None else Checkpoint(directory, known, resume, f"checkpoint_{file}")
-        staged = {"report": lambda at: report(at._replace(stage=stage)), "checkpoint": kept, "seconds": seconds}
-        return fit(task, own, **staged, **options)
+        staged = {"report": lambda at: report(at._replace(stage=stage)), "checkpoint": kept}
+        return fit(task, own, **staged, seconds=seconds, mesh=mesh, **options)
 
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     if description["name"] == POLYNOMIAL:
@@ -192,7 +195,7 @@ def train(
     else:
         first = fitted(RATES, first_problem(problem, description, parts, seed), recipe.steps, "rates", seconds)
     fits = {RATES: first}
-    left = seconds - (time.perf_counter() - began)
+    left = of_first_process(seconds - (time.perf_counter() - began), mesh)
     if not recipe.trajectory_steps or first.stop.reason == "not finite":
         return _ended(description, fits, RATES, first)
     if first.stop.reason == "time" or left <= 0:

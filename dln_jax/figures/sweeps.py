@@ -1,0 +1,95 @@
+"""Error against seconds over a grid of runs: a point for each, medians over seeds, the best in validation ringed."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from dln_jax.figures import style
+
+MOST_COLOURS = len(style.CYCLE)
+
+
+class Point(NamedTuple):
+    """A run, or the median of several."""
+
+    seconds: float
+    error: float
+    colour: str = ""
+    """Value of the option that colours show."""
+    marker: str = ""
+    """Value of the option that markers show."""
+    problem: str = ""
+    """Title of its panel."""
+    median: bool = False
+    best: bool = False
+
+
+def error_against_seconds(
+    points: Sequence[Point], *, x: str, y: str, colour: str = "", marker: str = "", note: str = ""
+) -> Figure:
+    """A panel for each problem; runs are faint where there are medians.
+
+    Args:
+        points: runs and medians.
+        x, y: labels of the axes.
+        colour, marker: names of the options that these show; empty for none. Of many colours some are named.
+        note: below the axes, for example which runs are missing.
+    """
+    problems = list(dict.fromkeys(point.problem for point in points)) or [""]
+    wide = len(problems) > 1
+    rows = -(-len(problems) // 2) if wide else 1
+    figure, axes = style.figure(rows, 2 if wide else 1, height=2.7 * rows + 1.1 if wide else 4.0)
+    colours = _colours(list(dict.fromkeys(point.colour for point in points)))
+    values = list(dict.fromkeys(point.marker for point in points))
+    markers = {value: style.MARKERS[number % len(style.MARKERS)] for number, value in enumerate(values)}
+    medians = any(point.median for point in points)
+    for number, (axis, problem) in enumerate(zip(axes.flat, problems, strict=False)):
+        here = [point for point in points if point.problem == problem]
+        for point in here:
+            faint = medians and not point.median
+            axis.plot(
+                point.seconds, point.error, markers[point.marker], color=colours[point.colour],
+                markersize=4 if faint else 8, alpha=0.45 if faint else 1.0, zorder=2 if faint else 3,
+                markeredgewidth=0,
+            )  # fmt: skip
+            if point.best:
+                axis.plot(point.seconds, point.error, "o", markersize=13, color="black", fillstyle="none", zorder=4)
+        axis.set_xscale(style.scale_of(point.seconds for point in here))
+        axis.set_yscale(style.scale_of(point.error for point in here))
+        style.title(axis, problem)
+        if number >= len(problems) - (2 if wide else 1):
+            axis.set_xlabel(x)
+        if not wide or number % 2 == 0:
+            axis.set_ylabel(y)
+    for axis in list(axes.flat)[len(problems) :]:
+        axis.axis("off")
+    listed = list(colours)[:: -(-len(colours) // MOST_COLOURS)]
+    handles = (
+        [] if not colour else [Line2D([], [], color=colours[v], linewidth=5, label=f"{colour} {v}") for v in listed]
+    )
+    handles += [] if not marker else [_handle(markers[value], f"{marker} {value}", "0.4") for value in markers]
+    if medians:
+        handles += [_handle("o", "a run", "0.4", size=4), _handle("o", "median", "0.4", size=8)]
+    if any(point.best for point in points):
+        ring = Line2D([], [], linestyle="", marker="o", color="black", fillstyle="none", markersize=10)
+        ring.set_label("best in validation")
+        handles.append(ring)
+    if handles or note:
+        titled = {"title": note, "title_fontsize": style.SMALL} if note else {}
+        style.legend(figure, handles=handles, loc="outside lower center", ncols=4, **titled)
+    return figure
+
+
+def _handle(marker: str, label: str, colour, *, size: float | int = 6) -> Line2D:
+    return Line2D([], [], linestyle="", marker=marker, color=colour, markersize=size, markeredgewidth=0, label=label)
+
+
+def _colours(values: Sequence[str]) -> dict[str, Any]:
+    """In turn, or along a scale where there are more values than colours."""
+    if len(values) <= MOST_COLOURS:
+        return {value: style.CYCLE[number] for number, value in enumerate(values)}
+    return dict(zip(values, map(tuple, colormaps["viridis"](np.linspace(0, 0.95, len(values)))), strict=True))

@@ -1,0 +1,3 @@
+from dln_jax.__main__ import command
+
+command("sweep", "python -m scripts.sweep")

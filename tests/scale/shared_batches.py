@@ -1,0 +1,118 @@
+"""What creatures and values come to on the devices that JAX sees: `shared_batches.py FOLDER NAME [PROCESS PORT]`.
+
+Writes FOLDER/NAME.npz. What the first run has learned half way it leaves in FOLDER/half, and every run continues.
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax import compilation
+from dln_jax.control.optimal.action_costs import quadratic
+from dln_jax.control.optimal.fitted import Iteration, fit_value
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.learning.soft_body_identification import ObservedMotions, identify
+from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
+from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
+from dln_jax.locomotion.learning import Goal, compile_learner, learn
+from dln_jax.locomotion.policy import make_policy
+from dln_jax.locomotion.task import make_task
+from dln_jax.scale.mesh import batch_mesh, program
+from dln_jax.softbody.mesh.creatures import Creature
+from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.scene import State
+from dln_jax.softbody.step import Stepper
+
+LINE = ControlProblem(
+    lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.2, [-2.0], [2.0], (), [0.0]
+)
+FEW = Iteration(iterations=2, starts=6, seconds=0.1, dt=0.025, steps=3, batch=8, kept=2)
+
+
+def block():
+    """Two triangles on the ground, and a muscle along one side."""
+    mesh = make_mesh([[0.0, 0.0], [0.4, 0.0], [0.0, 0.4], [0.4, 0.4]], [[0, 1, 2], [1, 3, 2]])
+    return make_task(Creature("block", mesh, np.array([[0, 2]])), episode=3, clock_period=4.0, upright=0.5)
+
+
+def walked(folder, name, compiled):
+    """Parameters and distances of a run of two updates, and of one that is continued after the first."""
+    given, steps = {"seed": 1, "settings": {"learner": name}}, compiled.learner.steps
+    half, whole = folder / "half" / name, Goal(2 * steps)
+    if not half.exists():
+        half.mkdir(parents=True)
+        learn(compiled, goal=Goal(steps), directory=half, **given)
+    copy = shutil.copytree(half, folder / f"{name}-{sys.argv[2]}")
+    runs = [
+        learn(compiled, goal=whole, **given),
+        learn(compiled, goal=whole, directory=copy, resume=True, **given),
+    ]
+    return [(run.parameters, [record.distance for record in run.records]) for run in runs]
+
+
+def stiffness(mesh):
+    """Of a spring, from three motions, which neither two nor four devices divide; a body would be traced for long."""
+
+    def step(stiffness, state, control):
+        v = state.v - 0.1 * stiffness * jnp.sin(state.x)
+        return State(state.x + 0.1 * v, v), None
+
+    x0 = jnp.asarray([1.0, 1.1, 0.9])[:, None, None]
+    motions = ObservedMotions(x0, jnp.zeros((3, 1, 1)), jnp.zeros((3, 2, 0)), 0.9 * jnp.stack([x0, x0], axis=1))
+    found = identify(Stepper(State, step), lambda theta: theta, jnp.asarray(2.0), motions, iterations=3, mesh=mesh)
+    return found.parameters, found.misfit
+
+
+def value(mesh):
+    """Parameters of a value, and what came of them on the way; six states do not divide among four."""
+    found = fit_value(LINE, value_network(LINE, widths=()), numbers=FEW, double=True, mesh=mesh)
+    return found.parameters, [(at.loss, at.validation) for at in found.history]
+
+
+def equation(mesh):
+    """Parameters of a value by the equation, and how many draws that took; nine samples do not divide."""
+    network = value_network(LINE, widths=())
+    start, given = network.init(jax.random.key(2)), {"samples": 9, "validation": 4, "iterations": 3, "rounds": 1}
+    start = jax.tree.map(lambda leaf: leaf.astype(float), start)
+    found = fit_residual(LINE, network.value_and_gradient, start, jax.random.key(3), mesh=mesh, **given)
+    return found.parameters, len(found.stages)
+
+
+def main(folder, name):
+    mesh, task = batch_mesh(), block()
+    policy = make_policy(task, width=2)
+    evolution = make_evolution_learner(task, policy, EvolutionSettings(pairs=2, generations=1), mesh=mesh)
+    settings = GradientSettings(window=3, pairs=2, updates=1)
+    by_gradient = compile_learner(task, make_gradient_learner(task, policy, settings, mesh=mesh), mesh)
+    # Both have one program of evaluation.
+    improve = program(evolution.improve, mesh).lower(jax.eval_shape(lambda: evolution.start(0))).compile()
+    by_evolution = by_gradient._replace(learner=evolution, improve=improve)
+    found = {
+        "evolution": walked(folder, "evolution", by_evolution),
+        "gradient": walked(folder, "gradient", by_gradient),
+        "stiffness": stiffness(mesh),
+        "value": value(mesh),
+        "equation": equation(mesh),
+    }
+    arrays = {
+        f"{subject} {number}": np.asarray(leaf)
+        for subject, results in found.items()
+        for number, leaf in enumerate(jax.tree.leaves(results))
+    }
+    np.savez(folder / f"{name}.npz", devices=1 if mesh is None else mesh.size, **arrays)
+
+
+if __name__ == "__main__":
+    place, own_name, *process = sys.argv[1:]
+    compilation._OPTIONS.clear()  # the tests' own are quicker
+    jax.config.update("jax_enable_x64", True)
+    if process:
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(f"127.0.0.1:{process[1]}", 2, int(process[0]))
+    main(Path(place), own_name)

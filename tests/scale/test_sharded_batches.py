@@ -1,0 +1,54 @@
+"""Creatures and values on four devices, and in two processes: what one device alone comes to."""
+
+import os
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from interpreters import Program, interpreters
+
+PATH = Path(__file__).parent / "shared_batches.py"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """The arrays of each run by name; four devices come first, whose run all others continue."""
+    folder = tmp_path_factory.mktemp("shared")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    flags = os.environ.get("XLA_FLAGS", "")
+
+    def program(name, *process, devices=1):
+        told = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count={devices}"}
+        return Program(PATH, folder, told, (str(folder), name, *process))
+
+    with interpreters(dict(os.environ)) as run_programs:
+        for beside in (
+            [program("four devices", devices=4)],
+            [program("one device"), program("first of two", "0", port), program("second of two", "1", port)],
+        ):
+            for result in run_programs(folder, *beside):
+                assert result.returncode == 0, result.stderr[-3000:]
+    return {path.stem: dict(np.load(path)) for path in folder.glob("*.npz")}
+
+
+def test_each_ran_on_its_devices(results):
+    assert {name: int(found["devices"]) for name, found in results.items()} == {
+        "four devices": 4,
+        "one device": 1,
+        "first of two": 2,
+        "second of two": 2,
+    }
+
+
+@pytest.mark.parametrize("name", ["four devices", "first of two", "second of two"])
+@pytest.mark.parametrize("subject", ["evolution", "gradient", "stiffness", "value", "equation"])
+def test_results_are_those_of_one_device(results, name, subject):
+    expected, found = results["one device"], results[name]
+    keys = [key for key in expected if key.startswith(subject)]
+    assert keys and found.keys() == expected.keys()
+    for key in keys:
+        assert np.isfinite(expected[key]).all()
+        np.testing.assert_allclose(found[key], expected[key], rtol=1e-12, atol=1e-12, err_msg=key)
