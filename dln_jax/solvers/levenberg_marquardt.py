@@ -32,7 +32,7 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from dln_jax.scale.mesh import on_devices, total
+from dln_jax.scale.mesh import first, on_devices, total
 from dln_jax.solvers import normal_equations as equations
 from dln_jax.solvers.normal_equations import Chunks, SampleResidual
 
@@ -160,7 +160,8 @@ def run_on_chunks(
     def on_one(shared: tuple[State, Array], chunks: Chunks) -> State:
         state, iterations = shared
         over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
-        return over_seeds(state, chunks, iterations)
+        # Devices of other makes round the solution of the equations otherwise: all go on from the first one's.
+        return first(over_seeds(state, chunks, iterations), mesh)
 
     return on_devices(on_one, mesh)((state, jnp.asarray(iterations)), chunks)
 

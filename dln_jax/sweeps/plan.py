@@ -72,6 +72,8 @@ def plan(
         raise InputError(f"{command} has no --out, so that it leaves nothing to compare; choose a command that trains")
     target = Target(command, arguments, {**{name: texts[0] for name, texts in grid.items()}, **fixed})
     common = [word for name, text in fixed.items() for word in _words(target, "--fixed", name, [text])]
+    # Within an allocation of several tasks each of them would take itself for a part of one run.
+    common += ["--processes=1"] * ("processes" in _options(arguments))
     words = {name: dict(zip(texts, _words(target, "--grid", name, texts), strict=True)) for name, texts in grid.items()}
     jobs = []
     for number, values in enumerate(combinations(grid)):

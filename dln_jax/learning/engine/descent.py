@@ -126,6 +126,8 @@ def _dispatch(
     failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
     # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
     state = jax.tree.map(lambda new, old: jnp.where(failed_step < 0, new, old), state, before)
+    # Devices of other makes may round otherwise: all go on from the first one's.
+    state = first(state, mesh)
     value, shown = first(problem.score(state.parameters), mesh)
     best = better_of(state.best, state.parameters, value, state.step)
     values = jnp.stack([jnp.asarray(v, dtype) for v in (total / steps, value, shown)])
