@@ -84,22 +84,23 @@ def equation(mesh):
     return found.parameters, len(found.stages)
 
 
-def main(folder, name):
+def main(folder, name, *, whole):
     mesh, task = batch_mesh(), block()
     policy = make_policy(task, width=2)
     evolution = make_evolution_learner(task, policy, EvolutionSettings(pairs=2, generations=1), mesh=mesh)
-    settings = GradientSettings(window=3, pairs=2, updates=1)
-    by_gradient = compile_learner(task, make_gradient_learner(task, policy, settings, mesh=mesh), mesh)
-    # Both have one program of evaluation.
-    improve = program(evolution.improve, mesh).lower(jax.eval_shape(lambda: evolution.start(0))).compile()
-    by_evolution = by_gradient._replace(learner=evolution, improve=improve)
+    by_evolution = compile_learner(task, evolution, mesh)
     found = {
         "evolution": walked(folder, "evolution", by_evolution),
-        "gradient": walked(folder, "gradient", by_gradient),
         "stiffness": stiffness(mesh),
         "value": value(mesh),
-        "equation": equation(mesh),
     }
+    if whole:
+        settings = GradientSettings(window=3, pairs=2, updates=1)
+        gradient = make_gradient_learner(task, policy, settings, mesh=mesh)
+        # Both have one program of evaluation.
+        improve = program(gradient.improve, mesh).lower(jax.eval_shape(lambda: gradient.start(0))).compile()
+        by_gradient = by_evolution._replace(learner=gradient, improve=improve)
+        found |= {"gradient": walked(folder, "gradient", by_gradient), "equation": equation(mesh)}
     arrays = {
         f"{subject} {number}": np.asarray(leaf)
         for subject, results in found.items()
@@ -115,4 +116,5 @@ if __name__ == "__main__":
     if process:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize(f"127.0.0.1:{process[1]}", 2, int(process[0]))
-    main(Path(place), own_name)
+    # Gradients of a body take long to compile, and share what evolution shares: not in two processes too.
+    main(Path(place), own_name, whole=not process)

@@ -69,7 +69,7 @@ def test_jobs_are_command_lines(tmp_path):
         fixed_of("low-latency=no compilation-cache=yes test=e,q"),
     )
     first, second = plan("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
-    common = ("--no-low-latency", "--compilation-cache", "--test=e,q")
+    common = ("--no-low-latency", "--compilation-cache", "--test=e,q", "--processes=1")
     assert first.arguments == (*common, "--width=8", f"--data={tmp_path}/a.npz")
     assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs" / "0001"
     assert first.resumes
