@@ -50,7 +50,7 @@ def fit(
         mesh: devices that share the training. Several seeds are split over them, and each device trains its own. Of one
             seed the samples are split: those of a step's batch for Adam, all for Gauss-Newton; each device works out
             the whole score. What is stored does not depend on the devices, and a run may continue on others. Results
-            are those of one device to rounding, which parameters amplify that the data hardly determine.
+            are those of one device to rounding, which long trainings amplify.
 
     Raises:
         InputError: settings out of range, a loss that is not finite to begin with, a checkpoint that does not fit, or
