@@ -1,6 +1,7 @@
 """Programs in fresh interpreters, each forked from one that has imported JAX and the library, and done nothing else."""
 
 import json
+import os
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -72,7 +73,7 @@ class Result(NamedTuple):
 def interpreters(environment):
     """A function that runs programs beside each other, and gives the result of each."""
     command = [sys.executable, "-c", SERVER]
-    environment = {**environment, "PYTHONPATH": str(ROOT)}
+    environment = {**environment, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
     with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
         count = 0
 

@@ -9,14 +9,13 @@ import itertools
 import json
 import shutil
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sharing import begun
 
-from dln_jax import compilation
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine import fit as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
@@ -162,10 +161,4 @@ def main(folder, name):
 
 
 if __name__ == "__main__":
-    place, own_name, *process = sys.argv[1:]
-    compilation._OPTIONS.clear()  # the tests' own are quicker
-    jax.config.update("jax_enable_x64", True)
-    if process:
-        jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(f"127.0.0.1:{process[1]}", 2, int(process[0]))
-    main(Path(place), own_name)
+    main(*begun()[:2])

@@ -1,13 +1,11 @@
 """Trainings on four devices, and in two processes over a network: what one device alone comes to."""
 
 import json
-import os
-import socket
 from pathlib import Path
 
 import numpy as np
 import pytest
-from interpreters import Program, interpreters
+from sharing import run_on_all
 
 PATH = Path(__file__).parent / "shared_trainings.py"
 SHARED = ("four devices", "first of two", "second of two")
@@ -19,22 +17,7 @@ ROUNDING = 1e-12
 def runs(tmp_path_factory):
     """What each run said, and its arrays; four devices come first, whose half trainings all others continue."""
     folder = tmp_path_factory.mktemp("shared")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    flags = os.environ.get("XLA_FLAGS", "")
-
-    def program(name, *process, devices=1):
-        told = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count={devices}"}
-        return Program(PATH, folder, told, (str(folder), name, *process))
-
-    with interpreters(dict(os.environ)) as run_programs:
-        for beside in (
-            [program("four devices", devices=4)],
-            [program("one device"), program("first of two", "0", port), program("second of two", "1", port)],
-        ):
-            for result in run_programs(folder, *beside):
-                assert result.returncode == 0, result.stderr[-3000:]
+    run_on_all(PATH, folder)
     names = ("one device", *SHARED)
     return {
         name: (json.loads((folder / f"{name}.json").read_text()), dict(np.load(folder / f"{name}.npz")))

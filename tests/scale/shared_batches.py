@@ -5,13 +5,12 @@ Writes FOLDER/NAME.npz. What the first run has learned half way it leaves in FOL
 
 import shutil
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sharing import begun
 
-from dln_jax import compilation
 from dln_jax.control.optimal.action_costs import quadratic
 from dln_jax.control.optimal.fitted import Iteration, fit_value
 from dln_jax.control.optimal.problem import ControlProblem
@@ -110,11 +109,6 @@ def main(folder, name, *, whole):
 
 
 if __name__ == "__main__":
-    place, own_name, *process = sys.argv[1:]
-    compilation._OPTIONS.clear()  # the tests' own are quicker
-    jax.config.update("jax_enable_x64", True)
-    if process:
-        jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(f"127.0.0.1:{process[1]}", 2, int(process[0]))
+    own_folder, own_name, of_two = begun()
     # Gradients of a body take long to compile, and share what evolution shares: not in two processes too.
-    main(Path(place), own_name, whole=not process)
+    main(own_folder, own_name, whole=not of_two)

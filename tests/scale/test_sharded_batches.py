@@ -1,12 +1,10 @@
 """Creatures and values on four devices, and in two processes: what one device alone comes to."""
 
-import os
-import socket
 from pathlib import Path
 
 import numpy as np
 import pytest
-from interpreters import Program, interpreters
+from sharing import run_on_all
 
 PATH = Path(__file__).parent / "shared_batches.py"
 
@@ -15,22 +13,7 @@ PATH = Path(__file__).parent / "shared_batches.py"
 def results(tmp_path_factory):
     """The arrays of each run by name; four devices come first, whose run all others continue."""
     folder = tmp_path_factory.mktemp("shared")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    flags = os.environ.get("XLA_FLAGS", "")
-
-    def program(name, *process, devices=1):
-        told = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count={devices}"}
-        return Program(PATH, folder, told, (str(folder), name, *process))
-
-    with interpreters(dict(os.environ)) as run_programs:
-        for beside in (
-            [program("four devices", devices=4)],
-            [program("one device"), program("first of two", "0", port), program("second of two", "1", port)],
-        ):
-            for result in run_programs(folder, *beside):
-                assert result.returncode == 0, result.stderr[-3000:]
+    run_on_all(PATH, folder)
     return {path.stem: dict(np.load(path)) for path in folder.glob("*.npz")}
 
 
