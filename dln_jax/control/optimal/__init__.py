@@ -4,7 +4,8 @@ from dln_jax.control.optimal import action_costs
 from dln_jax.control.optimal.action_costs import ActionCost
 from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.fitted import Fitted, Iteration, fit_value, fit_values
-from dln_jax.control.optimal.grid import GridValue, interpolated, solve_on_grid
+from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
+from dln_jax.control.optimal.grid_interpolation import Grid, interpolated
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import (
     Affine,
@@ -26,6 +27,7 @@ __all__ = [
     "Bounds",
     "ControlProblem",
     "Fitted",
+    "Grid",
     "GridValue",
     "Iteration",
     "ResidualFit",
@@ -36,6 +38,7 @@ __all__ = [
     "at_goal",
     "checked",
     "discounts_down_to",
+    "extrapolated",
     "fit_residual",
     "fit_value",
     "fit_values",
@@ -44,6 +47,7 @@ __all__ = [
     "hjb_policy",
     "hjb_residual",
     "interpolated",
+    "lookahead",
     "optimal_control",
     "rates",
     "solve_on_grid",
