@@ -9,7 +9,8 @@ Numbers are those of the board's own program (`leaderboard/acrobot/robustness_v2
     the response k of the motor, u_k = u_{k-1} + k (wanted - u_{k-1}), 0.1 to 2
     the delay of all that is measured, 0 to 40 ms
 
-and 50 runs with six pushes each. Success is, as there, a last state near the goal. The criterion is the share of
+and 50 runs with six pushes each, drawn for both joints; the board's plant multiplies all torques by B, pushes too, so
+that those on the passive joint do nothing. Success is, as there, a last state near the goal. The criterion is the share of
 successes, and the score the mean of the six.
 """
 
@@ -150,7 +151,8 @@ def last_state(motor: Motor, controller: Controller, disturbance: Disturbance, k
         u = before + disturbance.response * (wanted - before)
         u = limited(u + disturbance.torque_noise * jax.random.normal(of_torque, (1,)), -LIMIT, LIMIT)
         since = (number * dt - disturbance.times) / disturbance.widths
-        tau = B @ u + jnp.sum(disturbance.pushes * jnp.exp(-(since**2) / 2), axis=1)
+        pushed = B.T @ jnp.sum(disturbance.pushes * jnp.exp(-(since**2) / 2), axis=1)
+        tau = B @ (u + pushed)
         x = runge_kutta(CLASSICAL, lambda t, state: field(state, tau))(0.0, history[0], dt)
         return (jnp.concatenate([x[None], history[:-1]]), memory, u), None
 

@@ -72,6 +72,20 @@ def test_the_table_is_the_boards():
         assert (np.abs(each.pushes) >= PUSHES[0]).all() and (np.abs(each.pushes) <= PUSHES[1]).all()
 
 
+@pytest.mark.parametrize(("motor", "driven"), [("shoulder", 0), ("elbow", 1)])
+def test_only_pushes_on_the_driven_joint_move_the_arm(monkeypatch, motor, driven):
+    monkeypatch.setattr("dln_jax.studies.control.disturbed_board.SECONDS", 0.2)
+    idle = stateless(lambda y: jnp.zeros(1))
+    pushes, middle = 3.0 * np.eye(2)[:, :, None], np.full((2, 1), 0.1)
+    of_each = undisturbed()._replace(times=middle, widths=np.full((2, 1), 0.02))
+    ends = [
+        np.asarray(jax.jit(lambda each=each: last_state(motor, idle, each, jax.random.key(0)))())
+        for each in (of_each._replace(pushes=push) for push in pushes)
+    ]
+    assert np.abs(ends[driven]).max() > 0.1
+    np.testing.assert_array_equal(ends[1 - driven], 0.0)
+
+
 def test_printed_means_are_those_of_printed_shares():
     for table in PUBLISHED.values():
         for name, (*each, mean) in table.items():
