@@ -6,6 +6,7 @@ value.json (load them with dln_jax.runs.values.load_value), metrics.json and con
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,10 +47,11 @@ from dln_jax.types import InputError, require_positive, require_seed
 class Arguments(Folder, Scaled):
     """What to train a value function of, how, and where it goes."""
 
-    plant: Annotated[str, choice(PLANTS)] = "pendulum"
-    """The plant and its costs."""
-    method: Annotated[str, choice(METHODS)] = "fitted"
-    """fitted: value iteration along trajectories of the model; residual: the equation itself, by Gauss-Newton."""
+    plant: Annotated[str | None, choice(PLANTS, unstated=True)] = None
+    """The plant and its costs (default: pendulum)."""
+    method: Annotated[str | None, choice(METHODS, unstated=True)] = None
+    """fitted: value iteration along trajectories of the model; residual: the equation itself, by Gauss-Newton
+    (default: fitted)."""
     goal: Unstated[str] = None
     """Posture to hold, rad or m, separated by commas (default: upright)."""
     width: Unstated[int] = None
@@ -67,7 +69,8 @@ class Arguments(Folder, Scaled):
     starts: int = 100
     """Of the evaluation, hanging and anywhere each."""
     stored: Unstated[Path] = None
-    """Folder of a run whose value function is evaluated; nothing is trained (default: train one)."""
+    """Folder of a run whose value function is evaluated on the plant that it was trained for; nothing is trained, so
+    that only --starts, --out and --devices apply (default: train one)."""
 
 
 def main(given: Arguments) -> None:
@@ -77,24 +80,40 @@ def main(given: Arguments) -> None:
     require_seed(given.seed, given.seeds)
     require_positive_if_given(given, ("width", "depth", "members", "iterations"))
     if given.stored is not None:
-        run = load_value(given.stored)
-        with command_folder(given, "train_value") as folder:
-            finish(folder, ValueRun(run.plant, run.network, with_float64(run.parameters)), given, {})
+        evaluate_stored(given, given.stored)
         return
+    given = dataclasses.replace(given, plant=given.plant or "pendulum", method=given.method or "fitted")
+    name, method = str(given.plant), str(given.method)
     goal = posture(given.goal)
-    plant = plant_named(given.plant, goal)
-    fit = usual(given.plant, given.method)
+    plant = plant_named(name, goal)
+    fit = usual(name, method)
     width, depth = given.width or fit.widths[0], given.depth or len(fit.widths)
     family = Family((width,) * depth, given.members or 1, scale=fit.scale)
     with command_folder(given, "train_value", family=family._asdict()) as folder:
-        print(f"{given.plant}: {given.method}, {family.members} x {depth} layers of {width}")
+        print(f"{name}: {method}, {family.members} x {depth} layers of {width}")
         trained = train(given, plant, family, fit.numbers, mesh)
         best = min(trained, key=lambda each: each.validation)
-        save_value(folder, given.plant, goal, family, best.parameters)
+        save_value(folder, name, goal, family, best.parameters)
         numbers = {"train_seconds": best.train_seconds, "validation": best.validation}
         if len(trained) > 1:
             numbers |= over_seeds(trained)
-        finish(folder, ValueRun(plant, family_of(plant, family), with_float64(best.parameters)), given, numbers)
+        finish(folder, ValueRun(name, plant, family_of(plant, family), with_float64(best.parameters)), given, numbers)
+
+
+OF_TRAINING = ("plant", "method", "goal", "width", "depth", "members", "iterations", "seed", "seeds")
+
+
+def evaluate_stored(given: Arguments, stored: Path) -> None:
+    """Evaluates the value function of a run on its own plant; `InputError` for options that only a training has."""
+    unused = [name for name in OF_TRAINING if getattr(given, name) != getattr(Arguments(), name)]
+    if unused:
+        raise InputError(
+            f"--{unused[0]} does not go with --stored: the stored value function has its own plant and network; "
+            f"leave --{unused[0]} out, or leave --stored out to train"
+        )
+    run = load_value(stored)
+    with command_folder(dataclasses.replace(given, plant=run.name), "train_value") as folder:
+        finish(folder, dataclasses.replace(run, parameters=with_float64(run.parameters)), given, {})
 
 
 def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteration, mesh: Mesh | None) -> list[Trained]:

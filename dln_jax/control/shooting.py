@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.limited_horizon import Horizon, least_cost
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, Problem
+from dln_jax.solvers.ending import Ending
 from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, require_positive
 
@@ -45,8 +46,13 @@ class Shooting(NamedTuple):
     promised: Float[Array, ""]
     """By how much the last change was to lower the cost, relative to it."""
     iterations: Int[Array, ""]
-    converged: Bool[Array, ""]
-    """Whether the defects, and what was promised, were within the tolerance."""
+    ending: Int[Array, ""]
+    """An `Ending`."""
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether defects and promised decrease came within the tolerance; `solvers.ending.reason` says why not."""
+        return self.ending == Ending.CONVERGED
 
 
 class _Knots(NamedTuple):
@@ -108,9 +114,17 @@ def shoot(
         return (knots.iterations < iterations) & ~knots.done & knots.better & jnp.isfinite(knots.cost)
 
     last = jax.lax.while_loop(going, lambda knots: _iterate(problem, knots, tolerance, exact), knots)
-    plan = Plan(last.u, last.x, last.K, last.cost, jnp.asarray(FIRST_DAMPING, u.dtype), ~no)
+    outcomes = (
+        (last.done, Ending.CONVERGED),
+        (~jnp.isfinite(last.cost), Ending.NOT_FINITE),
+        (~last.better, Ending.NO_DESCENT),
+    )
+    ending = jnp.select(
+        [is_so for is_so, _ in outcomes], [int(each) for _, each in outcomes], int(Ending.OUT_OF_ITERATIONS)
+    )
+    plan = Plan(last.u, last.x, last.K, last.cost, jnp.asarray(FIRST_DAMPING, u.dtype), ~no, ending)
     defect = jnp.max(jnp.abs(last.missed))
-    return Shooting(plan, last.multipliers, defect, last.promised, last.iterations, last.done)
+    return Shooting(plan, last.multipliers, defect, last.promised, last.iterations, ending)
 
 
 def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.finite import where_finite
 from dln_jax.solvers.elimination import solve
+from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
@@ -53,6 +54,13 @@ class Plan(NamedTuple):
     damping: Float[Array, ""]
     better: Bool[Array, ""]
     """Whether the last iteration found a lower cost."""
+    ending: Int[Array, ""]
+    """An `Ending`: why the optimisation ended, undecided after a single iteration."""
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether the optimisation reached its tolerance; `solvers.ending.reason(plan.ending)` says why not."""
+        return self.ending == Ending.CONVERGED
 
 
 def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
@@ -63,13 +71,18 @@ def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
     # Without gains it does not matter which states the controls are planned about.
     about, K = jnp.tile(x, (len(u) + 1, 1)), jnp.zeros((*u.shape, x.shape[0]), x.dtype)
     damping = jnp.asarray(FIRST_DAMPING, x.dtype)
-    plan = Plan(u, about, K, jnp.zeros((), x.dtype), damping, jnp.asarray(True))
+    plan = Plan(u, about, K, jnp.zeros((), x.dtype), damping, jnp.asarray(True), jnp.asarray(Ending.UNDECIDED))
     states, u, cost = _follow(problem, x, plan)
     return plan._replace(u=u, x=states, cost=cost)
 
 
 def improve(problem: Problem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
     """One iteration, the best of some step lengths [L]; the cost never rises."""
+    return _improved(problem, plan, step_lengths)[0]
+
+
+def _improved(problem: Problem, plan: Plan, step_lengths: Any) -> tuple[Plan, Array]:
+    """The plan after an iteration, and by how much the first step length lowers the cost."""
     k, K = _backward(problem, plan)
     lengths = jnp.asarray(step_lengths, plan.u.dtype)
     x, u, costs = jax.vmap(lambda length: _follow(problem, plan.x[0], plan._replace(u=plan.u + length * k, K=K)))(
@@ -78,13 +91,17 @@ def improve(problem: Problem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -
     # A cost that is no number is none that is lower.
     best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
     better = costs[best] < plan.cost
-    found = Plan(u[best], x[best], K, costs[best], jnp.maximum(plan.damping / 10, LEAST_DAMPING), better)
-    kept = plan._replace(K=K, damping=jnp.minimum(plan.damping * 10, MOST_DAMPING), better=better)
-    return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, kept)
+    undecided = jnp.asarray(Ending.UNDECIDED)
+    less_damping, more_damping = jnp.maximum(plan.damping / 10, LEAST_DAMPING), plan.damping * 10
+    found = Plan(u[best], x[best], K, costs[best], less_damping, better, undecided)
+    kept = plan._replace(K=K, damping=jnp.minimum(more_damping, MOST_DAMPING), better=better, ending=undecided)
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), found, kept), plan.cost - costs[0]
 
 
 def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
-    """Iterations from given controls until the cost falls by less than a share of it, or no step is better at all.
+    """Iterates from given controls until the cost falls by less than a share of it, or no step is better at all.
+
+    The plan's `ending` says which; without a lower cost it has converged only if a whole step changes nothing either.
 
     Args:
         problem: to solve.
@@ -96,19 +113,26 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
     require_positive(iterations=iterations, tolerance=tolerance)
     plan = first_plan(problem, x, u)
 
-    def going(carry: tuple[Array, Plan, Array]) -> Array:
-        number, plan, fell = carry
+    def ending(number: Array, plan: Plan, fell: Array) -> Array:
+        flat = (jnp.abs(fell) <= tolerance * jnp.abs(plan.cost)) & (number > 0)
         hopeless = jnp.logical_not(plan.better) & (plan.damping >= MOST_DAMPING)
-        small = plan.better & (fell <= tolerance * jnp.abs(plan.cost))
-        return (number < iterations) & ~hopeless & ~(small & (number > 0))
+        outcomes = (
+            (~jnp.isfinite(plan.cost) & (number > 0), Ending.NOT_FINITE),
+            (flat, Ending.CONVERGED),
+            (hopeless, Ending.NO_DESCENT),
+            (number >= iterations, Ending.OUT_OF_ITERATIONS),
+        )
+        return jnp.select([is_so for is_so, _ in outcomes], [int(each) for _, each in outcomes], int(Ending.UNDECIDED))
 
     def iterate(carry: tuple[Array, Plan, Array]) -> tuple[Array, Plan, Array]:
         number, plan, _ = carry
-        found = improve(problem, plan)
-        return number + 1, found, plan.cost - found.cost
+        found, by_whole_step = _improved(problem, plan, STEP_LENGTHS)
+        fell = jnp.where(found.better, plan.cost - found.cost, by_whole_step)
+        return number + 1, found, fell
 
     start = (jnp.asarray(0), plan, jnp.asarray(jnp.inf, plan.u.dtype))
-    return jax.lax.while_loop(going, iterate, start)[1]
+    last = jax.lax.while_loop(lambda carry: ending(*carry) == Ending.UNDECIDED, iterate, start)
+    return last[1]._replace(ending=ending(*last))
 
 
 def receding(

@@ -62,6 +62,8 @@ class Trained(NamedTuple):
 class ValueRun:
     """A value function from its folder."""
 
+    name: str
+    """Of the plant."""
     plant: ValuePlant
     network: ValueNetwork
     parameters: Any
@@ -211,4 +213,4 @@ def load_value(folder: str | Path) -> ValueRun:
         return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
 
     like = jax.eval_shape(parameters, jax.random.key(0))
-    return ValueRun(plant, network, load_tree(folder, VALUE, like))
+    return ValueRun(facts["plant"], plant, network, load_tree(folder, VALUE, like))

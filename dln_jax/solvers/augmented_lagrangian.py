@@ -39,6 +39,8 @@ class Minimum(NamedTuple):
     """Largest g, 0 if none is positive."""
     rounds: int
     """Done."""
+    converged: bool
+    """Whether no constraint is broken by more than the tolerance and the value has settled."""
 
 
 def make_minimiser(
@@ -79,7 +81,7 @@ def make_minimiser(
 
         x, rho, last, before = np.asarray(x0, np.float64), penalty, np.inf, np.inf
         multipliers = np.zeros(jax.eval_shape(function, x, *arguments)[1].shape)
-        done, value, violation = 0, np.inf, np.inf
+        done, value, violation, settled = 0, np.inf, np.inf, False
         for done in range(1, rounds + 1):
 
             def objective(at: np.ndarray, mu: np.ndarray = multipliers, rho: float = rho) -> tuple[float, np.ndarray]:
@@ -91,11 +93,12 @@ def make_minimiser(
             x = minimize(objective, x, jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}).x
             value, constraints = (np.asarray(each) for each in evaluate(x, multipliers, rho, *arguments)[0][1])
             violation = float(np.max(constraints, initial=0.0))
-            if violation <= tolerance and abs(before - value) <= 1e-3 * max(1.0, abs(float(value))):
+            settled = violation <= tolerance and abs(before - value) <= 1e-3 * max(1.0, abs(float(value)))
+            if settled:
                 break
             multipliers = np.maximum(0.0, multipliers + rho * constraints)
             rho = rho * growth if violation > max(tolerance, last / 4) else rho
             last, before = violation, float(value)
-        return Minimum(x, float(value), violation, done)
+        return Minimum(x, float(value), violation, done, bool(settled))
 
     return minimise

@@ -25,6 +25,11 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, "--stored", tmp_path / "run", "--starts", "3", "--out", tmp_path / "again")
     again = json.loads((tmp_path / "again" / "metrics.json").read_text())
     assert again["down_return_mean"] == pytest.approx(numbers["down_return_mean"])
+    assert json.loads((tmp_path / "again" / "config.json").read_text())["plant"] == "pendulum"
+    for option, value in (("--plant", "cart-pole"), ("--goal", "0.1"), ("--seed", "3"), ("--method", "fitted")):
+        said = refused(capsys, train_value, "--stored", tmp_path / "run", option, value, "--out", tmp_path / "other")
+        assert f"{option} does not go with --stored" in said
+        assert not (tmp_path / "other").exists()
     assert "not empty" in refused(capsys, train_value, *TINY, "--out", tmp_path / "run")
 
 

@@ -11,6 +11,7 @@ from dln_jax.control import Problem, field_of, first_plan, improve, optimise, re
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.solvers.ending import reason
 from dln_jax.types import InputError
 
 RANDOM = np.random.default_rng(0)
@@ -47,6 +48,22 @@ def test_limits_hold_and_the_rest_is_stationary(most):
     assert np.abs(u).max() <= most and (np.abs(u) == most).any() and (np.abs(u) < most).any()
     np.testing.assert_allclose(slope[np.abs(u) < most], 0.0, atol=1e-6)
     assert (slope[u == most] < 0).all() and (slope[u == -most] > 0).all()
+
+
+def test_a_plan_says_why_it_ended():
+    u = np.zeros((N, 2))
+    found = optimise(LINEAR, START, u)
+    assert found.converged
+    again = optimise(LINEAR, START, found.u)
+    assert again.converged  # no cost is lower than the least
+    assert reason(optimise(LINEAR, START, u, iterations=1).ending).startswith("used up its iterations")
+    lost = optimise(LINEAR, START * np.nan, u)
+    assert not lost.converged
+    assert "not finite" in reason(lost.ending)
+    # Every slope points uphill: gradients of the wrong sign.
+    uphill = LINEAR._replace(final_cost=lambda x: 2 * x @ x + 100 * (x @ x - 2 * jax.lax.stop_gradient(x @ x)))
+    assert not optimise(uphill._replace(cost=lambda x, u: u @ u), START, 1 + u, iterations=30).converged
+    assert reason(improve(LINEAR, found).ending) == "has not ended: a single iteration cannot tell"
 
 
 def cart_pole_problem(dt):

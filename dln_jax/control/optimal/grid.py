@@ -23,13 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dln_jax.control.optimal.boxes import circles
 from dln_jax.control.optimal.flow import Flow, flow
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
-from dln_jax.solvers.ending import Ending, reason
+from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
 CONTROLS = 25
@@ -50,14 +50,9 @@ class GridValue(NamedTuple):
     """An `Ending`."""
 
     @property
-    def converged(self) -> bool:
-        """Whether `change` came within the tolerance."""
-        return int(self.ending) == Ending.CONVERGED
-
-    @property
-    def reason(self) -> str:
-        """Why the iteration on the last grid ended."""
-        return reason(self.ending)
+    def converged(self) -> Bool[Array, ""]:
+        """Whether `change` came within the tolerance; `solvers.ending.reason(found.ending)` says why not."""
+        return self.ending == Ending.CONVERGED
 
 
 def solve_on_grid(

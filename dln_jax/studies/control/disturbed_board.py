@@ -9,8 +9,8 @@ Numbers are those of the board's own program (`leaderboard/acrobot/robustness_v2
     the response k of the motor, u_k = u_{k-1} + k (wanted - u_{k-1}), 0.1 to 2
     the delay of all that is measured, 0 to 40 ms
 
-and 50 runs with six pushes each, drawn for both joints; the board's plant multiplies all torques by B, pushes too, so
-that those on the passive joint do nothing. Success is, as there, a last state near the goal. The criterion is the share of
+and 50 runs with six pushes each, drawn for both joints. The board's plant multiplies all torques by B, pushes too, so
+those on the passive joint do nothing. Success is, as there, a last state near the goal. The criterion is the share of
 successes, and the score the mean of the six.
 """
 

@@ -13,6 +13,7 @@ from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.grid import extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated, linear, one_sided_slopes, read
 from dln_jax.control.optimal.problem import ControlProblem, from_field
+from dln_jax.solvers.ending import reason
 from dln_jax.types import InputError
 
 A, B = np.array([[0.0, 1.0], [1.0, -0.2]]), np.array([[0.0], [1.0]])
@@ -116,7 +117,7 @@ def test_value_converges_where_it_has_ridges(of_weak_pendulum):
     _, found = of_weak_pendulum
     assert found.converged
     assert found.change <= 1e-7
-    assert found.reason == "converged within the tolerance"
+    assert reason(found.ending) == "converged within the tolerance"
 
 
 def test_no_policy_costs_less_than_the_value(of_weak_pendulum):
@@ -140,7 +141,7 @@ def test_policy_of_the_value_costs_what_the_value_says(of_weak_pendulum):
 def test_too_few_improvements_are_not_converged():
     found = solve_on_grid(LINEAR, (17,), low=[-3, -3], high=[3, 3], most=8.0, improvements=1)
     assert not found.converged
-    assert found.reason.startswith("used up its iterations")
+    assert reason(found.ending).startswith("used up its iterations")
 
 
 def test_a_step_and_its_cost():

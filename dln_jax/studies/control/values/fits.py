@@ -21,6 +21,7 @@ from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ValueAndGradient
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.figures.values import value_figure
+from dln_jax.solvers.ending import reason
 from dln_jax.studies.case import Findings
 from dln_jax.studies.control.values.evaluation import SECONDS, evaluate, starts
 from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
@@ -114,7 +115,7 @@ def pendulum(quick: bool) -> Findings:
             for quantity, of in (("median_relative_error", np.median), ("worst_relative_error", np.max))
         ),
         Row(case, "ridge_share", float(np.mean(ridge[counted]))),
-        expect(case, "grid_converged", fine.reason, float(fine.converged), 1.0, at_least=True),
+        expect(case, "grid_converged", reason(fine.ending), float(fine.converged), 1.0, at_least=True),
         Row(case, "grid_median_relative_extrapolation", float(np.median(_relative([before], truth)[:, counted]))),
         _of_grid(case, plant, fine),
         Row(case, "grid_value_hanging", float(interpolated(fine.grid, fine.V, jnp.array([np.pi, 0.0])))),

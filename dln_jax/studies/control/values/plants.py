@@ -45,7 +45,7 @@ class ValuePlant(NamedTuple):
     angle: int
     """Which coordinate is the pole's."""
     reference: dict[str, float]
-    """Mean returns of the published policies, re-run, from starts so close together that another draw changes little."""
+    """Mean returns of the published policies, re-run, from starts that hardly differ from draw to draw."""
     rest: float = 0.0
     """What the published costs have at the goal, in a second; the problem's are without."""
 
