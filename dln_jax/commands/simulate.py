@@ -200,8 +200,7 @@ def run_motion(prepared: Prepared) -> Motion:
     start = state = in_precision(init(), data_type(given.precision))
 
     def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
-        # Whether the Hessian is definite is not asked for: it would cost a factorisation.
-        return state.x, state.v, info._replace(definite=None)
+        return state.x, state.v, info
 
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
         return rollout(functools.partial(step, params), state, driven, observe=observe)

@@ -101,6 +101,7 @@ def make_step(
     tolerance: float = TOLERANCE,
     iterations: int = 100,
     linear_solver: LinearSolverFactory = by_size,
+    definite: bool = False,
 ) -> Stepper:
     """(init, step) of a scene.
 
@@ -111,6 +112,7 @@ def make_step(
         tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
         iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
         linear_solver: how linear systems are solved; by size unless said.
+        definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
 
     Raises:
         InputError: a number that is not positive.
@@ -119,7 +121,7 @@ def make_step(
         require_positive(dt=dt)
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
-    solve = partial(minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver)
+    solve = partial(minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver, definite=definite)
     at = pattern(energies, free.shape[0], free.shape[1], free)
 
     def init(x: Any = None, v: Any = None) -> State:
@@ -162,6 +164,7 @@ def static_solve(
     tolerance: float = TOLERANCE,
     iterations: int = 200,
     linear_solver: LinearSolverFactory = by_size,
+    definite: bool = False,
 ) -> tuple[Float[Array, "n dim"], Info]:
     """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
 
@@ -170,12 +173,13 @@ def static_solve(
         params: of the scene.
         control: actuation, for scenes that have one.
         x: where the search starts; held vertices stay there.
-        tolerance, iterations, linear_solver: as of `make_step`.
+        tolerance, iterations, linear_solver, definite: as of `make_step`.
     """
     x = params.rest if x is None else x
     data = prepare(scene, params, x, control=control)
-    limits: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
-    return minimise(element_energies(scene), x, data, free=scene.free, scale=params.masses, **limits)
+    options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
+    options |= {"free": scene.free, "scale": params.masses, "definite": definite}
+    return minimise(element_energies(scene), x, data, **options)
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

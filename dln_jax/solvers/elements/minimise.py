@@ -59,6 +59,7 @@ def minimise(
     iterations: int = 100,
     linear_solver: LinearSolverFactory = by_size,
     at: Pattern | None = None,
+    definite: bool = False,
 ) -> tuple[Blocks, Info]:
     """x [n, b] at which the sum of the energies is least, near x0, with how the search ended.
 
@@ -75,6 +76,7 @@ def minimise(
         iterations: Newton steps after which the search gives up, which `Info.converged` reports.
         linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
         at: the energies' pattern, if it is at hand; made here otherwise.
+        definite: also report `Info.definite`, which costs another Hessian, factorisation and solve to full accuracy.
 
     Raises:
         InputError: indices, shapes or numbers that do not fit.
@@ -93,6 +95,8 @@ def minimise(
     @jax.custom_jvp
     def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
         x, info = _newton(total, x0, data, scale, tolerance, iterations)
+        if not definite:
+            return x, info
         # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
         solved = total.solver.solve(_factor(total, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
