@@ -39,7 +39,7 @@ from dln_jax.softbody.mesh.mesh import overlaps
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 from dln_jax.studies.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder

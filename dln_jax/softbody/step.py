@@ -16,17 +16,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
+from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, Motion, energy_balance, least_J, trusted
 from dln_jax.solvers.elements.assembly import pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
 from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.newton import Info
+from dln_jax.solvers.newton import Info as SolverInfo
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[[Params, State, Any], tuple[State, Info]]
@@ -121,7 +123,9 @@ def make_step(
         require_positive(dt=dt)
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
-    solve = partial(minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver, definite=definite)
+    solve = partial(
+        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver, definite=definite
+    )
     at = pattern(energies, free.shape[0], free.shape[1], free)
 
     def init(x: Any = None, v: Any = None) -> State:
@@ -142,10 +146,25 @@ def make_step(
         # The better of two starts: where the body is, or where it would be without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
-        x, info = solve(energies, start, data, scale=params.masses, at=at)
-        x, v = integrator.finish(state, x, dt)
+        balanced, found = solve(energies, start, data, scale=params.masses, at=at)
+        x, v = integrator.finish(state, balanced, dt)
+        x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
+        info = judged(params, state, x, v, (balanced, found, data[1:]))
+        x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
-        return State(jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v), before), info
+        return State(x, v, before), info
+
+    def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any]) -> Info:
+        # The verdict has no derivatives.
+        params, state, x, v, (balanced, found, data) = jax.lax.stop_gradient((params, state, x, v, solution))
+        motion = Motion((state.x, x), (state.v, v), balanced)
+        growth, at_hand = energy_balance(scene, energies[1:], params.masses, data, motion, found)
+        info = _of_positions(scene, params, x, found)
+        return info._replace(
+            converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
+            energy_growth=growth,
+            energy_at_hand=at_hand,
+        )
 
     return Stepper(init, step)
 
@@ -179,7 +198,16 @@ def static_solve(
     data = prepare(scene, params, x, control=control)
     options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
     options |= {"free": scene.free, "scale": params.masses, "definite": definite}
-    return minimise(element_energies(scene), x, data, **options)
+    x, found = minimise(element_energies(scene), x, data, **options)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)))
+    return trusted(x, info.converged), info
+
+
+def _of_positions(scene: SoftScene, params: Params, x: Array, found: SolverInfo) -> Info:
+    """The solver's verdict, and that of the positions: no element is inverted."""
+    least = least_J(scene, params, x)
+    upright = True if least is None else least > 0
+    return Info(found.residual, found.iterations, found.converged & upright, found.definite, least_J=least)
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

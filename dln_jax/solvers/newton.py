@@ -35,6 +35,8 @@ class Info(NamedTuple):
     finite."""
     definite: Bool[Array, ""] | None = None
     """Whether the Hessian at a minimum is positive definite, so that the point is no saddle; `None` unless asked for."""
+    energy_noise: Float[Array, ""] | None = None
+    """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
 
 
 class _State(NamedTuple):

@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.creatures import body_length, crawler
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 from dln_jax.types import InputError
 
 
@@ -146,10 +146,18 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     numbers = np.ones(3)
     x = np.zeros((4, 3, 2))
     x[3, 0, 0] = np.nan
-    motion = Motion(np.arange(4.0), x, np.zeros_like(x), Info(numbers, numbers, converged, converged), 1.0, 1.0)
+    info = Info(numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, least_J=numbers)
+    motion = Motion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
     assert finite_moments(motion) == 3
     warn(motion)
     said = capsys.readouterr().out
+    assert "diverged" not in said and "inside out" not in said
+    warn(
+        motion._replace(info=info._replace(energy_growth=np.array([-1.0, 0.5, np.nan]), least_J=np.array([1, -0.1, 1])))
+    )
+    worse = capsys.readouterr().out
+    assert "2 of 3 steps diverged: they created energy, the first at t = 2 s" in worse
+    assert "1 of 3 steps turned elements inside out, the first at t = 2 s" in worse and "did not converge" not in worse
     assert "1 of 3 steps did not converge, the first at t = 2 s" in said and "not finite from t = 3 s" in said
 
 

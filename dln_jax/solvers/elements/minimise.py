@@ -44,6 +44,7 @@ class _Sum(NamedTuple):
 class _State(NamedTuple):
     point: Point
     floor: Blocks
+    unclear: Float[Array, ""]
     iterations: Int[Array, ""]
     stuck: Bool[Array, ""]
 
@@ -187,13 +188,14 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
         point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
-        return _State(point, floor, state.iterations + 1, ~accepted)
+        return _State(point, floor, unclear, state.iterations + 1, ~accepted)
 
-    start = _State(Point(x0, *evaluate(x0)), jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
+    first = Point(x0, *evaluate(x0))
+    start = _State(first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False))
     last = jax.lax.while_loop(running, iterate, start)
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)
-    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy))
+    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy), None, last.unclear)
 
 
 def _descent_direction(total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks) -> Blocks:
