@@ -86,8 +86,9 @@ def warn(motion: Motion) -> None:
     )
     for missed, what, remedy in reasons:
         if missed.any():
+            first = motion.t[np.argmax(missed) + 1]
             print(
-                f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {motion.t[np.argmax(missed) + 1]:.4g} s: "
+                f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {first:.4g} s: "
                 f"the motion is not to be trusted from there; {remedy}"
             )
     if (finite := finite_moments(motion)) < len(motion.t):

@@ -5,8 +5,8 @@ while the forces of every step are balanced. Over one step,
 
     growth = (T + V)' - (T + V) - W,    at hand = T + max(V - V', 0) + |W|
 
-with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact of
-this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
+with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact
+of this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
 `LARGEST_GROWTH` of the energy at hand has diverged.
 """
 
@@ -24,8 +24,8 @@ from dln_jax.solvers.elements.energies import ElementEnergy, value
 from dln_jax.solvers.newton import Info as SolverInfo
 
 LARGEST_GROWTH = 0.1
-"""Share of the energy at hand. The example scenes stay below 0.01 with backward Euler and BDF2, and smooth motions below
-1e-4 with the midpoint rule; contact that the midpoint rule does not resolve gives 0.1 to 5 before it explodes."""
+"""Share of the energy at hand. The example scenes stay below 0.01 with backward Euler and BDF2, and smooth motions
+below 1e-4 with the midpoint rule; contact that the midpoint rule does not resolve gives 0.1 to 5 before it explodes."""
 
 
 class Info(NamedTuple):

@@ -34,7 +34,7 @@ class Info(NamedTuple):
     """Whether the residual is within the tolerance or at the level of rounding; false for values that are not
     finite."""
     definite: Bool[Array, ""] | None = None
-    """Whether the Hessian at a minimum is positive definite, so that the point is no saddle; `None` unless asked for."""
+    """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless asked for."""
     energy_noise: Float[Array, ""] | None = None
     """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
 

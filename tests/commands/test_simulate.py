@@ -182,7 +182,19 @@ def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     assert (tmp_path / "run" / "motion.gif").read_bytes().startswith(b"GIF")
     shown = capsys.readouterr().out
     assert "steps per second" in shown and "warning" not in shown
+    assert "beam: 6 vertices, 5 elements in 1 component, 2 x 1 m, 8 unknowns" in shown
     assert "of 5 elements were inverted and have been turned" in shown and "elements overlap at" in shown
+
+
+def test_components_and_size_are_printed_and_millimetres_are_warned_of(tmp_path, capsys):
+    mesh = beam_mesh(30.0, 10.0, 2, 1)
+    vertices = np.concatenate([mesh.vertices, mesh.vertices + np.array([0.0, 20.0])])
+    np.savez(tmp_path / "mesh.npz", vertices=vertices, elements=np.concatenate([mesh.elements, mesh.elements + 6]))
+    options = ("--mesh", tmp_path / "mesh.npz", "--seconds", "0.02", "--dt", "0.01", "--no-figures")
+    command(simulate, "--scene", "beam", *options, "--out", tmp_path / "run")
+    shown = capsys.readouterr().out
+    assert "12 vertices, 8 elements in 2 components, 30 x 30 m" in shown
+    assert "warning: the body is 30 m long" in shown and "divide its vertices by 1000" in shown
 
 
 def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys):
