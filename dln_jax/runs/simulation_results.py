@@ -56,6 +56,8 @@ def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
         ("smallest_volume_ratio", float(ratios.min()), "1", None),
         ("energy_created_J", float(info.energy_growth.sum()), "J", None),
     )
+    if info.overlaps is not None:
+        numbers += (("overlapping_components_max", float(info.overlaps.max()), "1", None),)
     return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
 
 
@@ -91,6 +93,12 @@ def warn(motion: Motion) -> None:
                 f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {first:.4g} s: "
                 f"the motion is not to be trusted from there; {remedy}"
             )
+    if info.overlaps is not None and (meeting := info.overlaps > 0).any():
+        first = motion.t[np.argmax(meeting) + 1]
+        print(
+            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {info.overlaps.max()} pairs), first "
+            f"at t = {first:.4g} s: there is no contact between bodies, and they pass through each other"
+        )
     if (finite := finite_moments(motion)) < len(motion.t):
         print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
 

@@ -22,6 +22,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
 from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, Motion, energy_balance, least_J, trusted
 from dln_jax.solvers.elements.assembly import pattern
@@ -127,6 +128,7 @@ def make_step(
         minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver, definite=definite
     )
     at = pattern(energies, free.shape[0], free.shape[1], free)
+    overlaps = count_overlaps(scene.mesh)
 
     def init(x: Any = None, v: Any = None) -> State:
         given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
@@ -159,7 +161,7 @@ def make_step(
         params, state, x, v, (balanced, found, data) = jax.lax.stop_gradient((params, state, x, v, solution))
         motion = Motion((state.x, x), (state.v, v), balanced)
         growth, at_hand = energy_balance(scene, energies[1:], params.masses, data, motion, found)
-        info = _of_positions(scene, params, x, found)
+        info = _of_positions(scene, params, x, found, overlaps)
         return info._replace(
             converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
             energy_growth=growth,
@@ -199,15 +201,20 @@ def static_solve(
     options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
     options |= {"free": scene.free, "scale": params.masses, "definite": definite}
     x, found = minimise(element_energies(scene), x, data, **options)
-    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)))
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)), count_overlaps(scene.mesh))
     return trusted(x, info.converged), info
 
 
-def _of_positions(scene: SoftScene, params: Params, x: Array, found: SolverInfo) -> Info:
+def _of_positions(
+    scene: SoftScene, params: Params, x: Array, found: SolverInfo, overlaps: Callable[[Array], Array] | None
+) -> Info:
     """The solver's verdict, and that of the positions: no element is inverted."""
     least = least_J(scene, params, x)
     upright = True if least is None else least > 0
-    return Info(found.residual, found.iterations, found.converged & upright, found.definite, least_J=least)
+    pairs = None if overlaps is None else overlaps(x)
+    return Info(
+        found.residual, found.iterations, found.converged & upright, found.definite, least_J=least, overlaps=pairs
+    )
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

@@ -48,6 +48,9 @@ class Info(NamedTuple):
     least_J: Float[Array, ""] | None = None
     """Least ratio of an element's volume to its volume at rest, over the elements that resist deformation; `None` where
     there are none."""
+    overlaps: Int[Array, ""] | None = None
+    """Pairs of components of the mesh that overlap: there is no contact between bodies, and they pass through
+    each other. `None` for a mesh of one component. Does not count against `converged`."""
 
 
 class Motion(NamedTuple):

@@ -157,6 +157,8 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     )
     worse = capsys.readouterr().out
     assert "2 of 3 steps diverged: they created energy, the first at t = 2 s" in worse
+    warn(motion._replace(info=info._replace(overlaps=np.array([0, 2, 1]))))
+    assert "components overlap in 2 of 3 steps (up to 2 pairs), first at t = 2 s" in capsys.readouterr().out
     assert "1 of 3 steps turned elements inside out, the first at t = 2 s" in worse and "did not converge" not in worse
     assert "1 of 3 steps did not converge, the first at t = 2 s" in said and "not finite from t = 3 s" in said
 

@@ -281,6 +281,34 @@ def test_work_of_held_vertices_is_not_growth():
     assert (abs(info.energy_growth) < 0.05 * info.energy_at_hand).all()
 
 
+def two_blocks(gap):
+    """Two squares above each other, the lower one held."""
+    square = beam(1.0, 1.0, 2, 2)
+    above = square.vertices + np.array([0.0, 1.0 + gap])
+    n = len(square.vertices)
+    mesh = make_mesh(np.concatenate([square.vertices, above]), np.concatenate([square.elements, square.elements + n]))
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5)
+    return make_scene(mesh, (solid, gravity(mesh)), held=np.arange(n))
+
+
+def test_bodies_that_pass_through_each_other_are_counted():
+    scene = two_blocks(gap=0.1)
+    init, step = make_step(scene, DT)
+    advance = functools.partial(step, scene.params)
+    run = jax.jit(
+        lambda state: rollout(advance, state, steps=12, observe=lambda state, info: (state.x, info.overlaps))[1]
+    )
+    x, overlaps = run(init())
+    lowest = np.asarray(x)[:, 9:, 1].min(axis=1)
+    np.testing.assert_array_equal(overlaps, (lowest < 1.0).astype(int))
+    assert 0 < overlaps.sum() < 12 and lowest[-1] < 0.0
+    # One component: nothing of it is traced.
+    assert jax.eval_shape(stepper().step, held_body().params, stepper().init())[1].overlaps is None
+    # Derivatives pass by it.
+    slope = jax.jit(jax.grad(lambda v: rollout(advance, init(v=v), steps=12)[0].x[-1, 1]))(jnp.zeros(2))
+    np.testing.assert_allclose(slope, [0.0, 12 * DT], atol=1e-9)
+
+
 def test_what_resists_no_deformation_has_no_least_J():
     scene = make_scene(MESH, (springs([[0, 2], [1, 3]], stiffness=200.0),), masses=1.5, held=[0, 1])
     init, step = make_step(scene, DT)

@@ -22,8 +22,8 @@ _CLUSTER = 16
 def count_overlaps(mesh: Mesh) -> Callable[[Float[Array, "n dim"]], Int[Array, ""]] | None:
     """Positions -> number of pairs of components that overlap; `None` for a mesh of one component.
 
-    Components that only touch, to a depth of sqrt(eps) of the larger element, do not overlap. The work is that of bounding
-    boxes of clusters of elements, and of pairs of elements only where boxes of two components meet.
+    Components that only touch, to a depth of sqrt(eps) of the larger element, do not overlap. Elements are compared in
+    pairs only where the bounding boxes of their clusters meet.
     """
     labels = components(mesh)
     if labels.max(initial=0) == 0:
