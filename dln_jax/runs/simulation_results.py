@@ -96,8 +96,8 @@ def warn(motion: Motion) -> None:
     if info.overlaps is not None and (meeting := info.overlaps > 0).any():
         first = motion.t[np.argmax(meeting) + 1]
         print(
-            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {info.overlaps.max()} pairs), first "
-            f"at t = {first:.4g} s: there is no contact between bodies, and they pass through each other"
+            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {info.overlaps.max()} pairs), "
+            f"first at t = {first:.4g} s: there is no contact between bodies, and they pass through each other"
         )
     if (finite := finite_moments(motion)) < len(motion.t):
         print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")

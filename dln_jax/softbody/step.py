@@ -12,7 +12,7 @@ Backward Euler is of first order and damps; bdf2 is of second order and damps li
 order and does not damp, so that it is for smooth motions.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,9 +25,9 @@ from jaxtyping import Array, Float
 from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
 from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, Motion, energy_balance, least_J, trusted
-from dln_jax.solvers.elements.assembly import pattern
+from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size, by_stiffness
 from dln_jax.solvers.elements.minimise import minimise
 from dln_jax.solvers.newton import Info as SolverInfo
 from dln_jax.types import InputError, require_positive
@@ -103,7 +103,7 @@ def make_step(
     *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,
-    linear_solver: LinearSolverFactory = by_size,
+    linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
 ) -> Stepper:
     """(init, step) of a scene.
@@ -114,7 +114,9 @@ def make_step(
         integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or one's own.
         tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
         iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
-        linear_solver: how linear systems are solved; by size unless said.
+        linear_solver: how linear systems are solved; by default the way of least work for the stiffness in
+            `scene.params` and this time step (`by_size` where either is traced, or a term needs a control to be
+            prepared). Other parameters given to the step later do not change the choice.
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
 
     Raises:
@@ -124,11 +126,17 @@ def make_step(
         require_positive(dt=dt)
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
-    solve = partial(
-        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver, definite=definite
-    )
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = count_overlaps(scene.mesh)
+    rest, masses = scene.params.rest, scene.params.masses
+    known = _known(
+        (scene.params, dt),
+        lambda: ((masses / (integrator.span * dt) ** 2, rest), *prepare(scene, scene.params, rest, dt=dt)),
+    )
+    chosen = _linear_solver(linear_solver, energies, at, rest, known)
+    solve = partial(
+        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite
+    )
 
     def init(x: Any = None, v: Any = None) -> State:
         given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
@@ -184,7 +192,7 @@ def static_solve(
     x: Any = None,
     tolerance: float = TOLERANCE,
     iterations: int = 200,
-    linear_solver: LinearSolverFactory = by_size,
+    linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
 ) -> tuple[Float[Array, "n dim"], Info]:
     """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
@@ -198,11 +206,36 @@ def static_solve(
     """
     x = params.rest if x is None else x
     data = prepare(scene, params, x, control=control)
-    options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
+    energies, shape = element_energies(scene), scene.mesh.vertices.shape
+    at = pattern(energies, *shape, scene.free)
+    known = _known((params, x, control), lambda: data)
+    chosen = _linear_solver(linear_solver, energies, at, x, known)
+    options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": chosen, "at": at}
     options |= {"free": scene.free, "scale": params.masses, "definite": definite}
-    x, found = minimise(element_energies(scene), x, data, **options)
+    x, found = minimise(energies, x, data, **options)
     info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)), count_overlaps(scene.mesh))
     return trusted(x, info.converged), info
+
+
+def _known(values: Any, data: Callable[[], Any]) -> Any | None:
+    """Data of the elements, or `None` where a value is traced or a control is missing."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+        return None
+    try:
+        with jax.ensure_compile_time_eval():
+            return data()
+    except InputError:
+        return None
+
+
+def _linear_solver(
+    given: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
+) -> LinearSolverFactory:
+    """The linear solver given, or else the one of least work, found once."""
+    if given is not None:
+        return given
+    solver = by_size(energies, at) if data is None else by_stiffness(energies, at, x=x, data=data)
+    return lambda *_: solver
 
 
 def _of_positions(
