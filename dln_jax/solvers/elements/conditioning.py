@@ -24,8 +24,7 @@ def search_takes_at_most(
 ) -> bool:
     """Whether conjugate gradients with a block-Jacobi preconditioner solve with the Hessian at x in so many products.
 
-    Tried on a uniform and on a random right-hand side, to a relative residual. False where the Hessian is not positive
-    definite. Compiles one product of an element's Hessian.
+    Tried on a uniform and on a random right-hand side. Compiles one product of an element's Hessian.
 
     Args:
         products: the limit, which also bounds the work.
@@ -41,7 +40,7 @@ def search_takes_at_most(
 def _solved(hessian: csr_array, inverse: csr_array, b: np.ndarray, products: int, residual: float) -> bool:
     precondition = LinearOperator(hessian.shape, matvec=lambda r: inverse @ r, dtype=float)
     x, status = cg(hessian, b, rtol=residual, maxiter=products, M=precondition)
-    return status == 0 and bool(np.isfinite(x).all()) and x @ (hessian @ x) > 0
+    return status == 0 and bool(np.isfinite(x).all())
 
 
 def _hessian(

@@ -92,9 +92,9 @@ def least_work(
 ) -> LinearSolverFactory:
     """`dense`, `block_tridiagonal` or `matrix_free`: the least work by estimates of a factorisation and of products.
 
-    `search_takes_at_most` tells whether a search direction takes at most this many products; it is asked only where size
-    and structure leave the choice open. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer or nearly
-    incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
+    `search_takes_at_most` tells whether a search direction takes at most this many products; it is asked only where
+    size and structure leave the choice open. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer or
+    nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
     `matrix_free`.
     """
     if at.unknowns <= _DENSE_UNKNOWNS:
