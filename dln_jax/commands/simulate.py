@@ -35,11 +35,11 @@ from dln_jax.runs.results import print_numbers
 from dln_jax.runs.simulation_results import Motion, draw, line, results, warn
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
-from dln_jax.softbody.mesh.mesh import overlaps
+from dln_jax.softbody.mesh.mesh import components, overlaps
 from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 from dln_jax.studies.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder
@@ -51,6 +51,8 @@ MATERIALS = {
 FACETS = {2: "edges", 3: "triangles"}
 CHUNKS = 20
 """Programs called for a motion, after each of which progress is shown."""
+LARGEST_SIZE = 10.0
+"""Length in m above which a mesh is probably in millimetres."""
 ALL = "all"
 GALLERY = (0, 3, 2, 1, 4)
 """Order of the scenes in the picture of all."""
@@ -133,10 +135,17 @@ def simulate(prepared: Prepared, folder: Path) -> Moments:
     given, example, _, dt, steps = prepared
     write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
+    pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
     print(
-        f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements, "
+        f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements in {pieces} "
+        f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
         f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
     )
+    if size.max() > LARGEST_SIZE:
+        print(
+            f"warning: the body is {size.max():.4g} m long; expected lengths in metres: if the mesh is in millimetres, "
+            "divide its vertices by 1000"
+        )
     if mesh.turned:
         print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
     if count := len(overlaps(mesh)):
@@ -200,8 +209,7 @@ def run_motion(prepared: Prepared) -> Motion:
     start = state = in_precision(init(), data_type(given.precision))
 
     def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
-        # Whether the Hessian is definite is not asked for: it would cost a factorisation.
-        return state.x, state.v, info._replace(definite=None)
+        return state.x, state.v, info
 
     def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
         return rollout(functools.partial(step, params), state, driven, observe=observe)

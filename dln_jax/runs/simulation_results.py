@@ -1,6 +1,7 @@
 """What `simulate` shows of a motion: numbers, warnings, figures and the GIF."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh.mesh import Mesh, volumes
 from dln_jax.softbody.mesh.simplices import simplex_volumes
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import LARGEST_GROWTH, Info
 from dln_jax.studies.report import Row
 
 TITLES = {
@@ -53,11 +54,18 @@ def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
         ("steps", float(len(info.converged)), "1", None),
         ("steps_not_converged", float((~info.converged).sum()), "1", 0.0),
         ("smallest_volume_ratio", float(ratios.min()), "1", None),
+        ("energy_created_J", float(info.energy_growth.sum()), "J", None),
     )
+    if info.overlaps is not None:
+        numbers += (("overlapping_components_max", float(info.overlaps.max()), "1", None),)
     return [Row(scene, name, value, unit, bound=bound) for name, value, unit, bound in numbers]
 
 
-LABELS = {"worst_residual_m_per_s2": "worst residual", "smallest_volume_ratio": "smallest J = volume / rest volume"}
+LABELS = {
+    "worst_residual_m_per_s2": "worst residual",
+    "smallest_volume_ratio": "smallest J = volume / rest volume",
+    "energy_created_J": "energy created by the time step (damped where negative)",
+}
 """Of numbers that do not say it themselves."""
 
 
@@ -69,14 +77,34 @@ def line(row: Row) -> tuple[str, str, str]:
 
 def warn(motion: Motion) -> None:
     """Says what is not as it should be."""
-    missed = np.flatnonzero(~motion.info.converged)
-    if missed.size:
+    info, steps = motion.info, len(motion.t) - 1
+    diverged = _flags(info.energy_growth, lambda growth: ~(growth <= LARGEST_GROWTH * info.energy_at_hand))
+    inverted = _flags(info.least_J, lambda least: ~(least > 0))
+    unbalanced = ~info.converged & ~diverged & ~inverted
+    reasons = (
+        (unbalanced, "did not converge", "try a shorter --dt"),
+        (diverged, "diverged: they created energy", "try a shorter --dt or --integrator backward-euler"),
+        (inverted, "turned elements inside out", "try a shorter --dt, a stiffer material or a slower motion"),
+    )
+    for missed, what, remedy in reasons:
+        if missed.any():
+            first = motion.t[np.argmax(missed) + 1]
+            print(
+                f"warning: {missed.sum()} of {steps} steps {what}, the first at t = {first:.4g} s: "
+                f"the motion is not to be trusted from there; {remedy}"
+            )
+    if info.overlaps is not None and (meeting := info.overlaps > 0).any():
+        first = motion.t[np.argmax(meeting) + 1]
         print(
-            f"warning: {missed.size} of {len(motion.t) - 1} steps did not converge, the first at "
-            f"t = {motion.t[missed[0] + 1]:.4g} s: the motion is not to be trusted from there; try a shorter --dt"
+            f"warning: components overlap in {meeting.sum()} of {steps} steps (up to {info.overlaps.max()} pairs), "
+            f"first at t = {first:.4g} s: there is no contact between bodies, and they pass through each other"
         )
     if (finite := finite_moments(motion)) < len(motion.t):
         print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
+
+
+def _flags(values: np.ndarray | None, wrong: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | bool:
+    return False if values is None else wrong(values)
 
 
 def finite_moments(motion: Motion) -> int:

@@ -16,6 +16,7 @@ from dln_jax.softbody.step import (
     positions_and_convergence,
     static_solve,
 )
+from dln_jax.softbody.verdict import Info
 
 __all__ = [
     "BACKWARD_EULER",
@@ -23,6 +24,7 @@ __all__ = [
     "MIDPOINT",
     "Drive",
     "Example",
+    "Info",
     "Integrator",
     "Params",
     "SoftScene",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from dln_jax.softbody.scene import Params, SoftScene, State
 from dln_jax.softbody.step import BACKWARD_EULER, Integrator, Stepper, make_step
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 
 
 class Example(NamedTuple):

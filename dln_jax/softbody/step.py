@@ -12,21 +12,24 @@ Backward Euler is of first order and damps; bdf2 is of second order and damps li
 order and does not damp, so that it is for smooth motions.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from dln_jax.softbody.mesh.intersections import count_overlaps
 from dln_jax.softbody.scene import Params, Previous, SoftScene, State, element_energies, prepare
-from dln_jax.solvers.elements.assembly import pattern
+from dln_jax.softbody.verdict import LARGEST_GROWTH, Info, Motion, energy_balance, least_J, trusted
+from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import Corners, ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size
+from dln_jax.solvers.elements.linear_solvers import LinearSolverFactory, by_size, by_stiffness
 from dln_jax.solvers.elements.minimise import minimise
-from dln_jax.solvers.newton import Info
+from dln_jax.solvers.newton import Info as SolverInfo
 from dln_jax.types import InputError, require_positive
 
 Step = Callable[[Params, State, Any], tuple[State, Info]]
@@ -100,7 +103,8 @@ def make_step(
     *,
     tolerance: float = TOLERANCE,
     iterations: int = 100,
-    linear_solver: LinearSolverFactory = by_size,
+    linear_solver: LinearSolverFactory | None = None,
+    definite: bool = False,
 ) -> Stepper:
     """(init, step) of a scene.
 
@@ -110,7 +114,10 @@ def make_step(
         integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or one's own.
         tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
         iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
-        linear_solver: how linear systems are solved; by size unless said.
+        linear_solver: how linear systems are solved; by default the way of least work for the stiffness in
+            `scene.params` and this time step (`by_size` where either is traced, or a term needs a control to be
+            prepared). Other parameters given to the step later do not change the choice.
+        definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
 
     Raises:
         InputError: a number that is not positive.
@@ -119,8 +126,17 @@ def make_step(
         require_positive(dt=dt)
     free = scene.free
     energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
-    solve = partial(minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=linear_solver)
     at = pattern(energies, free.shape[0], free.shape[1], free)
+    overlaps = count_overlaps(scene.mesh)
+    rest, masses = scene.params.rest, scene.params.masses
+    known = _known(
+        (scene.params, dt),
+        lambda: ((masses / (integrator.span * dt) ** 2, rest), *prepare(scene, scene.params, rest, dt=dt)),
+    )
+    chosen = _linear_solver(linear_solver, energies, at, rest, known)
+    solve = partial(
+        minimise, free=free, tolerance=tolerance, iterations=iterations, linear_solver=chosen, definite=definite
+    )
 
     def init(x: Any = None, v: Any = None) -> State:
         given = {"x": scene.mesh.vertices if x is None else x, "v": 0.0 if v is None else v}
@@ -140,10 +156,25 @@ def make_step(
         # The better of two starts: where the body is, or where it would be without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
-        x, info = solve(energies, start, data, scale=params.masses, at=at)
-        x, v = integrator.finish(state, x, dt)
+        balanced, found = solve(energies, start, data, scale=params.masses, at=at)
+        x, v = integrator.finish(state, balanced, dt)
+        x, v = jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v)
+        info = judged(params, state, x, v, (balanced, found, data[1:]))
+        x, v = trusted((x, v), info.converged)
         before = Previous(state.x, state.v, jnp.asarray(True)) if integrator.two_steps else None
-        return State(jnp.where(free, x, state.x + dt * state.v), jnp.where(free, v, state.v), before), info
+        return State(x, v, before), info
+
+    def judged(params: Params, state: State, x: Array, v: Array, solution: tuple[Array, SolverInfo, Any]) -> Info:
+        # The verdict has no derivatives.
+        params, state, x, v, (balanced, found, data) = jax.lax.stop_gradient((params, state, x, v, solution))
+        motion = Motion((state.x, x), (state.v, v), balanced)
+        growth, at_hand = energy_balance(scene, energies[1:], params.masses, data, motion, found)
+        info = _of_positions(scene, params, x, found, overlaps)
+        return info._replace(
+            converged=info.converged & (growth <= LARGEST_GROWTH * at_hand),
+            energy_growth=growth,
+            energy_at_hand=at_hand,
+        )
 
     return Stepper(init, step)
 
@@ -161,7 +192,8 @@ def static_solve(
     x: Any = None,
     tolerance: float = TOLERANCE,
     iterations: int = 200,
-    linear_solver: LinearSolverFactory = by_size,
+    linear_solver: LinearSolverFactory | None = None,
+    definite: bool = False,
 ) -> tuple[Float[Array, "n dim"], Info]:
     """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
 
@@ -170,12 +202,52 @@ def static_solve(
         params: of the scene.
         control: actuation, for scenes that have one.
         x: where the search starts; held vertices stay there.
-        tolerance, iterations, linear_solver: as of `make_step`.
+        tolerance, iterations, linear_solver, definite: as of `make_step`.
     """
     x = params.rest if x is None else x
     data = prepare(scene, params, x, control=control)
-    limits: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": linear_solver}
-    return minimise(element_energies(scene), x, data, free=scene.free, scale=params.masses, **limits)
+    energies, shape = element_energies(scene), scene.mesh.vertices.shape
+    at = pattern(energies, *shape, scene.free)
+    known = _known((params, x, control), lambda: data)
+    chosen = _linear_solver(linear_solver, energies, at, x, known)
+    options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": chosen, "at": at}
+    options |= {"free": scene.free, "scale": params.masses, "definite": definite}
+    x, found = minimise(energies, x, data, **options)
+    info = _of_positions(scene, *jax.lax.stop_gradient((params, x, found)), count_overlaps(scene.mesh))
+    return trusted(x, info.converged), info
+
+
+def _known(values: Any, data: Callable[[], Any]) -> Any | None:
+    """Data of the elements, or `None` where a value is traced or a control is missing."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+        return None
+    try:
+        with jax.ensure_compile_time_eval():
+            return data()
+    except InputError:
+        return None
+
+
+def _linear_solver(
+    given: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
+) -> LinearSolverFactory:
+    """The linear solver given, or else the one of least work, found once."""
+    if given is not None:
+        return given
+    solver = by_size(energies, at) if data is None else by_stiffness(energies, at, x=x, data=data)
+    return lambda *_: solver
+
+
+def _of_positions(
+    scene: SoftScene, params: Params, x: Array, found: SolverInfo, overlaps: Callable[[Array], Array] | None
+) -> Info:
+    """The solver's verdict, and that of the positions: no element is inverted."""
+    least = least_J(scene, params, x)
+    upright = True if least is None else least > 0
+    pairs = None if overlaps is None else overlaps(x)
+    return Info(
+        found.residual, found.iterations, found.converged & upright, found.definite, least_J=least, overlaps=pairs
+    )
 
 
 def _inertia(x: Corners, weight_and_target: tuple[Array, Array]) -> Float[Array, ""]:

@@ -34,8 +34,9 @@ class Info(NamedTuple):
     """Whether the residual is within the tolerance or at the level of rounding; false for values that are not
     finite."""
     definite: Bool[Array, ""] | None = None
-    """Of a minimum: whether the Hessian there, as it is, is positive definite, so that it is no saddle. Costs a
-    factorisation, which is left out of the program where this is not used."""
+    """Whether the Hessian at a minimum is positive definite (no saddle); `None` unless asked for."""
+    energy_noise: Float[Array, ""] | None = None
+    """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
 
 
 class _State(NamedTuple):

@@ -23,7 +23,7 @@ from dln_jax.softbody.mesh.creatures import body_length, crawler
 from dln_jax.softbody.mesh.shapes import beam as beam_mesh
 from dln_jax.softbody.scene import potential, with_parameters
 from dln_jax.softbody.step import BACKWARD_EULER, BDF2
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 from dln_jax.types import InputError
 
 
@@ -146,10 +146,20 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     numbers = np.ones(3)
     x = np.zeros((4, 3, 2))
     x[3, 0, 0] = np.nan
-    motion = Motion(np.arange(4.0), x, np.zeros_like(x), Info(numbers, numbers, converged, converged), 1.0, 1.0)
+    info = Info(numbers, numbers, converged, energy_growth=-numbers, energy_at_hand=numbers, least_J=numbers)
+    motion = Motion(np.arange(4.0), x, np.zeros_like(x), info, 1.0, 1.0)
     assert finite_moments(motion) == 3
     warn(motion)
     said = capsys.readouterr().out
+    assert "diverged" not in said and "inside out" not in said
+    warn(
+        motion._replace(info=info._replace(energy_growth=np.array([-1.0, 0.5, np.nan]), least_J=np.array([1, -0.1, 1])))
+    )
+    worse = capsys.readouterr().out
+    assert "2 of 3 steps diverged: they created energy, the first at t = 2 s" in worse
+    warn(motion._replace(info=info._replace(overlaps=np.array([0, 2, 1]))))
+    assert "components overlap in 2 of 3 steps (up to 2 pairs), first at t = 2 s" in capsys.readouterr().out
+    assert "1 of 3 steps turned elements inside out, the first at t = 2 s" in worse and "did not converge" not in worse
     assert "1 of 3 steps did not converge, the first at t = 2 s" in said and "not finite from t = 3 s" in said
 
 
@@ -174,7 +184,19 @@ def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     assert (tmp_path / "run" / "motion.gif").read_bytes().startswith(b"GIF")
     shown = capsys.readouterr().out
     assert "steps per second" in shown and "warning" not in shown
+    assert "beam: 6 vertices, 5 elements in 1 component, 2 x 1 m, 8 unknowns" in shown
     assert "of 5 elements were inverted and have been turned" in shown and "elements overlap at" in shown
+
+
+def test_components_and_size_are_printed_and_millimetres_are_warned_of(tmp_path, capsys):
+    mesh = beam_mesh(30.0, 10.0, 2, 1)
+    vertices = np.concatenate([mesh.vertices, mesh.vertices + np.array([0.0, 20.0])])
+    np.savez(tmp_path / "mesh.npz", vertices=vertices, elements=np.concatenate([mesh.elements, mesh.elements + 6]))
+    options = ("--mesh", tmp_path / "mesh.npz", "--seconds", "0.02", "--dt", "0.01", "--no-figures")
+    command(simulate, "--scene", "beam", *options, "--out", tmp_path / "run")
+    shown = capsys.readouterr().out
+    assert "12 vertices, 8 elements in 2 components, 30 x 30 m" in shown
+    assert "warning: the body is 30 m long" in shown and "divide its vertices by 1000" in shown
 
 
 def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys):

@@ -11,6 +11,7 @@ from dln_jax.softbody.mesh.creatures import biped, body_length, crawler, quadrup
 from dln_jax.softbody.mesh.mesh import (
     boundary,
     boundary_vertices,
+    components,
     edges,
     lumped_masses,
     make_mesh,
@@ -321,3 +322,24 @@ def test_anatomy(creature, vertices, muscles, legs, length):
     ends = creature.muscles.reshape(-1).tolist()
     assert all(ends.count(corner) == 1 for sole in soles for corner in sole)
     assert body_length(creature) == pytest.approx(length)
+
+
+def test_components_are_connected_by_vertices():
+    mesh = box((2.0, 1.0, 1.0), (2, 1, 1))
+    twice = make_mesh(np.concatenate([mesh.vertices, mesh.vertices + 5.0]), [*mesh.elements, *(mesh.elements + 12)])
+    assert (components(mesh) == 0).all()
+    assert components(twice).tolist() == [0] * 10 + [1] * 10
+    hinged = make_mesh([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], [[0, 1, 2], [0, 3, 4]])
+    assert (components(hinged) == 0).all()
+
+
+def test_elements_whose_vertices_were_never_merged_are_refused():
+    mesh = box((1.0, 1.0, 1.0), (3, 3, 3))
+    loose = mesh.vertices[mesh.elements].reshape(-1, 3), np.arange(mesh.elements.size).reshape(-1, 4)
+    with pytest.raises(InputError, match=r"no two of the 135 elements share a vertex.*540 vertices have 64 distinct"):
+        make_mesh(*loose)
+    with pytest.raises(InputError, match=r"vertex 64 is dangling: it belongs to no element.*\(1 more like it\)"):
+        make_mesh(np.concatenate([mesh.vertices, [[2.0, 0, 0], [3.0, 0, 0]]]), mesh.elements)
+    # Bodies that are apart are bodies.
+    apart = make_mesh([[0, 0], [1, 0], [0, 1], [5, 0], [6, 0], [5, 1]], [[0, 1, 2], [3, 4, 5]])
+    assert components(apart).max() == 1

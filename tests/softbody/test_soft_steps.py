@@ -6,9 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 from dln_jax.rollout import rollout
+from dln_jax.softbody.driven import drive, driven_step
+from dln_jax.softbody.examples import drop
 from dln_jax.softbody.mesh.mesh import make_mesh
+from dln_jax.softbody.mesh.shapes import beam
 from dln_jax.softbody.scene import make_scene, potential, with_parameters
 from dln_jax.softbody.step import (
     BACKWARD_EULER,
@@ -19,10 +23,12 @@ from dln_jax.softbody.step import (
     positions_and_convergence,
     static_solve,
 )
+from dln_jax.softbody.terms.contact import plane_contact
 from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.springs import springs
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.verdict import LARGEST_GROWTH
 from dln_jax.types import InputError
 
 MESH = make_mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.1]], [[0, 1, 2], [1, 3, 2]])
@@ -60,7 +66,7 @@ def test_held_vertices_move_with_their_velocity(integrator):
     v = np.zeros((4, 2))
     v[:2] = 0.3, -0.2
     _, (states, info) = program(integrator)(held_body().params, stepper(integrator).init(v=v))
-    assert info.converged.all() and info.definite.all()
+    assert info.converged.all() and info.definite is None
     t = DT * np.arange(1, 5)
     np.testing.assert_allclose(states.x[:, :2], MESH.vertices[:2] + t[:, None, None] * v[:2], atol=1e-14)
     np.testing.assert_array_equal(states.v[:, :2], np.broadcast_to(v[:2], (4, 2, 2)))
@@ -182,6 +188,131 @@ def test_what_a_scene_does_not_list_is_not_compiled():
     weight, solid, both = flops(WEIGHT), flops(SOLID), flops(SOLID, WEIGHT)
     assert weight < 0.7 * both
     assert weight < solid < both
+
+
+def equations(jaxpr):
+    """Equations of a program, those of its loops and calls included."""
+    inner = [sub for equation in jaxpr.eqns for sub in jaxprs_in_params(equation.params)]
+    return len(jaxpr.eqns) + sum(map(equations, inner))
+
+
+def test_definiteness_is_computed_on_request_only():
+    def size_and_info(**options):
+        init, step = make_step(held_body(), DT, **options)
+        program = jax.jit(lambda params, state: step(params, state, None))
+        size = equations(jax.make_jaxpr(program)(held_body().params, init()).jaxpr)
+        return size, program(held_body().params, init())[1]
+
+    (plain, info), (asked, info_asked) = size_and_info(), size_and_info(definite=True)
+    assert info.definite is None and info_asked.definite
+    assert plain < 0.85 * asked
+    (x, info), (x_asked, info_asked) = (
+        static_solve(held_body(), held_body().params, definite=d) for d in (False, True)
+    )
+    assert info.definite is None and info_asked.definite
+    np.testing.assert_array_equal(x, x_asked)
+
+
+def falling(example, dt, steps, integrator):
+    init, step = driven_step(example, dt, integrator)
+    observe = lambda state, info: (state.x, state.v, info)  # noqa: E731
+    run = lambda params: rollout(functools.partial(step, params), init(), drive(example, dt, steps), observe=observe)  # noqa: E731
+    return jax.jit(run)(example.scene.params)[1]
+
+
+def test_a_motion_whose_energy_explodes_is_not_converged():
+    """The midpoint rule does not resolve this contact: forces are balanced in every step, and energy is created."""
+    example = drop(cells=2, youngs_modulus=1e6)
+    x, v, info = falling(example, 0.02, 100, MIDPOINT)
+    masses, start = example.scene.params.masses, example.scene.params.rest
+    energy = 0.5 * (masses[:, None] * v**2).sum((1, 2)) + jax.vmap(
+        lambda x: potential(example.scene, x, example.scene.params)
+    )(x)
+    first = 0.5 * (masses[:, None] * example.v**2).sum() + potential(example.scene, start, example.scene.params)
+    assert energy.max() > 1.5 * first and (info.residual < 1e-3).all()
+    # Without held vertices, actuation and friction of the step, the growth is the change of the energy.
+    np.testing.assert_allclose(info.energy_growth[:20], np.diff(np.append(first, energy[:20])), atol=1e-6 * first)
+    assert not info.converged.all()
+    exploded = np.asarray(info.energy_growth > LARGEST_GROWTH * info.energy_at_hand)
+    inverted = np.asarray(info.least_J <= 0)
+    np.testing.assert_array_equal(~np.asarray(info.converged), exploded | inverted)
+    assert exploded.any()
+    # Backward Euler takes the same steps and creates next to nothing.
+    _, _, damped = falling(example, 0.02, 100, BACKWARD_EULER)
+    assert damped.converged.all() and (damped.energy_growth <= 1e-2 * damped.energy_at_hand).all()
+
+
+def test_elements_inverted_by_an_impact_are_not_converged_and_have_no_derivatives():
+    mesh = beam(1.0, 1.0, 3, 3)
+    shifted = mesh._replace(vertices=mesh.vertices + np.array([0.0, 0.05]))
+    ground = plane_contact(range(len(mesh.vertices)), normal=(0, 1), stiffness=1e8, width=1e-3)
+    solid = elastic(shifted, stable_neo_hookean, youngs_modulus=1e6)
+    scene = make_scene(shifted, (solid, ground))
+    init, step = make_step(scene, 1e-3)
+
+    def height(speed, steps):
+        last, seen = rollout(
+            functools.partial(step, scene.params),
+            init(v=speed * np.array([0.0, -1.0])),
+            steps=steps,
+            observe=lambda _, info: info,
+        )
+        return last.x[:, 1].mean(), seen
+
+    run = jax.jit(jax.value_and_grad(height, has_aux=True), static_argnums=1)
+    (_, info), slope = run(100.0, 10)
+    assert (info.least_J.min() <= 0) and (info.residual < 1e-3).all()
+    np.testing.assert_array_equal(info.converged, info.least_J > 0)
+    assert np.isnan(slope)
+    (_, gentle), slope = run(1.0, 10)
+    assert gentle.converged.all() and (gentle.least_J > 0.5).all()
+    ahead, behind = (run(1.0 + sign * 1e-5, 10)[0][0] for sign in (1, -1))
+    np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-6)
+
+
+def test_work_of_held_vertices_is_not_growth():
+    """A body that is pulled by its held vertices gains energy; none of it is created."""
+    init, step = make_step(held_body(), DT, MIDPOINT)
+    v = np.zeros((4, 2))
+    v[:2] = 0.0, 3.0
+    advance = functools.partial(step, held_body().params)
+    info = jax.jit(lambda state: rollout(advance, state, steps=20, observe=lambda _, info: info)[1])(init(v=v))
+    assert info.converged.all() and info.energy_at_hand.max() > 100.0
+    assert (abs(info.energy_growth) < 0.05 * info.energy_at_hand).all()
+
+
+def two_blocks(gap):
+    """Two squares above each other, the lower one held."""
+    square = beam(1.0, 1.0, 2, 2)
+    above = square.vertices + np.array([0.0, 1.0 + gap])
+    n = len(square.vertices)
+    mesh = make_mesh(np.concatenate([square.vertices, above]), np.concatenate([square.elements, square.elements + n]))
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=1e5)
+    return make_scene(mesh, (solid, gravity(mesh)), held=np.arange(n))
+
+
+def test_bodies_that_pass_through_each_other_are_counted():
+    scene = two_blocks(gap=0.1)
+    init, step = make_step(scene, DT)
+    advance = functools.partial(step, scene.params)
+    run = jax.jit(
+        lambda state: rollout(advance, state, steps=12, observe=lambda state, info: (state.x, info.overlaps))[1]
+    )
+    x, overlaps = run(init())
+    lowest = np.asarray(x)[:, 9:, 1].min(axis=1)
+    np.testing.assert_array_equal(overlaps, (lowest < 1.0).astype(int))
+    assert 0 < overlaps.sum() < 12 and lowest[-1] < 0.0
+    # One component: nothing of it is traced.
+    assert jax.eval_shape(stepper().step, held_body().params, stepper().init())[1].overlaps is None
+    # Derivatives pass by it.
+    slope = jax.jit(jax.grad(lambda v: rollout(advance, init(v=v), steps=12)[0].x[-1, 1]))(jnp.zeros(2))
+    np.testing.assert_allclose(slope, [0.0, 12 * DT], atol=1e-9)
+
+
+def test_what_resists_no_deformation_has_no_least_J():
+    scene = make_scene(MESH, (springs([[0, 2], [1, 3]], stiffness=200.0),), masses=1.5, held=[0, 1])
+    init, step = make_step(scene, DT)
+    assert jax.eval_shape(step, scene.params, init())[1].least_J is None
 
 
 def test_the_potential_is_the_sum_of_the_terms():

@@ -9,8 +9,16 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial import Delaunay
 
+from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import beam, box
+from dln_jax.softbody.mesh.simplices import regularity
+from dln_jax.softbody.scene import make_scene
+from dln_jax.softbody.step import make_step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.solvers.elements import linear_solvers
 from dln_jax.solvers.elements.assembly import Pattern, assemble, entries, gradient, pattern
+from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import ElementEnergy, element_hessians, lower_triangles, project, square, value
 from dln_jax.solvers.elements.linear_solvers import block_tridiagonal, by_size, dense, least_work, matrix_free
 from dln_jax.solvers.elements.minimise import minimise
@@ -48,7 +56,7 @@ def hanging_chain(stiffness, length, ends, linear_solver=by_size, **options):
 
 @functools.cache
 def solved(name):
-    return jax.jit(functools.partial(hanging_chain, linear_solver=SOLVERS[name]))
+    return jax.jit(functools.partial(hanging_chain, linear_solver=SOLVERS[name], definite=True))
 
 
 ARGUMENTS = (50.0, 0.11, jnp.array([1.0, 0.1]))
@@ -77,6 +85,58 @@ def test_the_linear_solver_of_least_work_is_chosen(case):
     indices, dimension, expected = CHOICES[case]
     energies = (ElementEnergy(spring, indices),)
     assert least_work(energies, pattern(energies, int(indices.max()) + 1, dimension)) is expected
+
+
+def unordered_body(modulus, ratio):
+    """About a thousand tetrahedra in no particular order."""
+    random = np.random.default_rng(0)
+    points = random.uniform(size=(230, 3)) * [2.0, 1.0, 1.0]
+    elements = Delaunay(points).simplices
+    mesh = make_mesh(points, elements[np.abs(regularity(points, elements)) > 0.02])
+    solid = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=ratio)
+    return make_scene(mesh, (solid,), held=np.argsort(points[:, 0])[:20])
+
+
+def chosen(scene, dt):
+    """Name of the solver that a time step takes, of its linear systems."""
+    seen = []
+
+    def observed(way):
+        return lambda *given: seen.append(way.__name__) or way(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for way in (dense, block_tridiagonal, matrix_free):
+            patch.setattr(linear_solvers, way.__name__, observed(way))
+        make_step(scene, dt)
+    return seen[0]
+
+
+def test_the_choice_of_the_solver_follows_the_stiffness():
+    soft, stiff = unordered_body(1e4, 0.3), unordered_body(1e9, 0.49)
+    assert chosen(soft, 1e-3) == "matrix_free"
+    assert chosen(stiff, 1 / 60) == "block_tridiagonal"
+    # What is traced is not known: the choice is that of the size alone, and the step is made.
+    assert len({chosen_when_traced(scene) for scene in (soft, stiff)}) == 1
+
+
+def chosen_when_traced(scene):
+    names = []
+
+    def make(dt):
+        names.append(chosen(scene, dt))
+        return dt
+
+    jax.eval_shape(make, 1e-3)
+    return names[0]
+
+
+def test_products_of_a_search_are_those_that_conjugate_gradients_take():
+    """A chain of springs between held ends; its Hessian is known."""
+    data = ({"k": jnp.full(CHAIN - 1, 50.0), "length": jnp.full(CHAIN - 1, 0.05)}, jnp.zeros(CHAIN))
+    at = pattern(ENERGIES, CHAIN, 2, FREE)
+    x = jnp.asarray(START)
+    asked = functools.partial(search_takes_at_most, energies=ENERGIES, at=at, x=x, data=data, residual=1e-2)
+    assert asked(40) and not asked(2)
 
 
 def test_blocks_that_would_fill_the_memory_are_not_stored():
@@ -158,14 +218,14 @@ def rosenbrock(x, one):
 def test_a_function_of_all_unknowns_is_minimised_from_where_its_hessian_is_indefinite():
     start = jnp.array([[0.0], [2.0], [0.5], [-1.0], [3.0]])
     assert np.linalg.eigvalsh(jax.hessian(lambda x: rosenbrock(x[:, None], 1.0))(start[:, 0]))[0] < 0
-    x, info = jax.jit(lambda start, one: minimise(rosenbrock, start, one))(start, 1.0)
+    x, info = jax.jit(lambda start, one: minimise(rosenbrock, start, one, definite=True))(start, 1.0)
     np.testing.assert_allclose(x, 1.0, atol=1e-9)
     assert info.converged and info.definite
 
 
 def test_a_saddle_is_not_definite():
     # x² - y² has no minimum; its only stationary point is where the search starts.
-    _, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0)
+    _, info = minimise(lambda x, _: jnp.sum(x[0] ** 2) - jnp.sum(x[1] ** 2), jnp.zeros((2, 1)), 0.0, definite=True)
     assert info.converged and not info.definite
 
 

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from dln_jax.softbody.mesh.simplices import facets, simplex_volumes
 from dln_jax.softbody.mesh.validity import as_elements, as_vertices, oriented, require_valid
@@ -40,7 +42,8 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
 
     Raises:
         InputError: names the first vertex or element at fault: a position that is not finite, a corner out of range or
-            repeated, an element that is duplicate or degenerate, a vertex in no element.
+            repeated, an element that is duplicate or degenerate, a vertex in no element. Or elements that share no
+            vertex although some of their corners coincide: a mesh whose vertices were never merged.
     """
     positions = as_vertices(vertices)
     corners = as_elements(elements, positions.shape[1])
@@ -77,6 +80,15 @@ def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
     """
     distinct, counts = _facet_sides(mesh)
     return distinct[(counts > 1).any(axis=1)]
+
+
+def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
+    """Number, from 0, of the component that each element belongs to; shared vertices connect elements."""
+    n, m = len(mesh.vertices), len(mesh.elements)
+    corners = mesh.elements.ravel()
+    first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
+    _, of_vertices = connected_components(coo_array((np.ones(len(corners)), (first, corners)), shape=(n, n)))
+    return np.unique(of_vertices[mesh.elements[:, 0]], return_inverse=True)[1].reshape(m)
 
 
 def boundary_vertices(mesh: Mesh) -> Int[np.ndarray, " b"]:

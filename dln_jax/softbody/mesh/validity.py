@@ -54,11 +54,15 @@ def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray
             f"{shape[bad[0]]:.1e} of a regular one's; expected more than {FLAT:.0e}; "
             f"leave it out, merge its corners or move one{_others(bad)}"
         )
-    used = np.zeros(len(vertices), bool)
-    used[elements] = True
-    if (bad := np.flatnonzero(~used)).size:
+    uses = np.bincount(elements.ravel(), minlength=len(vertices))
+    if (bad := np.flatnonzero(uses == 0)).size:
         raise InputError(
             f"vertex {bad[0]} is dangling: it belongs to no element and would have no mass; remove it{_others(bad)}"
+        )
+    if uses.max() == 1 and (distinct := len(np.unique(vertices, axis=0))) < len(vertices):
+        raise InputError(
+            f"no two of the {len(elements)} elements share a vertex, so that each would move alone; "
+            f"the {len(vertices)} vertices have {distinct} distinct positions: merge those at the same position"
         )
 
 

@@ -2,7 +2,14 @@
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, value
-from dln_jax.solvers.elements.linear_solvers import LinearSolver, block_tridiagonal, by_size, dense, matrix_free
+from dln_jax.solvers.elements.linear_solvers import (
+    LinearSolver,
+    block_tridiagonal,
+    by_size,
+    by_stiffness,
+    dense,
+    matrix_free,
+)
 from dln_jax.solvers.elements.minimise import minimise
 
 __all__ = [
@@ -11,6 +18,7 @@ __all__ = [
     "Pattern",
     "block_tridiagonal",
     "by_size",
+    "by_stiffness",
     "dense",
     "matrix_free",
     "minimise",

@@ -1,6 +1,6 @@
 """Symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-Three ways, chosen by their work, which size and structure tell before anything is traced:
+Three ways, chosen by their work before anything is traced, from size, structure and, where known, the stiffness:
 
 - dense Cholesky for small systems;
 - block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most;
@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dln_jax.solvers.bands import places, solve_bands
 from dln_jax.solvers.elements.assembly import Pattern, assemble
+from dln_jax.solvers.elements.conditioning import search_takes_at_most
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy, square
 from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, factorise_blocks, solve_blocks
 from dln_jax.solvers.elimination import solve as eliminate
@@ -47,6 +48,9 @@ _FACTORISATION_SECONDS = 1.3e-10
 _BLOCK_OVERHEAD = 150
 _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
+# Where the products of a search are measured, they still come with so many times the Newton iterations.
+_MORE_ITERATIONS = 1.75
+_FEWEST_PRODUCTS = 20
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
 _MOST_ENTRIES = 3e7
 
@@ -73,25 +77,41 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
 def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """The way that `least_work` names."""
+    """The way that `least_work` names by size and structure, for stiffness that is not known."""
     return least_work(energies, at)(energies, at)
 
 
-def least_work(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolverFactory:
+def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, data: Sequence[Any]) -> LinearSolver:
+    """The way that `least_work` names for the Hessian at x, with concrete data of the elements."""
+    measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=_SEARCH_RESIDUAL)
+    return least_work(energies, at, measure)(energies, at)
+
+
+def least_work(
+    energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
+) -> LinearSolverFactory:
     """`dense`, `block_tridiagonal` or `matrix_free`: the least work by estimates of a factorisation and of products.
 
-    The stiffness is not known beforehand; much stiffer or nearly incompressible bodies (nu > 0.49) gain by
-    `block_tridiagonal`, soft ones in small time steps by `matrix_free`.
+    `search_takes_at_most` tells whether a search direction takes at most this many products; it is asked only where
+    size and structure leave the choice open. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer or
+    nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
+    `matrix_free`.
     """
     if at.unknowns <= _DENSE_UNKNOWNS:
         return dense
     size = _band(at, _ordering(at)) * at.width
     stored = at.unknowns * size
+    if stored > _MOST_ENTRIES:
+        return matrix_free
     factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
     product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
-    # Vertices along an edge of the body, which information crosses by one a product.
-    across = at.blocks ** (1 / min(at.width, 3))
-    if stored <= _MOST_ENTRIES and factorisation <= _PRODUCTS * across * product:
+    if search_takes_at_most is None:
+        # Vertices along an edge of the body, which information crosses by one a product.
+        across = at.blocks ** (1 / min(at.width, 3))
+        return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
+    affordable = int(factorisation / (_MORE_ITERATIONS * product))
+    # So few would gain little, and the measurement costs a compilation.
+    if affordable < _FEWEST_PRODUCTS or not search_takes_at_most(affordable):
         return block_tridiagonal
     return matrix_free
 

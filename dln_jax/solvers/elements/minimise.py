@@ -44,6 +44,7 @@ class _Sum(NamedTuple):
 class _State(NamedTuple):
     point: Point
     floor: Blocks
+    unclear: Float[Array, ""]
     iterations: Int[Array, ""]
     stuck: Bool[Array, ""]
 
@@ -59,6 +60,7 @@ def minimise(
     iterations: int = 100,
     linear_solver: LinearSolverFactory = by_size,
     at: Pattern | None = None,
+    definite: bool = False,
 ) -> tuple[Blocks, Info]:
     """x [n, b] at which the sum of the energies is least, near x0, with how the search ended.
 
@@ -75,6 +77,7 @@ def minimise(
         iterations: Newton steps after which the search gives up, which `Info.converged` reports.
         linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
         at: the energies' pattern, if it is at hand; made here otherwise.
+        definite: also report `Info.definite`, which costs another Hessian, factorisation and solve to full accuracy.
 
     Raises:
         InputError: indices, shapes or numbers that do not fit.
@@ -93,6 +96,8 @@ def minimise(
     @jax.custom_jvp
     def minimum(x0: Blocks, data: Any, scale: Array) -> tuple[Blocks, Info]:
         x, info = _newton(total, x0, data, scale, tolerance, iterations)
+        if not definite:
+            return x, info
         # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
         solved = total.solver.solve(_factor(total, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
@@ -183,13 +188,14 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
         point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
-        return _State(point, floor, state.iterations + 1, ~accepted)
+        return _State(point, floor, unclear, state.iterations + 1, ~accepted)
 
-    start = _State(Point(x0, *evaluate(x0)), jnp.zeros_like(x0), jnp.asarray(0), jnp.asarray(False))
+    first = Point(x0, *evaluate(x0))
+    start = _State(first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False))
     last = jax.lax.while_loop(running, iterate, start)
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)
-    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy))
+    return x, Info(residual, last.iterations, within(last) & jnp.isfinite(energy), None, last.unclear)
 
 
 def _descent_direction(total: _Sum, hessians: Sequence[Array], values: Array, gradient: Blocks) -> Blocks:

@@ -16,7 +16,7 @@ from dln_jax.softbody.terms.elasticity import elastic
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
 from dln_jax.softbody.terms.term import Term
-from dln_jax.solvers.newton import Info
+from dln_jax.softbody.verdict import Info
 from dln_jax.studies.report import Row, expect
 
 GRAVITY = 9.8

@@ -1,0 +1,124 @@
+"""Whether a time step can be trusted: balanced forces are not enough.
+
+A long step of a rule that does not damp can create energy without bound, and an impact can turn elements inside out,
+while the forces of every step are balanced. Over one step,
+
+    growth = (T + V)' - (T + V) - W,    at hand = T + max(V - V', 0) + |W|
+
+with the kinetic energy T of the free vertices, the potential V (both values with the actuation and the lagged contact
+of this step) and the work W done by held vertices. The exact motion has growth <= 0. A step that creates more than
+`LARGEST_GROWTH` of the energy at hand has diverged.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from dln_jax.softbody.mesh.simplices import simplex_volumes
+from dln_jax.softbody.scene import Params, SoftScene
+from dln_jax.solvers.elements.energies import ElementEnergy, value
+from dln_jax.solvers.newton import Info as SolverInfo
+
+LARGEST_GROWTH = 0.1
+"""Share of the energy at hand. The example scenes stay below 0.01 with backward Euler and BDF2, and smooth motions
+below 1e-4 with the midpoint rule; contact that the midpoint rule does not resolve gives 0.1 to 5 before it explodes."""
+
+
+class Info(NamedTuple):
+    """How a time step or a static solve ended."""
+
+    residual: Float[Array, ""]
+    """Largest force left over per mass, in m/s²."""
+    iterations: Int[Array, ""]
+    """Newton iterations."""
+    converged: Bool[Array, ""]
+    """Whether the result can be trusted: forces are balanced, the step has not diverged (`energy_growth` is at most
+    `LARGEST_GROWTH` of `energy_at_hand`), and no element is inverted (`least_J` > 0). Otherwise derivatives are NaN."""
+    definite: Bool[Array, ""] | None = None
+    """Whether the Hessian at the minimum is positive definite; `None` unless asked for."""
+    energy_growth: Float[Array, ""] | None = None
+    """Energy created by the step, in J; negative where it damps. `None` for a static solve."""
+    energy_at_hand: Float[Array, ""] | None = None
+    """Energy that the step could use, in J, including what rounding and the tolerance hide. `None` for a static
+    solve."""
+    least_J: Float[Array, ""] | None = None
+    """Least ratio of an element's volume to its volume at rest, over the elements that resist deformation; `None` where
+    there are none."""
+    overlaps: Int[Array, ""] | None = None
+    """Pairs of components of the mesh that overlap: there is no contact between bodies, and they pass through
+    each other. `None` for a mesh of one component. Does not count against `converged`."""
+
+
+class Motion(NamedTuple):
+    """Positions and velocities at the start and the end of a step, and the positions at which forces were balanced."""
+
+    x: tuple[Array, Array]
+    v: tuple[Array, Array]
+    balanced: Array
+
+
+def energy_balance(
+    scene: SoftScene,
+    energies: Sequence[ElementEnergy],
+    masses: Float[Array, " n"],
+    data: Sequence[Any],
+    motion: Motion,
+    found: SolverInfo,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(growth, energy at hand) of a step, in J.
+
+    Args:
+        scene: whose held vertices do work.
+        energies, data: its terms and the data of their elements in this step.
+        masses: in kg.
+        motion: of the step.
+        found: how the search for the minimum ended.
+    """
+    free = jnp.asarray(scene.free)
+    kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * v**2, 0)) for v in motion.v)
+    stored, stored_after = (value(energies, x, data) for x in motion.x)
+    moved = motion.x[1] - motion.x[0]
+    work = _work(scene.held, energies, data, motion.balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
+    # Forces left over do work, and rounding hides some of the energy.
+    unclear = found.energy_noise + found.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
+    growth = after - kinetic + (stored_after - stored) - work
+    return growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear
+
+
+def _work(
+    held: Int[np.ndarray, " k"], energies: Sequence[ElementEnergy], data: Sequence[Any], x: Array, moved: Array
+) -> Float[Array, ""]:
+    """Work of held vertices against the forces at x, from the elements that they are corners of."""
+    near, their_data = [], []
+    for energy, of in zip(energies, data, strict=True):
+        touched = np.flatnonzero(np.isin(energy.indices, held).any(axis=1))
+        if len(touched):
+            near.append(energy._replace(indices=energy.indices[touched]))
+            their_data.append(jax.tree.map(lambda leaf, touched=touched: leaf[touched], of))
+    along = jnp.zeros_like(moved).at[held].set(moved[held])
+    return jax.jvp(lambda x: value(near, x, their_data), (x,), (along,))[1]
+
+
+def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float[Array, ""] | None:
+    """Least ratio of an element's volume to its volume at rest; `None` where no term acts on the mesh's elements."""
+    elements = scene.mesh.elements
+    if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
+        return None
+    return jnp.min(simplex_volumes(x, elements) / simplex_volumes(params.rest, elements))
+
+
+@jax.custom_jvp
+def trusted(values: Any, converged: Bool[Array, ""]) -> Any:
+    """The values; their derivatives are NaN unless converged."""
+    return values
+
+
+@trusted.defjvp
+def _trusted_derivative(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    values, converged = primals
+    known = jax.tree.map(lambda dot: dot * jnp.where(converged, 1.0, jnp.nan).astype(dot.dtype), tangents[0])
+    return values, known
