@@ -31,7 +31,7 @@ def run_on_all(path, folder):
             [program("one device"), program("first of two", "0", port), program("second of two", "1", port)],
         ):
             for result in run_programs(folder, *beside):
-                assert result.returncode == 0, result.stderr[-3000:]
+                assert result.returncode == 0, f"status {result.returncode}\n{result.stderr[-3000:]}"
 
 
 def begun():

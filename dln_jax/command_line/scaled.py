@@ -47,9 +47,6 @@ def place_in(given: Any) -> Place | None:
         return None
     processes.host_devices(given.devices)
     place = place_of(given.processes, given.coordinator, given.process_id)
-    if jax.__version_info__ >= (0, 11) and (place is not None or (given.devices or 1) > 1):
-        # The compiler of jaxlib 0.11.2 crashes with it on structured models of one joint.
-        jax.config.update("jax_use_shardy_partitioner", False)
     if place is not None and getattr(given, "out", None) is None:
         raise InputError("several processes meet beside their run's folder; name one that all hosts see, by --out")
     return place

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend import core
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from dln_jax.types import InputError
@@ -151,7 +152,9 @@ def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
     if mesh is None:
         return function
     # Loops of different length on each device have no types in common over the mesh: what varies is not checked.
-    return jax.shard_map(function, mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False)
+    return jax.shard_map(
+        _with_empty_arrays_made_inside(function), mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False
+    )
 
 
 def total(tree: Any, mesh: Mesh | None) -> Any:
@@ -180,6 +183,26 @@ def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
 @functools.cache
 def _gathering(mesh: Mesh) -> Callable[[jax.Array], jax.Array]:
     return jax.jit(lambda x: x, out_shardings=NamedSharding(mesh, WHOLE))
+
+
+def _with_empty_arrays_made_inside(function: OfBatch) -> OfBatch:
+    """The same function, which reads no array without elements from outside: neither an argument nor a constant.
+
+    XLA of jaxlib 0.11.2 removes such an input of a `shard_map` and crashes on those that are left (docs/scale.md).
+    """
+
+    def on_one(shared: Any, batch: Any) -> Any:
+        given = _made_if_empty((shared, batch))
+        # Tracing brings to light what the function has closed over, in its loops too.
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*given)
+        closed = core.ClosedJaxpr(traced.jaxpr, _made_if_empty(traced.consts))
+        return jax.tree.unflatten(jax.tree.structure(shapes), core.jaxpr_as_fun(closed)(*jax.tree.leaves(given)))
+
+    return on_one
+
+
+def _made_if_empty(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if np.size(leaf) == 0 else leaf, tree)
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:

@@ -36,6 +36,7 @@ def reduced(path: Path) -> str:
     return source
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_its_assertions_hold(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -61,6 +61,26 @@ jax.tree.map(
     jax.jit(summed(total, None))(2.0, batch),
     jax.jit(summed(total, mesh))(2.0, batch),
 )
+
+
+@jax.jit
+def extended(scale, batch, outer):
+    """Samples times a scale, and three arrays without elements: in the batch, within a loop and closed over."""
+
+    def of_one(longer, x, none):
+        return jnp.concatenate([longer * x, none, outer])
+
+    def of_batch(scale, batch):
+        longer = jax.lax.fori_loop(0, 2, lambda _, row: jnp.concatenate([row, np.zeros(0)]), scale)
+        return jax.vmap(of_one, (None, 0, 0))(longer, *batch)
+
+    return spread(of_batch, mesh)(scale, batch)
+
+
+# XLA of jaxlib 0.11.2 ends in a segmentation fault where such an array comes into a `shard_map` and is used there.
+scale = np.array([1.0, 2.0, 3.0])
+found = extended(scale, (batch[0], np.zeros((8, 0))), np.zeros(0))
+np.testing.assert_array_equal(found, scale * batch[0])
 split = shard(batch, mesh)
 assert [part.data.shape for part in split[0].addressable_shards] == [(2, 3)] * 4
 jax.tree.map(np.testing.assert_array_equal, gathered(split), batch)
