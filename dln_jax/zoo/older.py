@@ -34,7 +34,7 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "pairwise-hamiltonian": (
         "pairwise-hnn",
         {
-            **{"dimension": 2, "alike": True, "distance_scale": 1.0, "width": 32, "depth": 2},
+            **{"dimension": 2, "order": "bodies", "alike": True, "distance_scale": 1.0, "width": 32, "depth": 2},
             "features": ["distance", "inverse", "logarithm"],
         },
     ),
@@ -50,6 +50,8 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
 }
 """By the old kind: the name, and the defaults that were not stored."""
+GAINED: dict[str, dict[str, Any]] = {"pairwise-hnn": {"order": "bodies"}}
+"""Keywords that models of schema version 2 have gained since, and the values that leave stored ones as they were."""
 NEEDS = {"gravity": True, "friction": False, "actuation": None}
 FIELDS = {"hnn": "black-box-hnn", "baseline": "phase-network"}
 """Of the latent plane."""
@@ -71,6 +73,12 @@ def upgraded(description: dict[str, Any]) -> dict[str, Any]:
     if kind == "latent-phase" and isinstance(stored.get("field"), str):
         stored["field"] = FIELDS.get(stored["field"], stored["field"])
     return {"name": name, **defaults, **stored}
+
+
+def completed(description: dict[str, Any]) -> dict[str, Any]:
+    """A description of this schema version with the keywords that its model has gained since it was written."""
+    name = description.get("name")
+    return {**(GAINED.get(name, {}) if isinstance(name, str) else {}), **description}
 
 
 def stored_types(like: Any) -> Any:
