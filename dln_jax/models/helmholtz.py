@@ -2,14 +2,13 @@
 
     (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
-The solenoidal part J grad H has no divergence, the conservative part grad F no rotation; H and F are networks of q and p.
+The solenoidal part J grad H has no divergence, the conservative part grad F no rotation. H and F are networks.
 Friction is learned in F where no Rayleigh function of (q, qd) is wanted: that of a damped spring is F = -½ c p². Fields
 that are both, those of harmonic functions, may be in either part. Published with Hamiltonian networks (Greydanus,
 Dzamba and Yosinski 2019), with the same canonical J and the same names.
 """
 
 from functools import partial
-from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +20,13 @@ from dln_jax.models.networks import Scale, joint_features, per_coordinate, perce
 from dln_jax.nn.activations import Activation, tanh
 from dln_jax.types import InputError, Needs, Scalar, Vector, require_positive
 
-Field = Literal["solenoidal", "conservative", "both"]
+FIELDS = ("solenoidal", "conservative", "both")
 
 
 def make_helmholtz(
     needs: Needs,
     *,
-    field: Field = "both",
+    field: str = "both",
     width: int = 64,
     depth: int = 2,
     activation: Activation = tanh,
@@ -44,8 +43,8 @@ def make_helmholtz(
     Raises:
         InputError: an unknown field, or numbers that are not positive.
     """
-    if field not in get_args(Field):
-        raise InputError(f"field is {field!r}; expected one of {', '.join(get_args(Field))}")
+    if field not in FIELDS:
+        raise InputError(f"field is {field!r}; expected one of {', '.join(FIELDS)}")
     require_positive(width=width, depth=depth)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
 

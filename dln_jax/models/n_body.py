@@ -13,8 +13,6 @@ a bounded activation does; the network learns the rest. To assume none of these 
 At r = 0 the energy (with 1/r or log r) and its slope are not finite: nothing is softened.
 """
 
-from typing import Literal
-
 import haiku as hk
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +33,7 @@ def make_pairwise_hamiltonian(
     bodies: int,
     dimension: int,
     *,
-    order: Literal["bodies", "axes"] = "bodies",
+    order: str = "bodies",
     alike: bool = True,
     features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
     distance_scale: float = 1.0,

@@ -21,9 +21,10 @@ from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.studies.hamiltonian import table
 from dln_jax.studies.hamiltonian import tasks as hnn_tasks
 from dln_jax.studies.hamiltonian import training as hnn_models
+from dln_jax.studies.hamiltonian.choice import description_of, models_of
 from dln_jax.studies.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import pieces, problem_of
-from dln_jax.studies.hamiltonian.training import RECIPES, description_of, models_of
+from dln_jax.studies.hamiltonian.training import RECIPES
 from dln_jax.studies.published import HAMILTONIAN
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load

@@ -37,6 +37,8 @@ WINDOWS_OF_A_STEP = 64
 """Of Adam, when it fits motions."""
 
 
+MOTIONS_COMPILE = 6.0
+"""How much longer the program for motions compiles than that for rates, about (5 to 7): compiling cannot be stopped."""
 FLAT = 1e-5
 """Relative decrease of the loss in one iteration of Gauss-Newton on motions at which their fit ends."""
 
@@ -103,10 +105,10 @@ def train(
 ) -> Trained:
     """Fits a model to rates, and then to trajectories where the recipe says so, by as many steps as it or `steps` says.
 
-    `seconds` are those of both, compilation included. Where fewer are left after the rates than their program took to
-    compile, or the fit of motions is not finite from its start, the fit of rates is the result; `keep` is called with
-    it before motions are fitted. Motions are left out where measured rates are exact. Devices of a mesh share the
-    samples of both.
+    `seconds` are those of both, compilation included. Where fewer are left after the rates than compiling the next
+    program would take, or the fit of motions is not finite from its start, the fit of rates is the result; `keep` is
+    called with it before motions are fitted. Motions are left out where measured rates are exact. Devices of a mesh
+    share the samples of both.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build(description)
@@ -136,8 +138,7 @@ def train(
     if rates_are_exact(problem, description, parts[1], first):
         return Trained(description, fits, "the measured rates are free of noise or fitted exactly: motions need no fit")
     alone = Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
-    # The program for motions has that for rates inside, and compiles for no less time.
-    if first.stop.reason == "time" or left <= first.compile_seconds:
+    if first.stop.reason == "time" or left <= MOTIONS_COMPILE * (first.compile_seconds or first.train_seconds):
         return alone
     if keep is not None:
         keep(alone)
