@@ -254,8 +254,27 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
         print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")
     elif problem.name == REAL or problem.noise is not None:
         print("momenta p are taken as qd, per unit of inertia")
-    for each in device_lines("f64"):
+    for each in (*assumptions(problem, description), *device_lines("f64")):
         print(each)
+
+
+def assumptions(problem: Problem, description: dict[str, Any]) -> list[str]:
+    """What was read off measurements rather than stated."""
+    found = []
+    if problem.assumed:
+        found.append("nothing states the needs: joints, potential and friction above are assumed; --needs states them")
+    if problem.name == MEASURED and description["name"] == PAIRWISE:
+        example = {"bodies": "x1, y1, x2, y2", "axes": "x1, x2, y1, y2"}[description["order"]]
+        found.append(f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it")
+    if problem.trust is not None and problem.noise is None:
+        noise = ", ".join(f"{each:.2g}" for each in np.ravel(problem.trust.weights.state))
+        small = (
+            "states are free of noise" if problem.trust.free_of_noise else f"motions are weighed by noise of {noise}"
+        )
+        found.append(f"(q, p): {small}")
+    if problem.gaps and problem.tests is not None:
+        found.append(f"test recordings have {problem.gaps} gap(s); predictions go on across them by time stamps")
+    return found
 
 
 def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
