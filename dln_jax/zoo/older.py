@@ -50,8 +50,6 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
 }
 """By the old kind: the name, and the defaults that were not stored."""
-GAINED: dict[str, dict[str, Any]] = {"pairwise-hnn": {"order": "bodies"}}
-"""Keywords that models of schema version 2 have gained since, and the values that leave stored ones as they were."""
 NEEDS = {"gravity": True, "friction": False, "actuation": None}
 FIELDS = {"hnn": "black-box-hnn", "baseline": "phase-network"}
 """Of the latent plane."""
@@ -73,12 +71,6 @@ def upgraded(description: dict[str, Any]) -> dict[str, Any]:
     if kind == "latent-phase" and isinstance(stored.get("field"), str):
         stored["field"] = FIELDS.get(stored["field"], stored["field"])
     return {"name": name, **defaults, **stored}
-
-
-def completed(description: dict[str, Any]) -> dict[str, Any]:
-    """A description of this schema version with the keywords that its model has gained since it was written."""
-    name = description.get("name")
-    return {**(GAINED.get(name, {}) if isinstance(name, str) else {}), **description}
 
 
 def stored_types(like: Any) -> Any:

@@ -178,7 +178,7 @@ def read_description(directory: Path) -> tuple[Description, bool]:
     if not isinstance(description, dict):
         raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
     try:
-        return (older.upgraded if old else older.completed)(description), old
+        return (older.upgraded(description) if old else description), old
     except InputError as error:
         raise InputError(f"{directory / MODEL}.json: {error}") from None
 

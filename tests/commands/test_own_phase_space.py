@@ -66,7 +66,7 @@ def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
     assert problem.trust.weights.rate is not None and np.isinf(problem.trust.weights.rate[1])
 
 
-def energy_error(name, rates, K=8):
+def energy_error(name, rates, K=4):
     """Mean square error of the true energy along predicted motions from starts without noise."""
     system, random = PUBLISHED[name], np.random.default_rng(5)
     starts = [np.stack(each) for each in zip(*(system.start(random) for _ in range(K)), strict=True)]
@@ -76,6 +76,7 @@ def energy_error(name, rates, K=8):
     return float(np.mean((system.energy(*integrated(learned, *starts, t)) - system.energy(q, p)) ** 2))
 
 
+@pytest.mark.slow
 def test_own_springs_are_learned_as_the_named_task(files):
     """Same model, start and budget: 20 own trajectories, 4 more for the test, and 20 of the generated task."""
     errors = {}
@@ -96,7 +97,7 @@ def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     assert "auto: pairwise-hnn" in out and "motions need no fit" in out and "motions: loss" not in out
     run = load(files / "orbits")
     assert (run.description["order"], run.description["dimension"], run.description["alike"]) == ("axes", 2, True)
-    assert energy_error("two-body", run.flow.rates, K=3) < 1e-9
+    assert energy_error("two-body", run.flow.rates, K=1) < 1e-9
     assert json.loads((files / "orbits" / "metrics.json").read_text())["validation_error"] < 1e-9
 
 

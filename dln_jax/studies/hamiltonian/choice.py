@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.data.bodies import Order, find_bodies
+from dln_jax.data.bodies import Order, arrangements, find_bodies
 from dln_jax.data.schema import Trajectories, column
 from dln_jax.data.splits import hold_out
 from dln_jax.learning import accelerations, growth
@@ -107,6 +107,8 @@ def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
     """
     if problem.name != MEASURED:
         return {} if order is None else {"order": order}
+    if set(problem.needs.joints) != {"prismatic"} or not arrangements(problem.needs.degrees_of_freedom):
+        return {}  # for the model itself to refuse
     found = find_bodies(forces_of(problem.fitted), order=order)
     if found is None:
         raise InputError(

@@ -77,7 +77,7 @@ def substeps_of(windows: Windows, weights: Weights) -> int:
     size = windows.state.reshape(-1, windows.state.shape[2]).std(axis=0)
     change = np.diff(windows.state, axis=1)[windows.weight[:, 1:] > 0]
     angle = np.max(np.sqrt(np.mean(change**2, axis=0)) / np.where(size > 0, size, np.inf))
-    allowed = INTEGRATION_SHARE * np.min(np.asarray(weights.state) / np.where(size > 0, size, np.nan), initial=1.0)
+    allowed = INTEGRATION_SHARE * np.min(np.asarray(weights.state) / np.where(size > 0, size, 1.0), initial=1.0)
     steps = np.arange(1, MOST_SUBSTEPS + 1)
     enough = windows.t.shape[1] * steps * (angle / steps) ** 5 / 120 <= allowed
     return int(steps[np.argmax(enough)]) if enough.any() else MOST_SUBSTEPS
