@@ -9,8 +9,10 @@ the embedded letters; a run folder gets what train_delan writes. Motions without
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from dln_jax.data import schema
 from dln_jax.runs.dynamics import run
 from dln_jax.runs.dynamics_options import Options
+from dln_jax.types import InputError
 
 
 @dataclass(frozen=True)
@@ -25,4 +27,9 @@ class Arguments(Options):
 
 def main(given: Arguments) -> None:
     """Trains, evaluates, and writes the run folder."""
+    if given.data is not None and "tau" in schema.load(given.data).estimated:
+        raise InputError(
+            f"{given.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "
+            f"train_hnn_task --task measured --data {given.data}"
+        )
     run(given, "train_hnn")

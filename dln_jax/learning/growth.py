@@ -5,7 +5,7 @@ size. One is better than another when its validation error is lower by more than
 difference over the validation samples (the one-standard-error rule of Breiman et al. 1984, paired).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +43,7 @@ def significantly_better(errors: Float[np.ndarray, " N"], others: Float[np.ndarr
 
 
 def grow(
-    candidates: Sequence[Any],
+    candidates: Iterable[Any],
     fit: Callable[[Any], tuple[Any, Float[np.ndarray, " N"]]],
     *,
     patience: int = 2,

@@ -55,8 +55,8 @@ class Weights(NamedTuple):
 
     state: tuple[float, ...] | float
     """Of q and p, one number or 2 d; infinite for what was not measured."""
-    rate: float | None = None
-    """Of qd and pd; `None` leaves measured rates out."""
+    rate: tuple[float, ...] | float | None = None
+    """Of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
 def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
@@ -99,7 +99,9 @@ def window_residual(
     if weights.rate is not None:
         d = start.shape[0] // 2
         velocity, force = jax.vmap(field.rates)(states[:, :d], states[:, d:])
-        errors.append(size * (jnp.concatenate([velocity, force], axis=1) - rate[0]) / weights.rate)
+        errors.append(
+            size * (jnp.concatenate([velocity, force], axis=1) - rate[0]) / jnp.asarray(weights.rate, start.dtype)
+        )
     return jnp.concatenate([jnp.ravel(error) for error in errors])
 
 
@@ -163,7 +165,8 @@ def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tupl
     for deviation in np.ravel(weights.state):
         require_positive(state_weight=float(deviation))
     if weights.rate is not None:
-        require_positive(rate_weight=weights.rate)
+        for deviation in np.ravel(weights.rate):
+            require_positive(rate_weight=float(deviation))
         if windows.rate is None or validation.rate is None:
             raise InputError("the weights count rates, which the windows lack; leave their weight out")
     if not len(windows.t) or not len(validation.t):

@@ -90,7 +90,7 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
 @overload
 def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ...
 @overload
-def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> PlainFlow: ...
+def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
 def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
     """The functions of a system in coordinates and momenta, without applied forces; arguments as for `dynamics`.
 
@@ -99,8 +99,9 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     """
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
-        rates = system.rates
-        return PlainFlow(lambda q, p: rates(*vectors(d, q=q, p=p)))
+        rates, energy = system.rates, system.hamiltonian
+        checked_rates = PlainFlow(lambda q, p: rates(*vectors(d, q=q, p=p)))
+        return checked_rates if energy is None else Flow(*checked_rates, lambda q, p: energy(*vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
         known = [*_DYNAMICS, PhaseRates]
         known.remove(InverseForward)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from jax import Array
 
 from dln_jax.mechanics.dynamics import PlainDynamics, decompose_by_differences, make_plain_dynamics
+from dln_jax.types import Hamiltonian
 
 
 class InverseForward(NamedTuple):
@@ -23,6 +24,8 @@ class PhaseRates(NamedTuple):
 
     rates: Callable[[Array, Array], tuple[Array, Array]]
     """(q, p) -> (qd, pd), each [d]."""
+    hamiltonian: Hamiltonian | None = None
+    """(q, p) -> the energy of a part of the field; `None` for a field without one."""
 
 
 def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics:

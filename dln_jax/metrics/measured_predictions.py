@@ -9,14 +9,15 @@ chaotic motions are measured in: accuracy adds its logarithm only.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
+from dln_jax.data.stretches import GAP
 from dln_jax.learning import motions, starts
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
 from dln_jax.learning.starts import nearest
@@ -60,6 +61,70 @@ def cut_stretches(data: Trajectories, samples: int, *, every: int) -> MeasuredWi
     return MeasuredWindows(t - t[:, :1], data.q[rows], data.qd[rows], data.tau[rows], np.ones(rows.shape))
 
 
+def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> MeasuredWindows:
+    """Whole recordings of free motions to predict: gaps are filled with times of weight 0, where nothing was measured.
+
+    A start is fitted to `fitted` consecutive samples without a gap. Each recording is predicted from the first such
+    place, for `samples` median time steps or until it ends, and from further places half as far apart for as long as
+    it has `samples` steps left. Shorter stretches repeat their last time, with weight 0.
+
+    Raises:
+        InputError: no recording has more than `fitted` samples in a row and one to predict.
+    """
+    found = []
+    for index in np.unique(data.trajectory):
+        own = np.flatnonzero(data.trajectory == index)
+        place = grid_places(data.t[own])
+        last_start = -np.inf
+        for first in range(len(own) - fitted):
+            whole = place[-1] - place[first] + 1 >= samples
+            in_a_row = place[first + fitted - 1] - place[first] == fitted - 1
+            followed = place[first + fitted] - place[first] < samples
+            apart = place[first] - last_start >= max(samples // 2, 1)
+            if in_a_row and followed and ((apart and whole) or np.isinf(last_start)):
+                rows = own[first:][place[first:] - place[first] < samples]
+                found.append(on_grid(data.t[rows], data.q[rows], data.qd[rows]))
+                last_start = place[first]
+    if not found:
+        raise InputError(f"no test motion has {fitted + 1} samples without a gap; record longer ones")
+    return padded(found)
+
+
+def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
+    """Place of each sample on a grid whose steps are those of the samples, and within a gap at most the median step."""
+    steps = np.diff(t)
+    median = np.median(steps) if len(steps) else 1.0
+    # Rounding of the times must not add a step to a gap of a whole number of them.
+    counts = np.where(steps > gap * median, np.ceil(steps / median - 1e-6), 1).astype(int)
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
+def on_grid(t: Float[np.ndarray, " N"], q: Float[np.ndarray, "N d"], qd: Float[np.ndarray, "N d"]) -> MeasuredWindows:
+    """One free motion on the grid of its places, as a window; places of weight 0 repeat the sample before."""
+    place = grid_places(t)
+    grid = np.arange(place[-1] + 1)
+    held = np.searchsorted(place, grid, side="right") - 1
+    weight = np.isin(grid, place).astype(float)
+    return MeasuredWindows(np.interp(grid, place, t - t[0]), q[held], qd[held], np.zeros_like(q[held]), weight)
+
+
+def padded(motions: list[MeasuredWindows]) -> MeasuredWindows:
+    """Motions as windows of one length: the shorter ones repeat their last time, with weight 0."""
+    longest = max(len(motion.t) for motion in motions)
+
+    def extended(array: np.ndarray, mode: Literal["edge", "constant"]) -> np.ndarray:
+        return np.pad(array, [(0, longest - len(array)), *[(0, 0)] * (array.ndim - 1)], mode)
+
+    alike = [
+        motion._replace(
+            **{key: extended(getattr(motion, key), "edge") for key in ("t", "q", "qd", "tau")},
+            weight=extended(motion.weight, "constant"),
+        )
+        for motion in motions
+    ]
+    return MeasuredWindows(*(np.stack(arrays) for arrays in zip(*alike, strict=True)))
+
+
 def predict_measured(
     model: Model,
     parameters: Parameters,
@@ -70,7 +135,7 @@ def predict_measured(
     substeps: int = 1,
     momenta: bool = False,
 ) -> Predictions:
-    """Motions of a model whose starts come closest to the first `fitted` samples of q, at least 2.
+    """Motions of a model whose starts come closest to the first `fitted` samples of q, at least 2; weight 0 is none.
 
     Args:
         model: of any energies, or of accelerations.
@@ -88,7 +153,7 @@ def predict_measured(
         raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {stretches.t.shape[1]}")
     spread = stretches.q.reshape(-1, stretches.q.shape[2]).std(axis=0)
     scale = tuple(np.where(spread > 0, spread, 1.0).tolist())
-    arrays = (jnp.asarray(each) for each in stretches[:4])
+    arrays = (jnp.asarray(each) for each in stretches)
     known = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
     found = _predict(model, parameters, *arrays, **known)
     return Predictions(*(np.asarray(each) for each in found))
@@ -102,19 +167,21 @@ def valid_times(
     variance: Float[np.ndarray, " d"],
     threshold: float = 1e-2,
 ) -> Float[np.ndarray, " W"]:
-    """Valid prediction time of each stretch in s, from the last of the fitted samples on."""
-    later = slice(fitted - 1, None)
+    """Valid prediction time of each stretch in s, from the last of the fitted samples on, at measured samples."""
+    measured = (stretches.weight > 0) & (np.arange(stretches.t.shape[1]) >= fitted - 1)
     return np.array(
         [
-            valid_prediction_time(q[later], q_hat[later], t[later], variance, threshold=threshold)
-            for q, q_hat, t in zip(stretches.q, predicted.q, stretches.t, strict=True)
+            valid_prediction_time(q[kept], q_hat[kept], t[kept], variance, threshold=threshold)
+            for q, q_hat, t, kept in zip(stretches.q, predicted.q, stretches.t, measured, strict=True)
         ]
     )
 
 
 # Compiled once for each model and shape, whatever the parameters.
 @functools.partial(jax.jit, static_argnames=("model", "scale", "fitted", "torque", "substeps", "momenta"))
-def _predict(model: Model, parameters, t, q, qd, tau, *, scale, fitted: int, torque: Torque, substeps: int, momenta):
+def _predict(
+    model: Model, parameters, t, q, qd, tau, weight, *, scale, fitted: int, torque: Torque, substeps: int, momenta
+):
     energies = model.energies(parameters)
     d = q.shape[2]
 
@@ -128,18 +195,19 @@ def _predict(model: Model, parameters, t, q, qd, tau, *, scale, fitted: int, tor
             return jnp.asarray(jnp.nan)
         return _drift(dynamics(energies), states, t, tau, torque, substeps)
 
-    def one(t, q, qd, tau):
+    def one(t, q, qd, tau, weight):
         first = slice(None, fitted)
 
         def error(start):
-            return jnp.ravel((moved(start, t[first], tau[first])[:, :d] - q[first]) / jnp.asarray(scale))
+            off = weight[first, None] * (moved(start, t[first], tau[first])[:, :d] - q[first])
+            return jnp.ravel(off / jnp.asarray(scale))
 
         start = nearest(error, jnp.concatenate([q[0], qd[0]]), steps=START_STEPS)
         states, moves = jax.jvp(lambda start: moved(start, t, tau), (start,), (jnp.ones(2 * d),))
         growth = jnp.log(jnp.linalg.norm(moves[-1]) / jnp.linalg.norm(moves[0])) / (t[-1] - t[0])
         return states[:, :d], states[:, d:], growth, drift(states, t, tau)
 
-    return jax.vmap(one)(t, q, qd, tau)
+    return jax.vmap(one)(t, q, qd, tau, weight)
 
 
 def _drift(system: Dynamics, states, t, tau, torque: Torque, substeps: int):

@@ -2,8 +2,9 @@
 
     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),    U(r) = w·f(r / scale) + network(f(r / scale))
 
-q and p hold one body after the other, [bodies * dimension]. Distances alone enter: translation, rotation and
-reflection change nothing, so that total momentum and angular momentum are conserved for any parameters; nor does
+q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis after the other (x1, x2,
+.., y1, y2, ..), as many published files do. Distances alone enter: translation, rotation and reflection change nothing,
+so that total momentum and angular momentum are conserved for any parameters; nor does
 exchanging bodies that are alike.
 
 The features f are r, 1/r and log r by default: the powers of r of a constant force, of Newton's and Coulomb's law in
@@ -32,6 +33,7 @@ def make_pairwise_hamiltonian(
     bodies: int,
     dimension: int,
     *,
+    order: str = "bodies",
     alike: bool = True,
     features: tuple[str, ...] = ("distance", "inverse", "logarithm"),
     distance_scale: float = 1.0,
@@ -45,17 +47,21 @@ def make_pairwise_hamiltonian(
     Args:
         bodies: at least two.
         dimension: coordinates of each.
+        order: of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
         alike: whether all bodies share one mass and all pairs one energy; otherwise each has its own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m, by which distances are divided.
         width, depth, activation, dtype: as for all, in `models.model`.
 
     Raises:
-        InputError: fewer than two bodies, numbers that are not positive, or unknown, repeated or no features.
+        InputError: fewer than two bodies, numbers that are not positive, an unknown order, or unknown, repeated or no
+            features.
     """
     require_positive(dimension=dimension, distance_scale=distance_scale, width=width, depth=depth)
     if bodies < 2:
         raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
+    if order not in ("bodies", "axes"):
+        raise InputError(f"order is {order!r}; expected 'bodies' (x1, y1, x2, y2) or 'axes' (x1, x2, y1, y2)")
     if not features or len(set(features)) < len(features) or not set(features) <= set(FEATURES):
         raise InputError(f"features are {features}; expected some of {', '.join(FEATURES)}, each once")
     first, second = np.triu_indices(bodies, 1)
@@ -69,14 +75,15 @@ def make_pairwise_hamiltonian(
         return hk.Linear(kinds, with_bias=False, name="pair_linear")(seen) + network(seen)
 
     def potential(q: Vector) -> Scalar:
-        positions = q.reshape(bodies, dimension)
+        positions = q.reshape(bodies, dimension) if order == "bodies" else q.reshape(dimension, bodies).T
         separation = jnp.matmul(jnp.asarray(difference, q.dtype), positions, precision="highest")
         energies = pair_energies(jnp.sqrt(jnp.sum(separation**2, axis=1)))
         return jnp.sum(energies) if alike else jnp.trace(energies)
 
     def inverse_factor(q: Vector) -> Matrix:
         logarithm = hk.get_parameter("log_mass", (1 if alike else bodies,), q.dtype, hk.initializers.Constant(0.0))
-        return jnp.diag(jnp.repeat(jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,))), dimension))
+        factors = jnp.exp(-0.5 * jnp.broadcast_to(logarithm, (bodies,)))
+        return jnp.diag(jnp.repeat(factors, dimension) if order == "bodies" else jnp.tile(factors, dimension))
 
     terms = {"potential": potential, "inverse_factor": inverse_factor}
     return model_of(NaturalHamiltonian, lambda: terms, bodies * dimension, dtype)

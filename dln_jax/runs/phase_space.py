@@ -1,9 +1,11 @@
 """Hamiltonian models of a phase space: from options to a run folder with the model, its errors, speed and pictures."""
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +25,7 @@ from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, Sing
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, needs_from_option
 from dln_jax.command_line.scaled import mesh_of
+from dln_jax.data.schema import needs_from_json
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH
@@ -32,27 +35,21 @@ from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.latency import one_step
 from dln_jax.runs.results import OF_LOSSES, losses, one_step_metrics, print_numbers, unit_of
 from dln_jax.scale.devices import device_lines
+from dln_jax.studies.hamiltonian.choice import HELMHOLTZ, PAIRWISE, POLYNOMIAL, choose_model, description_of
+from dln_jax.studies.hamiltonian.stages import LINEAR, gauge_of, in_velocities
 from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, TASKS, Problem, Stated, problem_of
-from dln_jax.studies.hamiltonian.training import (
-    LINEAR,
-    MOTIONS,
-    POLYNOMIAL,
-    RATES,
-    Trained,
-    check,
-    description_of,
-    gauge_of,
-    in_velocities,
-    stages_of,
-    train,
-)
+from dln_jax.studies.hamiltonian.training import MOTIONS, RATES, Trained, check, stages_of, train
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError, require_seed
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save
 
 GIF_FRAMES = 80
+CHOICE_SHARE = 0.2
+"""Of a limit of time, after which no other model is tried."""
+SOON = 1e-3
+"""Seconds that are left where none are."""
 LOSSES = {
     RATES: "rates: mean square error of (qd, pd)",
     MOTIONS: "motions: mean square error of (q, p) over its weight",
@@ -74,11 +71,13 @@ class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
         "pairwise-hnn",
         "polynomial-hamiltonian",
         "phase-network",
+        "helmholtz-hnn",
         "structured-delan",
         "trigonometric",
         "planar-chain",
     ] = "auto"
-    """What is learned; auto: what suits the task. The last three are for measured."""
+    """What is learned; auto: what suits the task, which for measured is the smallest model whose validation error no
+    other's betters. The last three are for measured."""
     data: Unstated[Path] = None
     """Trajectories in the npz schema, for measured and real-pendulum."""
     trajectories: Unstated[int] = None
@@ -89,7 +88,13 @@ class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
     test: Unstated[str] = None
     """measured: labels of test trajectories, or an npz file of them (default: every sixth, or the last fifth)."""
     noise: Unstated[str] = None
-    """measured: standard deviation of q, rad or m, one number or one for each coordinate (default: estimated)."""
+    """measured: standard deviation of q, rad or m, one number or one for each coordinate; where the file has p, also
+    one for each coordinate and then one for each momentum (default: estimated)."""
+    field: Unstated[Literal["solenoidal", "conservative", "both"]] = None
+    """helmholtz-hnn: the part that conserves an energy, the part that is a gradient, or both (default: both)."""
+    order: Unstated[Literal["bodies", "axes"]] = None
+    """measured, pairwise-hnn: coordinates body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2) (default: that
+    in which the forces on the bodies balance)."""
     coordinates: Unstated[Literal["relative", "absolute"]] = None
     """planar-chain: whether angles are those of joints, or from the vertical (default: relative)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
@@ -122,12 +127,21 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
         refuse_given(given, ["coordinates"], "for planar-chain")
     needs = None if given.needs is None else needs_from_option(given.needs)
     if given.task != MEASURED:
-        refuse_given(given, ["test", "noise"], "for measured")
+        refuse_given(given, ["test", "noise", "order"], "for measured")
+    if given.model != HELMHOLTZ:
+        refuse_given(given, ["field"], "for helmholtz-hnn")
+    if given.model not in ("auto", PAIRWISE):
+        refuse_given(given, ["order"], "for pairwise-hnn")
     stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
-    names = ("width", "depth", "activation", "degree", "coordinates")
+    names = ("width", "depth", "activation", "degree", "coordinates", "order", "field")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}
-    description = description_of(problem, given.model, **size)
+    if given.model == "auto" and given.task == MEASURED:
+        networks = given.optimizer == "adam" or any(size[name] is not None for name in names[:3])
+        chosen = {"networks": networks, "report": print, "seconds": CHOICE_SHARE * (given.seconds or math.inf)}
+        description = choose_model(problem, **chosen, precision="f64", **size)
+    else:
+        description = description_of(problem, given.model, **size)
     check_suited(given, problem, description)
     name = "gauss-newton" if given.optimizer == "auto" else given.optimizer
     optimiser = optimiser_named(name, precision=description["precision"], learning_rate=given.learning_rate)
@@ -162,6 +176,7 @@ def run(given: Options, command: str) -> None:
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
+    began = time.perf_counter()
     problem, description, training = prepare(given)
     mesh = mesh_of(given)
     truth = problem.truth[0]
@@ -169,7 +184,10 @@ def run(given: Options, command: str) -> None:
         announce(problem, description)
         with stage_progress(stages_of(problem, description, training["steps"])) as report:
             kept = {"directory": folder, "resume": given.resume}
-            trained = train(problem, description, **training, **kept, report=report, mesh=mesh)
+            # The limit is of all that a user waits for until there is a model: data, choice of the model, fits.
+            training["seconds"] = max(training["seconds"] - (time.perf_counter() - began), SOON)
+            keep = partial(save_first, folder, description)
+            trained = train(problem, description, **training, **kept, report=report, keep=keep, mesh=mesh)
         if not np.isfinite(trained.result.validation):
             raise InputError(f"{trained.stopped}; {folder} holds no model")
         save(folder, description, trained.result.parameters)
@@ -193,6 +211,12 @@ def run(given: Options, command: str) -> None:
             print(trained.stopped)
 
 
+def save_first(folder: Path, description: dict[str, Any], trained: Trained) -> None:
+    """Saves the model of the fit of rates, which whatever ends the fit of motions then leaves."""
+    save(folder, description, trained.result.parameters)
+    print(f"{folder} holds the model of the fit of rates; the fit of motions begins")
+
+
 @contextmanager
 def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None]]:
     """Yields `report(at)`: the stages, one after the other, each with a count of its own."""
@@ -214,11 +238,12 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
     """Says what is trained on what, and what was assumed."""
     data = problem.fitted
     trajectories = len(np.unique(data.trajectory))
-    needs = problem.needs
+    needs = needs_from_json(description["needs"])
     terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
     print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
     print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
-    missing = [key for key in data.estimated if key != "tau"]
+    unused = ("qdd",) if problem.noise is None else ("p", "pd")
+    missing = [key for key in data.estimated if key not in ("tau", *unused)]
     if missing:
         of = "finite differences" if problem.noise is None else "local polynomials, not finite differences,"
         print(f"not in the data: {', '.join(missing)}; {of} start the fit to motions")
@@ -227,10 +252,29 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
     if in_velocities(problem, description):
         q = ", ".join(f"{each:.3g}" for each in gauge_of(problem).q)
         print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")
-    elif problem.name in (REAL, MEASURED) and np.array_equal(data.p if data.p is not None else 0, data.qd):
+    elif problem.name == REAL or problem.noise is not None:
         print("momenta p are taken as qd, per unit of inertia")
-    for each in device_lines("f64"):
+    for each in (*assumptions(problem, description), *device_lines("f64")):
         print(each)
+
+
+def assumptions(problem: Problem, description: dict[str, Any]) -> list[str]:
+    """What was read off measurements rather than stated."""
+    found = []
+    if problem.assumed:
+        found.append("nothing states the needs: joints, potential and friction above are assumed; --needs states them")
+    if problem.name == MEASURED and description["name"] == PAIRWISE:
+        example = {"bodies": "x1, y1, x2, y2", "axes": "x1, x2, y1, y2"}[description["order"]]
+        found.append(f"coordinates are taken as {example}, .. with {description['dimension']} axes; --order states it")
+    if problem.trust is not None and problem.noise is None:
+        noise = ", ".join(f"{each:.2g}" for each in np.ravel(problem.trust.weights.state))
+        small = (
+            "states are free of noise" if problem.trust.free_of_noise else f"motions are weighed by noise of {noise}"
+        )
+        found.append(f"(q, p): {small}")
+    if problem.gaps and problem.tests is not None:
+        found.append(f"test recordings have {problem.gaps} gap(s); predictions go on across them by time stamps")
+    return found
 
 
 def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:

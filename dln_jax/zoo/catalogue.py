@@ -20,6 +20,7 @@ from dln_jax.models.hamiltonian import (
     make_separable_hamiltonian,
     make_structured_hamiltonian,
 )
+from dln_jax.models.helmholtz import make_helmholtz
 from dln_jax.models.joint_friction import with_joint_friction
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model
@@ -228,6 +229,7 @@ CATALOGUE = {
         Properties(energy=False, canonical=True),
         {**MOMENTUM, "rate_scale": ("qd", "pd")},
     ),
+    "helmholtz-hnn": Entry(with_friction_laws(make_helmholtz), Properties(energy=False, canonical=True), MOMENTUM),
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
     "latent-phase": Entry(make_picture_model, Properties(energy=False)),
 }

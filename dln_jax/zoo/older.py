@@ -34,7 +34,7 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "pairwise-hamiltonian": (
         "pairwise-hnn",
         {
-            **{"dimension": 2, "alike": True, "distance_scale": 1.0, "width": 32, "depth": 2},
+            **{"dimension": 2, "order": "bodies", "alike": True, "distance_scale": 1.0, "width": 32, "depth": 2},
             "features": ["distance", "inverse", "logarithm"],
         },
     ),

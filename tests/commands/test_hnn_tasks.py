@@ -17,13 +17,14 @@ from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.studies.case import Findings, rows_of
+from dln_jax.studies.hamiltonian import choice, measurements, stages, table
 from dln_jax.studies.hamiltonian import pixels as pixel_task
-from dln_jax.studies.hamiltonian import table
 from dln_jax.studies.hamiltonian import tasks as hnn_tasks
 from dln_jax.studies.hamiltonian import training as hnn_models
+from dln_jax.studies.hamiltonian.choice import description_of, models_of
 from dln_jax.studies.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
 from dln_jax.studies.hamiltonian.tasks import pieces, problem_of
-from dln_jax.studies.hamiltonian.training import RECIPES, description_of, models_of
+from dln_jax.studies.hamiltonian.training import RECIPES
 from dln_jax.studies.published import HAMILTONIAN
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
@@ -76,8 +77,10 @@ def workplace(tmp_path_factory):
     }  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(hnn_models, "RECIPES", small)
-        patch.setattr(hnn_tasks, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
+        for module in (hnn_models, stages, choice):
+            patch.setattr(module, "RECIPES", small)
+        for module in (hnn_tasks, measurements):
+            patch.setattr(module, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
         patch.setattr(table, "models_of", MEASURED.get)
         patch.setattr(table, "predict", quick_prediction)
@@ -86,7 +89,7 @@ def workplace(tmp_path_factory):
             patch.setattr(module, "reference_motion", quick_motion)
         patch.setattr(hnn_tasks, "STARTS", 2)
         patch.setattr(hnn_tasks, "POINTS", 4)
-        patch.setattr(hnn_models, "DEGREES", (2, 3))
+        patch.setattr(choice, "DEGREES", (2, 3))
         patch.setattr(pixel_task, "measure_pixels", lambda kind, data, **options: (quick_pixels(kind), None))
         patch.setattr(pixel_task, "draw_pixels", lambda seen, data, folder: None)
         patch.setattr(pixel_task, "pixel_data", lambda *options: None)

@@ -50,6 +50,7 @@ MODELS = {
     "pairwise-hnn": {"needs": BODIES, **SMALL, "features": ["inverse"]},
     "polynomial-hamiltonian": {"needs": FREE, "degree": 3},
     "phase-network": {"needs": FREE, **SMALL, "rate_scale": 2.0},
+    "helmholtz-hnn": {"needs": FREE, **SMALL, "momentum_scale": 0.5},
     "differential-network": {"sizes": [2, 3, 1], "activation": "cos", "members": 2},
     "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
 }

@@ -12,15 +12,17 @@ from matplotlib.figure import Figure
 from dln_jax.figures.phase_space import Field, motion_figure
 from dln_jax.figures.style import TRUTH
 from dln_jax.files import write_figure
-from dln_jax.learning.measured_motions import MeasuredWindows
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.measured_predictions import predict_measured, prediction_metrics
+from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
 from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
 from dln_jax.models.model import Model, Parameters
 from dln_jax.studies.case import Case, Findings, by_case, rows_of
 from dln_jax.studies.hamiltonian import pixels
+from dln_jax.studies.hamiltonian.choice import description_of, models_of
+from dln_jax.studies.hamiltonian.recipes import RECIPES
+from dln_jax.studies.hamiltonian.stages import in_velocities
 from dln_jax.studies.hamiltonian.tasks import MEASURED, PIXELS, REAL, WINDOW, Problem, problem_of
-from dln_jax.studies.hamiltonian.training import RECIPES, Trained, description_of, in_velocities, models_of, train
+from dln_jax.studies.hamiltonian.training import Trained, train
 from dln_jax.studies.published import HAMILTONIAN, published
 from dln_jax.studies.report import Row, markdown_table, unit_of
 from dln_jax.types import require_positive
@@ -85,15 +87,25 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
 def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
     """The problem's motions from their first states, whose momenta are velocities where a model has its own."""
     model, parameters = build(trained.description), trained.result.parameters
-    if not in_velocities(problem, trained.description):
-        return [predict(model, parameters, true.q[:, 0], true.p[:, 0], true.t) for true in problem.truth]
-    found = []
-    for true in problem.truth:
-        given = MeasuredWindows(true.t[None], true.q, true.p, np.zeros_like(true.q), np.ones(true.q.shape[:2]))
-        fitted = min(WINDOW[MEASURED], len(true.t) - 1)
+    if in_velocities(problem, trained.description):
+        given = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
+        fitted = min(WINDOW[MEASURED], *(len(true.t) - 1 for true in problem.truth))
         moved = predict_measured(model, parameters, given, fitted=fitted, substeps=SUBSTEPS)
-        found.append(Motions(true.t, moved.q, moved.qd))
-    return found
+        kept = [np.flatnonzero(weight) for weight in given.weight]
+        pairs = zip(problem.truth, moved.q, moved.qd, kept, strict=True)
+        return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
+    # Times of one length, so that one program predicts all.
+    longest = max(len(true.t) for true in problem.truth)
+    times = [np.pad(true.t, (0, longest - len(true.t)), mode="edge") for true in problem.truth]
+    return [
+        first_samples(predict(model, parameters, true.q[:, 0], true.p[:, 0], t), len(true.t))
+        for true, t in zip(problem.truth, times, strict=True)
+    ]
+
+
+def first_samples(motions: Motions, count: int) -> Motions:
+    """The first samples of each motion."""
+    return Motions(motions.t[:count], motions.q[:, :count], motions.p[:, :count])
 
 
 def predicted_times(problem: Problem, trained: Trained) -> dict[str, float]:

@@ -7,55 +7,40 @@ alone. Measurements have no rates, only finite differences for a first fit: the 
 
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.data.magnitudes import spread
-from dln_jax.data.schema import Trajectories, column
+from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import PER_SAMPLE, hold_out
-from dln_jax.learning import accelerations, measured_motions, motions, rates
+from dln_jax.learning import motions, rates
 from dln_jax.learning.engine import problem as engine
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton, Optimiser
 from dln_jax.learning.engine.problem import Progress, Report, Training, silent
-from dln_jax.learning.growth import grow
-from dln_jax.learning.measured_motions import Gauge, cut_measured_windows
-from dln_jax.learning.motions import Weights, cut_windows
+from dln_jax.learning.motions import cut_windows
 from dln_jax.learning.rates import match_linear
 from dln_jax.scale.mesh import of_first_process
+from dln_jax.studies.hamiltonian.choice import EXACT, POLYNOMIAL, VALIDATION_SHARE, mean_square_rates
 from dln_jax.studies.hamiltonian.recipes import RECIPES
+from dln_jax.studies.hamiltonian.stages import first_problem, in_velocities, second_problem, weights_of
 from dln_jax.studies.hamiltonian.tasks import Problem
-from dln_jax.types import InputError
-from dln_jax.zoo.catalogue import CATALOGUE, entry_of
-from dln_jax.zoo.descriptions import build, describe_for
+from dln_jax.zoo.descriptions import build
 
-MODELS = ("black-box-hnn", "phase-network")
-"""Of every task in the table, beside the one that suits the scene."""
-POLYNOMIAL = "polynomial-hamiltonian"
-"""Of tasks with one coordinate and without friction, beside."""
-DEGREES = range(2, 7)
-LINEAR = {"trigonometric": ("degree",), "planar-chain": ("coordinates",)}
-"""Models of measured motions whose parameters enter linearly, and their keywords."""
-IN_VELOCITIES = ("structured-hnn", "structured-delan", *LINEAR)
-"""Models of measured motions that are fitted in coordinates and velocities, whose momenta are their own."""
 RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
 WINDOWS_OF_A_STEP = 64
 """Of Adam, when it fits motions."""
-VALIDATION_SHARE = 0.15
-"""Of the trajectories for training."""
 
 
-ANCHOR = 30.0
-"""How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
-to choose its own momentum."""
-FRICTION_WIDTH = 4
-"""Hidden units of the friction, where a scene has it; the model that is one network has one coefficient."""
+MOTIONS_COMPILE = 6.0
+"""How much longer the program for motions compiles than that for rates, about (5 to 7): compiling cannot be stopped."""
+FLAT = 1e-5
+"""Relative decrease of the loss in one iteration of Gauss-Newton on motions at which their fit ends."""
 
 
 class Trained(NamedTuple):
@@ -82,65 +67,11 @@ class Trained(NamedTuple):
         return engine.one_after_the_other(named)
 
 
-def models_of(task: str) -> tuple[str, ...]:
-    """The models that the table gives a task to; the first is what suits the scene."""
-    every = (RECIPES[task].suits, *MODELS)
-    return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
-
-
-def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
-    """The description of a model for a task, "auto" for what suits the scene.
-
-    `keywords` (width, depth, activation, degree, coordinates) replace the recipe's.
-    """
-    recipe = RECIPES[problem.name]
-    suits = model in ("auto", recipe.suits)
-    name = recipe.suits if suits else model
-    if problem.noise is not None and name in LINEAR:
-        own = {key: value for key, value in keywords.items() if value is not None and key in LINEAR[name]}
-        return describe_for(name, problem.fitted, problem.needs, precision=precision, **own)
-    if not (entry_of(name).properties.canonical or (problem.noise is not None and name in IN_VELOCITIES)):
-        known = ", ".join(name for name, entry in CATALOGUE.items() if entry.properties.canonical)
-        raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
-    stated: dict[str, Any] = {"precision": precision, "pooled": True}
-    if name == POLYNOMIAL:
-        degree = keywords.get("degree") or polynomial_degree(problem)
-        return describe_for(name, problem.fitted, problem.needs, **stated, degree=degree)
-    few = (recipe.width, recipe.depth) if suits else (recipe.network, recipe.network_depth)
-    size: dict[str, Any] = {"width": few[0], "depth": few[1], "activation": "tanh"}
-    size |= {key: value for key, value in keywords.items() if value is not None and key in size}
-    if problem.needs.friction and name in ("separable-hnn", "structured-hnn"):
-        size["friction_width"] = FRICTION_WIDTH
-    return describe_for(name, problem.fitted, problem.needs, **stated, **size)
-
-
-def polynomial_degree(problem: Problem) -> int:
-    """The degree that the validation trajectories call enough."""
-    fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
-
-    def fit(degree: int):
-        description = describe_for(POLYNOMIAL, fitted, problem.needs, precision="f64", degree=degree)
-        return match_linear(build(description), fitted, validation=validation)
-
-    return grow(DEGREES, fit)[0].candidate
-
-
 def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
     """The stages of a training that take steps, and how many each."""
     recipe = RECIPES[problem.name]
     most = {RATES: 0 if description["name"] == POLYNOMIAL else recipe.steps, MOTIONS: recipe.trajectory_steps}
     return {stage: steps or own for stage, own in most.items() if own}
-
-
-def in_velocities(problem: Problem, description: dict[str, Any]) -> bool:
-    """Whether a model is fitted in coordinates and velocities, rather than momenta."""
-    return problem.noise is not None and description["name"] in IN_VELOCITIES
-
-
-def gauge_of(problem: Problem) -> Gauge:
-    """Unit inertia where revolute joints are at zero, and prismatic ones at their mean."""
-    means = zip(problem.needs.joints, problem.fitted.q.mean(axis=0), strict=True)
-    return Gauge(tuple(0.0 if joint == "revolute" else float(mean) for joint, mean in means))
 
 
 def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
@@ -155,7 +86,7 @@ def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
     engine.require_finite_start(fitted, rates.samples(problem.fitted))
     if recipe.trajectory_steps:
         windows, validation = (cut_windows(part, recipe.window) for part in parts)
-        motions.arrays(windows, validation, recipe.weights or deviations(parts[0]))
+        motions.arrays(windows, validation, weights_of(problem, parts[0]))
 
 
 def train(
@@ -169,12 +100,15 @@ def train(
     directory: Path | None = None,
     resume: bool = False,
     report: Report = silent,
+    keep: Callable[[Trained], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Trained:
     """Fits a model to rates, and then to trajectories where the recipe says so, by as many steps as it or `steps` says.
 
-    `seconds` are those of both, compilation included. Where they are over after the rates, or the fit of motions is not
-    finite from its start, the fit of rates is the result. Devices of a mesh share the samples of both.
+    `seconds` are those of both, compilation included. Where fewer are left after the rates than compiling the next
+    program would take, or the fit of motions is not finite from its start, the fit of rates is the result; `keep` is
+    called with it before motions are fitted. Motions are left out where measured rates are exact. Devices of a mesh
+    share the samples of both.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build(description)
@@ -184,6 +118,9 @@ def train(
         own = optimiser._replace(steps=steps or most)
         if isinstance(own, Adam):
             own = own._replace(patience=own.steps, batch=WINDOWS_OF_A_STEP if stage == MOTIONS else own.batch)
+        elif stage == MOTIONS:
+            # One iteration a dispatch: it is what a limit of time is kept to, and each is judged by validation.
+            own = own._replace(improvement=FLAT, steps_per_dispatch=1)
         known = identity(own, numbers, model=description, seed=seed, samples=recipe.samples)
         kept = None if directory is None else Checkpoint(directory, known, resume, f"checkpoint_{file}")
         staged = {"report": lambda at: report(at._replace(stage=stage)), "checkpoint": kept}
@@ -198,8 +135,13 @@ def train(
     left = of_first_process(seconds - (time.perf_counter() - began), mesh)
     if not recipe.trajectory_steps or first.stop.reason == "not finite":
         return _ended(description, fits, RATES, first)
-    if first.stop.reason == "time" or left <= 0:
-        return Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
+    if rates_are_exact(problem, description, parts[1], first):
+        return Trained(description, fits, "the measured rates are free of noise or fitted exactly: motions need no fit")
+    alone = Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
+    if first.stop.reason == "time" or left <= MOTIONS_COMPILE * (first.compile_seconds or first.train_seconds):
+        return alone
+    if keep is not None:
+        keep(alone)
     task = second_problem(problem, description, parts, first.parameters, seed)
     second = fitted(MOTIONS, task, recipe.trajectory_steps, "trajectories", left, must_start=False)
     if not in_velocities(problem, description):
@@ -209,28 +151,13 @@ def train(
     return _ended(description, fits, MOTIONS, second)
 
 
-def first_problem(
-    problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories], seed: int
-) -> engine.Problem:
-    """The fit of rates: accelerations, or (qd, pd)."""
-    model, most = build(description), RECIPES[problem.name].samples
-    if in_velocities(problem, description):
-        initial = jax.jit(model.init)(jax.random.key(seed))
-        return accelerations.problem(model, initial, *parts, gauge=gauge_of(problem), most_samples=most, seed=seed)
-    return rates.problem(model, *parts, seed=seed, most_samples=most)
-
-
-def second_problem(
-    problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories], start: Any, seed: int
-) -> engine.Problem:
-    """The fit of motions, from parameters of the first fit."""
-    recipe, model = RECIPES[problem.name], build(description)
-    if problem.noise is not None and in_velocities(problem, description):
-        known = {"noise": problem.noise, "gauge": gauge_of(problem), "substeps": recipe.substeps, "seed": seed}
-        windows = [cut_measured_windows(part, recipe.window) for part in parts]
-        return measured_motions.problem(model, start, *windows, **known)
-    weighted = {"weights": recipe.weights or deviations(parts[0]), "substeps": recipe.substeps, "seed": seed}
-    return motions.problem(model, start, *(cut_windows(part, recipe.window) for part in parts), **weighted)
+def rates_are_exact(problem: Problem, description: dict[str, Any], validation: Trajectories, fit: Training) -> bool:
+    """Whether measured rates are all that a model needs: states are free of noise, or the fit leaves nothing."""
+    own = ("qd", "qdd") if in_velocities(problem, description) else ("qd", "pd")
+    if problem.trust is None or any(key in problem.fitted.estimated for key in own):
+        return False
+    size = mean_square_rates(problem, description, validation)
+    return problem.trust.free_of_noise or fit.validation <= EXACT * size
 
 
 def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training) -> Trained:
@@ -242,12 +169,3 @@ def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, l
         "the data",
     }
     return Trained(description, fits, words.get(last.stop.reason, ""), last.stop.reason == "not finite")
-
-
-def deviations(data: Trajectories) -> Weights:
-    """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
-    p = column(data, "p")
-    of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", p)))
-    if "qd" in data.estimated and np.array_equal(p, data.qd):
-        of_p = ANCHOR * of_p
-    return Weights(state=tuple(np.concatenate([of_q, of_p]).tolist()))

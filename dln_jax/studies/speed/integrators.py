@@ -13,8 +13,9 @@ from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.studies.case import Findings
+from dln_jax.studies.hamiltonian.choice import description_of
 from dln_jax.studies.hamiltonian.tasks import Problem, problem_of
-from dln_jax.studies.hamiltonian.training import description_of, train
+from dln_jax.studies.hamiltonian.training import train
 from dln_jax.studies.report import Row
 from dln_jax.types import Hamiltonian
 from dln_jax.zoo.descriptions import build

@@ -48,6 +48,7 @@ MODELS = {
     "pairwise-hnn": {"needs": BODIES, **SMALL},
     "polynomial-hamiltonian": {"needs": SWING._replace(friction=False), "degree": 2},
     "phase-network": {"needs": FREE, **SMALL},
+    "helmholtz-hnn": {"needs": FREE, **SMALL},
     "differential-network": {"sizes": [2, 4, 3], "activation": "tanh", "members": 2},
     "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
 }

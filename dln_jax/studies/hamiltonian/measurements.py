@@ -1,0 +1,225 @@
+"""What a file of measured motions gives a Hamiltonian task: parts to fit and to predict, rates, and how noisy each is.
+
+Motions whose states carry noise are fitted through an integrator, weighted by that noise; where states and rates are
+free of it, a fit of the rates is all that they need.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.data import schema
+from dln_jax.data.bodies import find_bodies
+from dln_jax.data.local_polynomials import DEGREE, smooth_locally
+from dln_jax.data.magnitudes import spread
+from dln_jax.data.schema import Trajectories, column, time_derivative
+from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, select
+from dln_jax.data.stretches import stretches
+from dln_jax.learning.measured_motions import MeasuredWindows, Noise
+from dln_jax.learning.motions import Weights
+from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
+from dln_jax.metrics.phase_space import Motions
+from dln_jax.types import InputError, Needs
+
+REAL, MEASURED = "real-pendulum", "measured"
+TEST_SHARE = 0.2
+"""Of a single measured trajectory: its last samples, as published."""
+HORIZON_WINDOWS = 20
+"""Most windows that a measured motion is predicted for; a longer gap ends a recording."""
+LEAST_NOISE = 1e-6
+"""Of the spread of a measurement: what has less noise is exact."""
+FREE_OF_NOISE = 1e-3
+"""Noise of states over their spread, below which the bias of a fit of rates, its square, does not matter."""
+LEAST_RATE_NOISE = 0.01
+"""Of the spread of measured rates: they are trusted no further, since no model has them exactly."""
+ANCHOR = 30.0
+"""How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
+to choose its own momentum."""
+SURVEYED = 1_500
+"""Samples from which noise is estimated, about: its standard deviation is then known to 2 %."""
+WINDOW = {REAL: 30, MEASURED: 30}
+"""Samples of a window of measurements; shorter trajectories than two of them are taken whole."""
+
+
+class Stated(NamedTuple):
+    """What is known of measurements beside their file."""
+
+    needs: Needs | None = None
+    """Of the plant (default: what the file states, else bodies whose forces balance, else revolute joints with a
+    potential and friction)."""
+    test: str | None = None
+    """Labels of the test trajectories, separated by commas, or another file of them."""
+    noise: tuple[float, ...] | None = None
+    """Standard deviation of q, one for all or one each; or, where the file has p, of q and then p (default:
+    estimated)."""
+
+
+class Trust(NamedTuple):
+    """How far states and rates of a phase space are to be trusted."""
+
+    weights: Weights
+    free_of_noise: bool
+    """Whether rates were measured and states have so little noise that motions need not be fitted."""
+
+
+NOTHING = Stated()
+
+
+def needs_of(data: Trajectories, file: str, stated: Needs | None) -> Needs:
+    """Of a plant that moves by itself; `InputError` for one that does not, or is of another size than stated."""
+    d = data.degrees_of_freedom
+    if "tau" not in data.estimated and np.any(data.tau):
+        raise InputError(f"{file} has applied forces tau; a phase field knows none: train it with train_hnn --data")
+    needs = stated or data.needs or assumed_needs(data)
+    if needs.degrees_of_freedom != d:
+        raise InputError(f"the needs have {needs.degrees_of_freedom} joints, but {file} has {d}; make them agree")
+    return needs
+
+
+def assumed_needs(data: Trajectories) -> Needs:
+    """Bodies in a plane or in space where the measured forces on them balance; else revolute joints with friction."""
+    d = data.degrees_of_freedom
+    if find_bodies(forces_of(data)) is not None:
+        return Needs(joints=("prismatic",) * d)
+    return Needs(joints=("revolute",) * d, friction=True)
+
+
+def forces_of(data: Trajectories) -> np.ndarray:
+    """pd where it is known, else accelerations: forces up to the masses."""
+    return data.qdd if data.pd is None else data.pd
+
+
+def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[Trajectories, Trajectories]:
+    """What is fitted, and what is predicted; `InputError` where one of them is not there, or in the other."""
+    present = np.unique(data.trajectory)
+    if test is not None and test.endswith(".npz"):
+        other = schema.load(test)
+        if other.degrees_of_freedom != data.degrees_of_freedom:
+            raise InputError(f"{test} has {other.degrees_of_freedom} coordinates, {file} {data.degrees_of_freedom}")
+        return data, other
+    if test is None and len(present) == 1:
+        count = len(data.t) - round(TEST_SHARE * len(data.t))
+        if min(count, len(data.t) - count) < WINDOW[name]:
+            raise InputError(f"{file} has {len(data.t)} samples; expected some hundred, a fifth of them for the test")
+        return samples_of(data, slice(0, count)), samples_of(data, slice(count, None))
+    chosen = present[5::6] if len(present) >= 6 else present[-1:]
+    if test is not None:
+        chosen = label_indices(data, [label.strip() for label in test.split(",")])
+    rest = np.setdiff1d(present, chosen)
+    if not len(rest):
+        raise InputError(f"all trajectories of {file} are for the test; leave some to learn from")
+    fitted, held = select(data, rest), select(data, chosen)
+    require_no_copies(fitted, held)
+    return fitted, held
+
+
+def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Trajectories, Noise]:
+    """With velocities and accelerations of local polynomials where they were not measured; and the noise.
+
+    Raises:
+        InputError: noise of another number of coordinates, or stretches that are too short.
+    """
+    d = data.degrees_of_freedom
+    if noise is not None and len(noise) not in (1, d):
+        raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates")
+    smooth = smooth_locally(data)
+    of_q = _at_least(smooth.noise if noise is None else np.broadcast_to(noise, d), data.q)
+    if "qd" not in data.estimated:
+        return data, Noise(of_q, _at_least(smooth_locally(data._replace(q=data.qd)).noise, data.qd))
+    kept = samples_of(data, smooth.rows)
+    return kept._replace(qd=smooth.data.qd, qdd=smooth.data.qdd), Noise(of_q)
+
+
+def with_momenta(data: Trajectories) -> Trajectories:
+    """With p, by default qd, and pd, by default the rate of p; `estimated` names those that are no measurements."""
+    if data.p is None:
+        own = tuple(key for key, source in (("p", "qd"), ("pd", "qdd")) if source in data.estimated)
+        return data._replace(p=data.qd, pd=data.qdd, estimated=(*data.estimated, *own))
+    if data.pd is None:
+        pd = time_derivative(data.t, data.p, data.trajectory, name="pd")
+        return data._replace(pd=pd, estimated=(*data.estimated, "pd"))
+    return data
+
+
+def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | None:
+    """Weights of data with momenta, in `pieces`, by stated or else estimated noise; `None` if all pieces are short.
+
+    Raises:
+        InputError: noise of another number of coordinates.
+    """
+    d, own = data.degrees_of_freedom, "p" not in data.estimated
+    if noise is not None and len(noise) not in ((1, d, 2 * d) if own else (1, d)):
+        more = f", or {2 * d} of q and then p" if own else ""
+        raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates{more}")
+    parts = stretches(data.t, data.trajectory)
+    if max(map(len, parts)) < DEGREE + 2:
+        if noise is None:
+            return None
+        raise InputError(f"--noise is for motions, but no stretch without a gap has {DEGREE + 2} samples; leave it out")
+    order = np.random.default_rng(0).permutation(len(parts))
+    count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
+    surveyed = samples_of(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
+    sizes = {key: spread(key, column(data, key)) for key in ("q", "p", "qd", "pd")}
+    sizes = {key: np.where(size > 0, size, 1.0) for key, size in sizes.items()}
+
+    def of(key: str, least: float) -> np.ndarray:
+        found = smooth_locally(surveyed._replace(q=column(surveyed, key))).noise
+        return np.maximum(found, least * sizes[key])
+
+    of_q = of("q", FREE_OF_NOISE) if noise is None else np.broadcast_to(noise[:d], d)
+    if noise is not None and len(noise) == 2 * d:
+        of_p = np.asarray(noise[d:])
+    else:
+        of_p = ANCHOR * sizes["p"] if "p" in data.estimated else of("p", FREE_OF_NOISE)
+    rates = [sizes[key] * np.inf if key in data.estimated else of(key, LEAST_RATE_NOISE) for key in ("qd", "pd")]
+    rate = np.concatenate(rates)
+    weights = Weights(
+        tuple(np.concatenate([of_q, of_p]).tolist()), tuple(rate.tolist()) if np.isfinite(rate).any() else None
+    )
+    quiet = np.all(of_q <= FREE_OF_NOISE * sizes["q"]) and np.all(of_p <= FREE_OF_NOISE * sizes["p"])
+    return Trust(weights, bool(quiet and np.isfinite(rate).all()))
+
+
+def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
+    """The noise, or the least that counts."""
+    size = spread("q and qd", values)
+    return tuple(np.maximum(noise, LEAST_NOISE * np.where(size > 0, size, 1.0)).tolist())
+
+
+def to_predict(test: Trajectories) -> MeasuredWindows | None:
+    """Whole recordings, across their gaps, for at most so many windows; `None` where none is longer than a window."""
+    parts = stretches(test.t, test.trajectory)
+    if max(map(len, parts)) <= WINDOW[MEASURED]:
+        return None
+    longest = max(int(grid_places(test.t[test.trajectory == index])[-1]) + 1 for index in np.unique(test.trajectory))
+    return cut_recordings(test, min(longest, HORIZON_WINDOWS * WINDOW[MEASURED]), fitted=WINDOW[MEASURED])
+
+
+def gap_count(test: Trajectories) -> int:
+    """Gaps within trajectories."""
+    return len(stretches(test.t, test.trajectory)) - len(np.unique(test.trajectory))
+
+
+def motion_of(test: Trajectories) -> Motions:
+    """One trajectory as the motion that is to be predicted, up to a gap that is longer than any prediction."""
+    longest = np.diff(grid_places(test.t)) > HORIZON_WINDOWS * WINDOW[MEASURED]
+    length = int(np.argmax(longest)) + 1 if longest.any() else len(test.t)
+    t = test.t[:length] - test.t[0]
+    return Motions(t, test.q[None, :length], column(test, "p")[None, :length])
+
+
+def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
+    """Some of the samples."""
+    arrays = {key: getattr(data, key) for key in PER_SAMPLE}
+    return data._replace(**{key: array[chosen] for key, array in arrays.items() if array is not None})
+
+
+def pieces(data: Trajectories, length: int) -> Trajectories:
+    """Stretches without a gap, cut to the length of two windows, as trajectories of their own: some to validate by."""
+    parts = [
+        each[at : at + 2 * length]
+        for each in stretches(data.t, data.trajectory)
+        for at in range(0, len(each), 2 * length)
+    ]
+    index = np.arange(len(parts))
+    return data._replace(trajectory=np.repeat(index, [len(part) for part in parts]), label=index.astype(str))

@@ -1,0 +1,81 @@
+"""Valid prediction time of recordings with gaps: by time stamps across them, and not cut to the shortest part."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data import schema
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem
+from dln_jax.metrics.measured_predictions import (
+    cut_recordings,
+    grid_places,
+    on_grid,
+    padded,
+    predict_measured,
+    valid_times,
+)
+from dln_jax.models.model import Model
+from dln_jax.types import InputError
+
+STEP, FITTED, FREQUENCY = 0.05, 12, 3.0
+
+
+def oscillator(frequency):
+    energy = HamiltonianSystem(lambda q, p: 0.5 * jnp.sum(p**2) + 0.5 * frequency**2 * jnp.sum(q**2))
+    return Model(init=lambda key: jnp.zeros(1), energies=lambda parameters: energy)
+
+
+def swings(kept):
+    """One recording with the kept samples of 4 s."""
+    t = STEP * np.flatnonzero(kept)
+    q = np.cos(FREQUENCY * t)[:, None]
+    return schema.from_arrays({"t": t, "q": q, "qd": -FREQUENCY * np.sin(FREQUENCY * t)[:, None], "trajectory": 0 * t})
+
+
+def with_gaps():
+    kept = np.ones(81, bool)
+    kept[30:34], kept[47:60] = False, False
+    return swings(kept)
+
+
+def test_places_fill_gaps_at_the_median_step():
+    t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.4])
+    np.testing.assert_array_equal(grid_places(t), [0, 1, 2, 5, 6, 7])
+    np.testing.assert_array_equal(grid_places(0.1 * t), [0, 1, 2, 5, 6, 7])
+    q = t[:, None]
+    whole = on_grid(t, q, q)
+    np.testing.assert_allclose(whole.t, [0, 1, 2, 3, 4, 5, 6, 7.4])
+    np.testing.assert_array_equal(whole.weight, [1, 1, 1, 0, 0, 1, 1, 1])
+    both = padded([whole, on_grid(t[:3], q[:3], q[:3])])
+    np.testing.assert_array_equal(both.t[1], [0, 1, 2, 2, 2, 2, 2, 2])
+    np.testing.assert_array_equal(both.weight[1], [1, 1, 1, 0, 0, 0, 0, 0])
+
+
+def test_an_exact_model_is_right_to_the_end_of_a_recording_with_gaps():
+    """The part after a gap is as short as one sample more than a window; predictions go on by time stamps."""
+    for data in (with_gaps(), swings(np.ones(81, bool))):
+        recordings = cut_recordings(data, 200, fitted=FITTED)
+        found = predict_measured(
+            oscillator(FREQUENCY), jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True
+        )
+        times = valid_times(recordings, found, fitted=FITTED, variance=data.q.var(axis=0))
+        assert times == pytest.approx([4 - (FITTED - 1) * STEP])
+
+
+def test_a_wrong_model_fails_at_the_same_time_with_gaps_and_without():
+    """cos(w t) and cos(w' t) part at one time, whether samples before it were measured or not."""
+    wrong = oscillator(1.03 * FREQUENCY)
+    found = []
+    for data in (with_gaps(), swings(np.ones(81, bool))):
+        recordings = cut_recordings(data, 200, fitted=FITTED)
+        predicted = predict_measured(wrong, jnp.zeros(1), recordings, fitted=FITTED, substeps=4, momenta=True)
+        found.append(valid_times(recordings, predicted, fitted=FITTED, variance=np.array([0.5]))[0])
+    late, exact = found
+    assert FITTED * STEP < exact <= late < 3.0 and late - exact <= 14 * STEP
+
+
+def test_starts_lie_on_parts_without_a_gap():
+    recordings = cut_recordings(with_gaps(), 30, fitted=FITTED)
+    assert np.all(recordings.weight[:, :FITTED] == 1) and len(recordings.t) > 1
+    with pytest.raises(InputError, match="no test motion has 41 samples without a gap"):
+        cut_recordings(with_gaps(), 200, fitted=40)
