@@ -11,7 +11,7 @@ the motion does not leak into the floor, and divided by the gain of the differen
 
 Spectra are means of squares, which a single jump decides; the noise is a median, which no jump changes. So jumps are
 interpolated over before spectra are taken, and where the top of a spectrum is flat and higher than the median's floor,
-as it is where samples are late now and then, it is the floor.
+that is the floor. Noise need not be white: from where the spectrum of accelerations rises for good, it is noise.
 """
 
 import math
@@ -44,6 +44,8 @@ PREDICTION = math.sqrt(1 + 524 / 400)
 """Standard deviation of the prediction's error, in that of the noise."""
 MEDIAN = math.log(2)
 """Median of a spectrum's lines over their mean, where few segments are averaged."""
+RISES = 3.0
+"""Times its lowest value, which a spectrum of accelerations exceeds at high frequencies where those are noise."""
 FLAT = 4.0
 """Largest ratio between the parts of the upper half of a spectrum at which it counts as flat."""
 
@@ -87,7 +89,8 @@ def choose_cutoff(
     """
     require_positive(rate=rate, order=order)
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
-    floor = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
+    white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
+    floor = np.maximum(white, _rising(f, spectrum))
     signal = _motion(f, spectrum, floor)
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
@@ -101,9 +104,9 @@ def choose_cutoff(
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
         error[place] = np.mean(left[moves] / sizes[moves])
     best = int(np.argmin(error))
-    raw = np.mean((weight @ np.broadcast_to(floor, spectrum.shape))[moves] / sizes[moves])
+    raw = np.mean((weight @ floor)[moves] / sizes[moves])
     cutoff = float(tried[best]) if raw > WORTH**2 else np.inf
-    return Choice(cutoff, tried, error, f, spectrum, floor)
+    return Choice(cutoff, tried, error, f, spectrum, white)
 
 
 def without_jumps(
@@ -143,6 +146,22 @@ def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) ->
     return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
 
 
+def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
+    """The part of each spectrum above the lowest power of the accelerations, where that rises up to half the rate.
+
+    Forces of finite power make accelerations whose spectrum falls, so what rises is noise, white or not: samples that
+    are late by a part of a step, for one, are noise whose size is that of the velocity. Zero elsewhere.
+    """
+    accelerations = f[:, None] ** 4 * _smoothed(spectrum)
+    found = np.zeros_like(spectrum)
+    for channel, power in enumerate(accelerations.T):
+        peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
+        lowest = peak + int(np.argmin(power[peak:]))
+        if power[f > f[-1] / 2].min() > RISES * power[lowest]:
+            found[lowest:, channel] = spectrum[lowest:, channel]
+    return found
+
+
 def spectra(
     values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], *, rate: float
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F k"]]:
@@ -170,7 +189,7 @@ def spectra(
 
 
 def _motion(
-    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, " d"]
+    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, "F d"]
 ) -> Float[np.ndarray, "F d"]:
     """S of each joint: what stands out of the floor, up to where it first does not."""
     smooth = _smoothed(spectrum)
