@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in, require_positive_if_given
+from dln_jax.command_line.arguments import Unstated, choice, names_in, names_listed, require_positive_if_given
 from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema
@@ -104,7 +104,7 @@ class Case(NamedTuple):
 
 def prepare(given: Options) -> Case:
     """Reads and checks everything that the options name, before anything is written."""
-    held = tuple(name.strip() for name in given.hold.split(",")) if given.hold else ()
+    held = names_listed(given.hold)
     robot = read_robot(given.robot, hold=held)
     laws = () if given.friction == NO_FRICTION else tuple(names_in("--friction", given.friction, IDENTIFIED))
     require_laws(laws, "--friction")

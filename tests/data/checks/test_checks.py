@@ -191,8 +191,8 @@ def test_a_clean_log_suits_its_robot(clean):
     assert examined.findings == []
     assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
     assert on_tree.gravity == pytest.approx([0, 0, -9.81], abs=0.3)
-    assert abs(on_tree.delays.delay) < 0.2
-    assert on_tree.friction.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
+    assert abs(on_tree.torques.likely_delay) < 0.2
+    assert on_tree.torques.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
     assert 0 < on_tree.rank < on_tree.parameters and 1 < on_tree.condition < 1000
     assert "nothing was found" in page(examined, "log.npz")
 
@@ -208,7 +208,7 @@ def test_a_fault_against_the_robot_is_found(clean, name):
     if name == "upside down":
         assert "-9." in found[0].said
     if name == "torques late":
-        assert examined.on_tree.delays.delay == pytest.approx(2, abs=0.3)
+        assert examined.on_tree.torques.log.delay == pytest.approx(2, abs=0.3)
 
 
 def test_a_robot_of_another_size_is_refused(clean):
