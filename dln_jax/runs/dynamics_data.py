@@ -71,7 +71,9 @@ def read(given: Options) -> Recorded:
             f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
         )
     data = data._replace(needs=needs)
-    found = checked(data, without=SETTLED if given.model == AUTO else ()) if given.data is not None else []
+    found = (
+        [] if given.data is None else checked(given, data, given.data, without=SETTLED if given.model == AUTO else ())
+    )
     filtered = smoothed(given, data)
     said = [*preparation(data, filtered), *found]
     if filtered is not None:

@@ -95,7 +95,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
     if robot is not None:
         samples = even.data if even is not None else data
         farthest = 0 if even is None else _farthest(even)
-        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest)
+        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
     return Examination(told(findings), recording._replace(data=data), even, regression, on_tree, step_of(data.q))
 

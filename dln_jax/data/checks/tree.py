@@ -28,7 +28,7 @@ PACE = 0.03
 """Logarithm of the factor between the motions' speeds by the robot and by t, from which a wrong clock is looked for."""
 LENGTH = 0.1
 """m, by which the centre of a body may be elsewhere than its file says."""
-EQUATIONS = 1200
+EQUATIONS = 1000
 """Torques, over all joints, by which faults are looked for."""
 ILL = 1000.0
 """Condition of the scaled regressor, above which noise decides parameters."""
@@ -71,7 +71,13 @@ class _Forces(NamedTuple):
 
 
 def against_tree(
-    data: Trajectories, robot: Robot, names: tuple[str, ...], *, driven: bool, farthest: int = 0
+    data: Trajectories,
+    robot: Robot,
+    names: tuple[str, ...],
+    *,
+    driven: bool,
+    farthest: int = 0,
+    equations: int = EQUATIONS,
 ) -> OnTree:
     """Compares samples whose rates are sound with the tree.
 
@@ -81,6 +87,7 @@ def against_tree(
         names: the data's joints, where they state them.
         driven: whether there are torques.
         farthest: samples of delay that are tried.
+        equations: torques, over all joints, by which faults are looked for.
     """
     found = named_order(robot, names) + limits(data, robot)
     inside = away_from_ends(data.trajectory, farthest)
@@ -105,7 +112,7 @@ def against_tree(
     scale, correlation = _by_joint(forces, down)
     estimate = _gravity(forces, down)
     torques = examine_torques(
-        data, near_tree(phi, theta, down, EQUATIONS // q.shape[1]), farthest=farthest, equations=EQUATIONS,
+        data, near_tree(phi, theta, down, equations // q.shape[1]), farthest=farthest, equations=equations,
         ambiguous=False, others=lambda log: _mounted(log, estimate, down) + _paced(log, forces, down),
     )  # fmt: skip
     geared = _gears(scale, correlation)
