@@ -24,7 +24,7 @@ FARTHEST = 0.1
 MOST_SHIFTS = 20
 EQUATIONS, FEWER = 1000, 300
 """Torques, over all joints, by which faults are looked for, and the same where it must be quick."""
-BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "spikes", "unexcited")
+BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
 """Findings beside which torques are not examined without a robot."""
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
 
@@ -75,7 +75,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
     data, repeats = without_repeats(data)
     findings += _repeated(repeats)
     even = _even(data)
-    findings += check_channels(data, None if even is None else even.data.qd)
+    findings += check_channels(recording.data, None if even is None else even.data.qd)
     regression = None
     driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
     if even is not None:
@@ -97,7 +97,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         farthest = 0 if even is None else _farthest(even)
         on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
-    return Examination(told(findings), recording._replace(data=data), even, regression, on_tree, step_of(data.q))
+    return Examination(told(findings), recording, even, regression, on_tree, step_of(recording.data.q))
 
 
 def plain(data: Trajectories) -> bool:

@@ -21,6 +21,8 @@ COMPARABLE = 0.3
 """The steps before and after a repeat must be at least this fraction of the step that ends it."""
 CLEAR = 3.0
 """Steps of the encoder by which a joint must move on, so that equal readings are no matter of resolution."""
+CHANCE = 3.0
+"""Times as many rows have to be equal as would be by chance, were the channels independent."""
 NEAR = 5
 """Steps on either side of a repeat that say how far a joint usually moves in one."""
 LOST = 1.5
@@ -81,7 +83,10 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
     same = (changes == 0).all(axis=1) & inside
-    if not same.any():
+    # Channels with few levels are equal now and then, and all of them by chance.
+    others = changes[inside & ~same] == 0
+    by_chance = float(np.prod(others.mean(axis=0))) * len(changes) if len(others) else np.inf
+    if same.sum() <= CHANCE * by_chance:
         return found, np.inf
     levels, noise = step_of(values), noise_of(values, trajectory)
     moves = np.flatnonzero(~same)

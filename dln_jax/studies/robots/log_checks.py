@@ -62,7 +62,7 @@ def random_arm(seed: int, d: int) -> _Arm:
         if seed % 4 == 1:  # parallel axes
             turns = [np.eye(3)] * d
         turns = [turn * np.sign(np.linalg.det(turn)) for turn in turns]
-        positions = random.uniform(-0.3, 0.3, (d, 3)) + [0.1, 0, 0]
+        positions = random.uniform([-0.2, -0.3, -0.3], [0.4, 0.3, 0.3], (d, 3))
         masses = np.geomspace(5.0, 0.5, d) * random.uniform(0.6, 1.5, d)
         links = [
             trees.inertial_parameters(
