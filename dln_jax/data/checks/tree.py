@@ -112,7 +112,7 @@ def against_tree(
     scale, correlation = _by_joint(forces, down)
     estimate = _gravity(forces, down)
     torques = examine_torques(
-        data, near_tree(phi, theta, down, equations // q.shape[1]), farthest=farthest, equations=equations,
+        data, near_tree(phi, theta, down), farthest=farthest, equations=equations,
         ambiguous=False, others=lambda log: _mounted(log, estimate, down) + _paced(log, forces, down),
     )  # fmt: skip
     geared = _gears(scale, correlation)
@@ -124,7 +124,7 @@ def against_tree(
     return OnTree(found, scale, correlation, estimate, rank, columns.shape[1], condition, torques)
 
 
-def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray, most: int) -> Build:
+def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray) -> Build:
     """The prior of torques of a tree whose parameters are near those of its file, and friction."""
     d = len(theta) // 11
     bodies = np.abs(theta[: 10 * d]).reshape(d, 10)
@@ -134,9 +134,7 @@ def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarra
     sizes = np.concatenate([np.maximum(bodies, spread).ravel(), np.full(d, float(spread[:, 4].max()))])
 
     def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
-        # One shape for all, so that the regressor is compiled once.
-        filled = [np.concatenate([x, np.repeat(x[-1:], max(most - len(x), 0), axis=0)]) for x in states]
-        columns = phi(*filled, down if gravity is None else gravity)[: len(tau)].reshape(tau.size, -1)
+        columns = phi(*states, down if gravity is None else gravity).reshape(tau.size, -1)
         return Prior(columns @ theta, [], [columns * sizes, *friction_of(states[1])])
 
     return build

@@ -29,7 +29,11 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "kernels": learned_kinematics.kernels,
     },
     "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
-    "logs": {"checks": log_checks.detector},
+    "logs": {
+        "sound": functools.partial(log_checks.sound, with_robot=False),
+        "faulty": log_checks.faulty,
+        "sound-with-robot": functools.partial(log_checks.sound, with_robot=True),
+    },
     "speed": {"seven-axis": speed.speed},
 }
 """quick -> findings, by subject and by name; only `speed` depends on the machine."""

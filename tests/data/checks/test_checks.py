@@ -308,7 +308,7 @@ def test_covariance_of_torques_is_that_of_an_energy():
         def by_state(p, v):
             return torque(lambda q, u: kernel(q, p, 2) * (u * sizes @ v) ** 2, *state)
 
-        return jnp.stack([torque(lambda p, v: by_state(p, v)[i], *other) for i in range(2)])
+        return jnp.stack([torque(lambda p, v, i=i: by_state(p, v)[i], *other) for i in range(2)])
 
     with jax.enable_x64(True):
         for a in range(2):
