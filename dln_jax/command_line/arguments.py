@@ -76,6 +76,11 @@ def own_first(arguments: type[Arguments]) -> type[Arguments]:
     return arguments
 
 
+def names_listed(text: str | None) -> tuple[str, ...]:
+    """The names of an option such as --hold, which commas separate; none where it was not given."""
+    return tuple(name for each in (text or "").split(",") if (name := each.strip()))
+
+
 def refuse_given(given: Any, names: Iterable[str], why: str) -> None:
     """Raises `InputError` for the first of these options that was given, for example "--batch is for adam: ..."."""
     for name in names:

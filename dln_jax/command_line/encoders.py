@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,11 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
 AUTO = "auto"
+FILTERED = (
+    "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
+    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated",
+)  # fmt: skip
+"""Checks of what a filter of q replaces or repairs."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,8 @@ class Filtered:
     (default: the rates of the file, by finite differences where it has none)."""
     decimate: Unstated[int] = None
     """With --cutoff: keep every so manyth sample, of filtered torques too (default: 1, and torques as they are)."""
+    accept_log: bool = False
+    """Go on although the check of the log found errors, which then are warnings."""
 
 
 def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
@@ -61,20 +69,38 @@ def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
     torque = "filtered alike" if found.filtered_torque else "not filtered"
     sizes = [", ".join(f"{each:.2g}" for each in noise) for noise in (found.noise_q, found.noise_tau)]
     lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
+    if count := int((found.repeats.q | found.repeats.tau).sum()):
+        lines.append(f"{count} samples repeat the one before and are resampled over")
     if found.left_out:
         lines.append(f"{found.left_out} stretches are too short for the filter and left out")
     return lines
 
 
-def checked(data: Trajectories, *, without: Collection[str] = ()) -> list[str]:
+def checked(given: Filtered, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
     """What the quick part of `check_data` finds, a line each; none where nothing is found.
 
     Args:
+        given: options; with a cut-off, what concerns the rates of the file only is left out.
         data: as they are in the file.
+        path: of the file.
         without: names of checks that say nothing to this command.
+
+    Raises:
+        InputError: an error was found, and --accept-log was not given.
     """
-    lines = [finding.line for finding in quick(data) if finding.check not in without]
-    return [*lines, "python -m scripts.check_data --data FILE says more"] if lines else []
+    settled = {*without, *(FILTERED if given.cutoff is not None else ())}
+    found = [finding for finding in quick(data) if finding.check not in settled]
+    if not found:
+        return []
+    more = f"python -m scripts.check_data --data {path}"
+    if getattr(given, "robot", None) is not None:
+        more += f" --robot {getattr(given, 'robot')}"  # noqa: B009  only some commands have it
+        more += f" --hold '{hold}'" if (hold := getattr(given, "hold", None)) else ""
+    errors = [f"{finding.said}; {finding.remedy}" for finding in found if finding.severity == "error"]
+    if errors and not given.accept_log:
+        raise InputError(f"{path}: {'; also '.join(errors)}; or go on with --accept-log ({more} says more)")
+    lines = [f"warning: {finding.said}; {finding.remedy}" for finding in found if finding.severity == "error"]
+    return [*lines, *(finding.line for finding in found if finding.severity != "error"), f"{more} says more"]
 
 
 def _hertz(text: str) -> float:

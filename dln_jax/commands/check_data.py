@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.arguments import Unstated, names_listed, refuse_given
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
 from dln_jax.data.checks import Examination, examine, page, read
@@ -29,12 +29,17 @@ class Arguments(Folder, Drawn):
     """Log in the npz schema: t, q and trajectory, and tau, qd and qdd where there are any."""
     robot: Unstated[Path] = None
     """URDF or MJCF of the robot (needs MuJoCo)."""
+    hold: Unstated[str] = None
+    """Joints of the robot that do not move, such as those of a gripper, comma separated; "*finger*" names all with
+    finger in their name (default: all joints move)."""
 
 
 def main(given: Arguments) -> None:
     """Examines, prints and writes."""
     recording = read(given.data)
-    robot = None if given.robot is None else read_robot(given.robot)
+    if given.robot is None:
+        refuse_given(given, ["hold"], "for joints of --robot")
+    robot = None if given.robot is None else read_robot(given.robot, hold=names_listed(given.hold))
     examined = examine(recording, robot)
     lines = page(examined, str(given.data))
     with command_folder(given, "check_data") as folder:
@@ -57,8 +62,7 @@ def metrics(examined: Examination) -> dict[str, Any]:
         numbers |= {"cutoff_hz": smoothed.cutoff} if np.isfinite(smoothed.cutoff) else {}
     if on_tree is not None:
         numbers |= {"rank": on_tree.rank, "condition": on_tree.condition}
-    if on_tree is not None and on_tree.delays is not None:
-        numbers["delay_samples"] = on_tree.delays.delay
-    elif regression is not None:
-        numbers["delay_samples"] = regression.delay
+    torques = on_tree.torques if on_tree is not None else regression
+    if torques is not None:
+        numbers |= {"delay_samples": torques.likely_delay, "unexplained": float(1 - torques.explained.mean())}
     return numbers

@@ -24,16 +24,19 @@ class Split(NamedTuple):
     test: Trajectories
 
 
+def select_samples(data: Trajectories, samples: np.ndarray | slice) -> Trajectories:
+    """The samples of a mask, of indices or of a slice; labels stay as they are."""
+    return data._replace(**{key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None})
+
+
 def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajectories:
     """The trajectories with these indices; indices and labels stay as they are."""
-    samples = np.isin(data.trajectory, indices)
-    kept = {key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None}
-    return data._replace(**kept)
+    return select_samples(data, np.isin(data.trajectory, indices))
 
 
 def every(data: Trajectories, step: int) -> Trajectories:
     """Every so manyth sample."""
-    return data._replace(**{key: getattr(data, key)[::step] for key in PER_SAMPLE if getattr(data, key) is not None})
+    return select_samples(data, slice(None, None, step))
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
@@ -48,7 +51,7 @@ def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
     if count <= most:
         return data
     rows = np.sort(np.random.default_rng([seed, count]).choice(count, most, replace=False))
-    return data._replace(**{key: getattr(data, key)[rows] for key in PER_SAMPLE if getattr(data, key) is not None})
+    return select_samples(data, rows)
 
 
 def in_blocks(data: Trajectories, blocks: int) -> Trajectories:

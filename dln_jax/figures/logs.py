@@ -5,8 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dln_jax.data.checks import Examination
-from dln_jax.data.checks.surrogate import Surrogate
-from dln_jax.data.checks.tree import OnTree
+from dln_jax.data.checks.hypotheses import Torques
 from dln_jax.data.encoders import Smoothed
 from dln_jax.figures import style
 
@@ -31,9 +30,8 @@ def cutoff_figure(smoothed: Smoothed) -> Figure:
 
 def log_figure(examined: Examination) -> Figure:
     """One page: spectra and cut-off, time steps or delay, and the torque that friction has part in, joint by joint."""
-    regression, smoothed = examined.regression, examined.smoothed
-    on_tree = examined.on_tree
-    seen = on_tree.friction if on_tree is not None and on_tree.friction is not None else regression
+    smoothed = examined.smoothed
+    seen = examined.on_tree.torques if examined.on_tree is not None else examined.regression
     joints = 0 if seen is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)
     rows = 1 + -(-joints // COLUMNS)
     figure, axes = style.figure(rows, COLUMNS, height=2.3 * rows + 0.3)
@@ -43,8 +41,8 @@ def log_figure(examined: Examination) -> Figure:
     else:
         axes[0, 0].set_axis_off()
         axes[0, 1].set_axis_off()
-    if regression is not None and smoothed is not None:
-        _delays(axes[0, 2], regression, on_tree, smoothed.rate)
+    if seen is not None and smoothed is not None:
+        _delays(axes[0, 2], seen, smoothed.rate)
     else:
         _steps(axes[0, 2], examined)
     for place, axis in enumerate(axes[1:].flat):
@@ -99,16 +97,12 @@ def _mark(axis: Axes, cutoff: float) -> None:
         )  # fmt: skip
 
 
-def _delays(axis: Axes, regression: Surrogate, on_tree: OnTree | None, rate: float) -> None:
-    step = 1e3 / rate
-    axis.plot(step * regression.delays, regression.delay_error, color=style.BLUE, linewidth=1.2, label="regression")
-    if on_tree is not None and on_tree.delays is not None and len(on_tree.delays.tried) > 1:
-        axis.plot(step * on_tree.delays.tried, on_tree.delays.error, color=style.GREEN, linewidth=1.2, label="robot")
-    axis.set_yscale("log")
+def _delays(axis: Axes, seen: Torques, rate: float) -> None:
+    axis.plot(1e3 / rate * seen.tried, np.maximum(seen.loss, -1.0), color=style.BLUE, linewidth=1.2)
+    axis.set_yscale("symlog", linthresh=10.0)
     axis.axvline(0.0, color="0.7", linewidth=0.8)
     axis.set_xlabel("torques are late by, ms")
-    axis.set_ylabel("unexplained share")
-    style.legend(axis)
+    axis.set_ylabel("log likelihood ratio of none")
 
 
 def _steps(axis: Axes, examined: Examination) -> None:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.command_line.arguments import refuse_given
+from dln_jax.command_line.arguments import names_listed, refuse_given
 from dln_jax.command_line.encoders import checked, preparation, smoothed
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
@@ -71,7 +71,9 @@ def read(given: Options) -> Recorded:
             f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
         )
     data = data._replace(needs=needs)
-    found = checked(data, without=SETTLED if given.model == AUTO else ()) if given.data is not None else []
+    found = (
+        [] if given.data is None else checked(given, data, given.data, without=SETTLED if given.model == AUTO else ())
+    )
     filtered = smoothed(given, data)
     said = [*preparation(data, filtered), *found]
     if filtered is not None:
@@ -131,8 +133,7 @@ def robot_of(given: Options) -> Robot | None:
         if isinstance(given, ArmOptions):
             refuse_given(given, ["hold"], "for joints of --robot")
         return None
-    held = [name.strip() for name in (given.hold or "").split(",")]
-    return read_robot(given.robot, hold=[name for name in held if name])
+    return read_robot(given.robot, hold=names_listed(given.hold))
 
 
 def parents_of(given: Options, d: int) -> tuple[int, ...] | None:

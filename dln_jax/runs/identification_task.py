@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in, require_positive_if_given
+from dln_jax.command_line.arguments import Unstated, choice, names_in, names_listed, require_positive_if_given
 from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema
@@ -29,7 +29,7 @@ from dln_jax.zoo.descriptions import Description, build, describe
 IDENTIFIED = tuple(law for law in LAWS if law != "load")
 """Laws that forces are linear in the coefficients of."""
 NO_FRICTION = "none"
-SETTLED = ("split", "friction", "order")
+SETTLED = ("split", "friction")
 """Checks of a log that the robot's file and this command answer."""
 MOST_SAMPLES = 4_000
 """Of which the shapes of friction are found."""
@@ -104,7 +104,7 @@ class Case(NamedTuple):
 
 def prepare(given: Options) -> Case:
     """Reads and checks everything that the options name, before anything is written."""
-    held = tuple(name.strip() for name in given.hold.split(",")) if given.hold else ()
+    held = names_listed(given.hold)
     robot = read_robot(given.robot, hold=held)
     laws = () if given.friction == NO_FRICTION else tuple(names_in("--friction", given.friction, IDENTIFIED))
     require_laws(laws, "--friction")
@@ -116,7 +116,7 @@ def prepare(given: Options) -> Case:
     if "tau" in data.estimated:
         raise InputError(f"{given.data}: the data have no tau; identification takes measured torques")
     found = smoothed(given, data)
-    said = (*preparation(data, found), *checked(data, without=SETTLED))
+    said = (*preparation(data, found), *checked(given, data, given.data, without=SETTLED))
     labels = [label.strip() for label in given.test.split(",")] if given.test else None
     if found is not None:
         labels = labels and labels_of_parts(found.data, labels)

@@ -57,11 +57,45 @@ def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, 
         said = capsys.readouterr().out
         assert ("raw finite differences, which amplify noise: --cutoff auto" in said) == (name == "raw")
         assert ("q filtered without delay at" in said) == (name == "filtered")
-        assert "warning: accelerations by differences of this q" in said
+        assert ("warning: accelerations by differences of this q" in said) == (name == "raw")
         errors[name] = json.loads((tmp_path / name / "metrics.json").read_text())["torque_mse"]
     assert errors["filtered"] < 0.1 * errors["raw"]
     config = json.loads((tmp_path / "filtered" / "config.json").read_text())
     assert config["cutoff"] == "auto" and 3 < config["chosen"]["cutoff_hz"] < 30
+
+
+def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, tmp_path, capsys):
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
+    given = ["--data", tmp_path / "degrees.npz", "--model", "trigonometric", "--degree", "1", "--out", tmp_path / "run"]
+    said = refused(capsys, train_delan, *given)
+    assert "convert to radians" in said and "--accept-log" in said
+    assert f"check_data --data {tmp_path / 'degrees.npz'} says more" in said
+    assert not (tmp_path / "run").exists()
+    command(train_delan, *given, "--accept-log", "--no-figures", "--no-low-latency")
+    said = capsys.readouterr().out
+    assert "warning: q of joint 1 goes to" in said and "error:" not in said
+
+
+def test_joints_of_a_gripper_are_held(log, tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    links = "".join(
+        f'<link name="{name}"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>'
+        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for name in ("arm", "finger")
+    )
+    joints = "".join(
+        f'<joint name="{name}_joint" type="continuous"><parent link="{parent}"/><child link="{name}"/>'
+        '<axis xyz="0 1 0"/></joint>'
+        for parent, name in (("ground", "arm"), ("arm", "finger"))
+    )
+    robot = tmp_path / "robot.urdf"
+    robot.write_text(f'<robot name="robot"><link name="ground"/>{links}{joints}</robot>')
+    given = ["--data", log, "--robot", robot, "--no-figures"]
+    assert "--hold NAME,NAME" in refused(capsys, check_data, *given, "--out", tmp_path / "all")
+    command(check_data, *given, "--hold", "*finger*", "--out", tmp_path / "held")
+    assert "robot: the motions determine" in capsys.readouterr().out
+    assert "--hold is for joints of --robot" in refused(capsys, check_data, "--data", log, "--hold", "finger")
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from calls import refused
 
 from dln_jax.commands import robot_report
-from dln_jax.studies.robots import cases
+from dln_jax.studies.robots import cases, log_checks
 from dln_jax.studies.robots.known_kinematics import rows_of_errors, rows_of_tracking
 from dln_jax.studies.robots.recorded_arm import rows_of
 
@@ -41,6 +41,17 @@ def test_errors_are_held_against_the_rival():
 def test_tracking_is_held_against_true_parameters():
     rows = rows_of_tracking({"true-parameters": [1.0, 2.0], "ours": [1.2, 2.4], "without": [20.0, 30.0]})
     assert rows[-1].value == pytest.approx(1.2) and rows[-1].passed is False
+
+
+def test_some_faults_of_logs_are_found_and_a_sound_log_has_none():
+    drawn = log_checks._Drawn()
+    for number in (1, 6):
+        log = drawn.log(number, repeats=number == 1)
+        assert log_checks.false_findings(log, None) == []
+    assert log_checks.false_findings(log, log.robot) == []
+    for kind in ("swapped-columns", "flipped-sign", "saturated-torque", "rates-exchanged"):
+        fault, checks, given = log_checks.FAULTS[kind]
+        assert set(checks) & set(log_checks.planted(drawn.log(1, repeats=False), fault, given, 0)), kind
 
 
 def test_blocks_count_by_the_whole_logs_variance():

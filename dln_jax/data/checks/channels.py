@@ -16,6 +16,10 @@ RUN = 4
 """Samples at the very same extreme value that make a flat top."""
 SHARE = 2e-3
 """Of all samples, in flat tops, from which a channel is called saturated."""
+SPIKE = 4.0
+"""Times the usual change of a channel over two samples, from which a single sample is a spike."""
+CLEAR = 3.0
+"""Times the range of its four neighbours, which a spike exceeds."""
 ABRUPT = 0.5
 """Of the typical step between samples: by so much a channel moves into or out of a limit that cuts it off."""
 
@@ -37,6 +41,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
             found.append(Finding("warning", "unexcited", said, remedy, tuple(map(int, weak))))
     if "tau" not in data.estimated:
         constant = np.flatnonzero(np.ptp(data.tau, axis=0) == 0)
+        found += _dead(data, still)
         # A joint without a motor has zero torque, and a passive system has none at all.
         constant = np.array([joint for joint in constant if data.tau[0, joint] != 0], int)
         if len(constant):
@@ -44,6 +49,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
             remedy = "see that the right channel was logged"
             found.append(Finding("warning", "constant-torque", said, remedy, tuple(map(int, constant))))
         found += _saturated(data, "tau", "torque", "keep away from the motors' limits, or leave those samples out")
+    found += _spiky(data)
     found += _saturated(data, "q", "position", "see whether it is at its stop or the log is clipped; leave that out")
     steps = step_of(data.q)
     coarse = np.flatnonzero(steps > COARSE)
@@ -51,6 +57,56 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
         said = f"q of {named(coarse)} comes in steps of up to {steps.max():.2g}"
         remedy = "filter before rates are derived: --cutoff auto, or smooth()"
         found.append(Finding("note", "quantisation", said, remedy, tuple(map(int, coarse))))
+    return found
+
+
+def _dead(data: Trajectories, still: np.ndarray) -> list[Finding]:
+    """Torques that are zero all the time, although the joint moves and nothing says that it has no motor."""
+    needs = data.needs
+    driven = np.ones(data.degrees_of_freedom, bool)
+    if needs is not None and needs.actuation is not None:
+        driven = np.any(np.asarray(needs.actuation) != 0, axis=1)
+    dead = np.setdiff1d(np.flatnonzero(driven & ~data.tau.any(axis=0)), still)
+    if not len(dead):
+        return []
+    said = (
+        f"the torque of {named(dead)} is zero in all samples, although {'it moves' if len(dead) == 1 else 'they move'}"
+    )
+    remedy = "log that torque; or state in needs, by actuation, that there is no motor"
+    return [Finding("warning", "dead-torque", said, remedy, tuple(map(int, dead)))]
+
+
+def _spiky(data: Trajectories) -> list[Finding]:
+    """Single samples far from both neighbours, which themselves agree."""
+    found = []
+    for key, word in (("q", "position"), ("tau", "torque")):
+        if key in data.estimated:
+            continue
+        counts = spikes(getattr(data, key), data.trajectory).sum(axis=0)
+        joints = np.flatnonzero(counts)
+        if len(joints):
+            said = f"the {word} of {named(joints)} has {int(counts.sum())} spike(s)"
+            remedy = "leave those samples out" + (", or let identify weigh them by --robust" if key == "tau" else "")
+            found.append(Finding("warning", "spikes", said, remedy, tuple(map(int, joints))))
+    return found
+
+
+def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
+    """Samples [N, k] that leave a channel and come back at once, by far more than it ever changes otherwise.
+
+    Three neighbours on either side say how the channel runs; the quartiles of the errors of all samples, how well.
+    """
+    found = np.zeros(values.shape, bool)
+    inside = np.flatnonzero(trajectory[4:] == trajectory[:-4]) + 2
+    if len(inside) < 50:
+        return found
+    near = values[inside - 1], values[inside + 1]
+    wide = values[inside - 2], values[inside + 2]
+    middle = np.median([*near, *wide], axis=0)
+    spread = np.max([*near, *wide], axis=0) - np.min([*near, *wide], axis=0)
+    error = np.abs(values[inside] - middle)
+    usual = np.quantile(error, 0.75, axis=0) + np.quantile(spread, 0.75, axis=0)
+    found[inside] = (error > SPIKE * usual) & (error > CLEAR * spread) & (error > 0)
     return found
 
 

@@ -14,6 +14,8 @@ ALIKE = 0.9
 """Correlation, after scale and delay, from which two signals are one."""
 UNLIKE = 0.5
 """Below which they are not."""
+EXCHANGED = 0.3
+"""Of the error as its own rate, that qd or qdd leave as the other."""
 LATE = 0.5
 """Samples of delay that are worth a word."""
 FARTHEST = 0.25
@@ -62,8 +64,27 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
             match(measured[:, joint], derived[:, joint], even.data.trajectory, farthest)
             for joint in range(data.degrees_of_freedom)
         ]
-        found += _judged(key, of, matches, even.rate, data.q.std(axis=0) > 0)
+        moves = data.q.std(axis=0) > 0
+        other = "qdd" if key == "qd" else "qd"
+        exchanged = _closer(measured, derived, getattr(even.data, other), even.data.trajectory) & moves
+        if exchanged[moves].all() and moves.any():
+            said = f"{key} is {'d²q/dt²' if key == 'qd' else 'dq/dt'}, not {of}"
+            found.append(Finding("error", f"{key}-exchanged", said, "exchange qd and qdd, or " + RATE_REMEDY))
+            continue
+        found += _judged(key, of, matches, even.rate, moves)
     return found
+
+
+def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Whether each column follows another rate than its own, with any factor, and far better."""
+    inside = away_from_ends(part, 2)
+
+    def left(reference: np.ndarray) -> np.ndarray:
+        x, y = reference[inside], measured[inside]
+        tiny = np.finfo(float).tiny
+        return 1 - np.sum(x * y, axis=0) ** 2 / np.maximum(np.sum(x**2, axis=0) * np.sum(y**2, axis=0), tiny)
+
+    return (left(other) < 1 - ALIKE**2) & (left(other) < EXCHANGED * left(own))
 
 
 def at_times_of(data: Trajectories, even: Smoothed, values: np.ndarray) -> np.ndarray:

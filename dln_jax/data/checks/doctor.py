@@ -7,12 +7,13 @@ import numpy as np
 from dln_jax.data.checks.channels import check_channels
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.findings import Finding, told
+from dln_jax.data.checks.hypotheses import Torques, any_energy, examine_torques
 from dln_jax.data.checks.recording import Recording, as_recording
-from dln_jax.data.checks.surrogate import Surrogate, surrogate
 from dln_jax.data.checks.times import check_times
 from dln_jax.data.checks.torques import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
 from dln_jax.data.encoders.noise import step_of
+from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, smooth
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
@@ -21,6 +22,10 @@ from dln_jax.types import InputError
 FARTHEST = 0.1
 """s, of a delay between q and tau that is looked for; at most `MOST_SHIFTS` samples."""
 MOST_SHIFTS = 20
+EQUATIONS, FEWER = 1000, 300
+"""Torques, over all joints, by which faults are looked for, and the same where it must be quick."""
+BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
+"""Findings beside which torques are not examined without a robot."""
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
 
 
@@ -32,8 +37,8 @@ class Examination(NamedTuple):
     recording: Recording
     smoothed: Smoothed | None
     """The log with rates of filtered coordinates; `None` where no stretch is long enough for any."""
-    regression: Surrogate | None
-    """Of its torques; `None` without torques or with too few samples."""
+    regression: Torques | None
+    """What its torques tell without a robot; `None` without torques, with too few samples, or with a robot."""
     on_tree: OnTree | None
     """What the robot's description says of it; `None` without one."""
     steps: np.ndarray
@@ -41,12 +46,17 @@ class Examination(NamedTuple):
 
 
 def quick(data: Trajectories) -> list[Finding]:
-    """Findings without a robot's description, in a second or less for some ten thousand samples."""
-    return examine(as_recording(data)).findings
+    """Findings without a robot's description, in about a second."""
+    return examine(as_recording(data), equations=FEWER).findings
 
 
-def examine(recording: Recording, robot: Robot | None = None) -> Examination:
+def examine(recording: Recording, robot: Robot | None = None, *, equations: int = EQUATIONS) -> Examination:
     """All checks.
+
+    Args:
+        recording: of the log.
+        robot: whose joints are those of the data.
+        equations: torques, over all joints, by which faults of signs, order and delay are looked for.
 
     Raises:
         InputError: the robot has another number of joints than the data.
@@ -57,32 +67,55 @@ def examine(recording: Recording, robot: Robot | None = None) -> Examination:
     if robot is not None:
         joints = robot.tree.joints
         if len(joints) != d:
-            raise InputError(f"the robot has {len(joints)} joints, but the data have {d}; give those that it moves")
+            raise InputError(
+                f"the robot has {len(joints)} joints, but the data have {d}; hold those that do not move: "
+                "--hold NAME,NAME"
+            )
     findings = [*recording.repaired, *check_times(data)]
+    data, repeats = without_repeats(data)
+    findings += _repeated(repeats)
     even = _even(data)
-    findings += check_channels(data, None if even is None else even.data.qd)
+    findings += check_channels(recording.data, None if even is None else even.data.qd)
     regression = None
     driven = "tau" not in data.estimated and bool(np.ptp(data.tau, axis=0).any())
     if even is not None:
         findings += _noise(data, even)
         findings += check_derivatives(data, even)
-        farthest = _farthest(even)
-        regression = surrogate(even.data, joints, farthest=farthest) if driven else None
-        findings += check_degrees(even.data, joints, regression, farthest)
+        findings += check_degrees(even.data, joints, driven=driven)
+        # Torques along motions in other units, or of channels that are cut off or dead, say nothing of signs.
+        sound = not any(each.severity == "error" or each.check in BLINDING for each in findings)
+        if driven and sound and robot is None and plain(data):
+            regression = examine_torques(
+                even.data, any_energy(tuple(joints)), farthest=_farthest(even), equations=equations, ambiguous=True
+            )
         if regression is not None:
-            stated = data.needs is not None and data.needs.friction
+            stated = data.needs is not None and bool(data.needs.friction or data.needs.joint_friction)
             findings += check_torques(even.data, regression, friction_stated=stated)
     on_tree = None
     if robot is not None:
         samples = even.data if even is not None else data
         farthest = 0 if even is None else _farthest(even)
-        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest)
-        # What the tree says of signs and delays is surer.
-        findings = [each for each in findings if each.check != "delay"]
-        if any(each.check == "tree-sign" for each in on_tree.findings):
-            findings = [each for each in findings if each.check != "torque-sign"]
+        on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
-    return Examination(told(findings), recording, even, regression, on_tree, step_of(data.q))
+    return Examination(told(findings), recording, even, regression, on_tree, step_of(recording.data.q))
+
+
+def plain(data: Trajectories) -> bool:
+    """Whether tau are the forces of the coordinates themselves, a motor for each."""
+    needs = data.needs
+    passive = not np.ptp(data.tau, axis=0).all()
+    return not passive and (needs is None or (needs.actuation is None and needs.joint_map is None))
+
+
+def _repeated(repeats: Repeats) -> list[Finding]:
+    count = int((repeats.q | repeats.tau).sum())
+    if not count:
+        return []
+    kinds = {"rows": repeats.rows, "q": repeats.q & ~repeats.rows, "tau": repeats.tau & ~repeats.rows}
+    counted = ", ".join(f"{int(where.sum())} of {name}" for name, where in kinds.items() if where.any())
+    why = "the log is faster than its source" if repeats.inserted else "messages were lost"
+    said = f"{count} sample(s) repeat the one before while the robot moves ({counted}): {why}"
+    return [Finding("warning", "repeated", said, "resample over them with smooth() or --cutoff auto")]
 
 
 def _farthest(even: Smoothed) -> int:

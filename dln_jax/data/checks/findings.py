@@ -8,7 +8,8 @@ from jaxtyping import Int
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""error: what is learned will be wrong; warning: worse than it need be; note: good to know."""
+"""error: what is learned would be wrong, so that commands that learn stop; warning: worse than it need be; note: good
+to know."""
 
 
 class Finding(NamedTuple):

@@ -1,9 +1,10 @@
 """Which column is which joint: names, limits, and the order in which torques fit; and the regressor to judge by."""
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.compilation import quick_compilation
@@ -11,11 +12,14 @@ from dln_jax.data.checks.findings import Finding, named
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.mechanics.trees import Tree, regressor
+from dln_jax.types import JointKind
 
 OUTSIDE = 0.05
 """rad or m beyond a limit."""
 EXPLAINED = 0.02
 """Of the torques' variance left unexplained, below which their order is right."""
+PADDED = 200
+"""Samples to a multiple of which a batch is filled up."""
 BETTER = 0.3
 """Of the unexplained variance that another order of the joints leaves."""
 
@@ -26,19 +30,31 @@ def parameters_of(tree: Tree) -> np.ndarray:
 
 
 def regressor_of(tree: Tree) -> Callable[..., np.ndarray]:
-    """(q, qd, qdd [n, d], gravity [3]) -> Phi [n, d, 11 d] of a tree: one program, whatever gravity is."""
-
-    def one(q, qd, qdd, gravity):
-        return regressor(tree._replace(gravity=gravity), q, qd, qdd)
-
-    with jax.enable_x64(True):
-        program = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)), compiler_options=quick_compilation())
+    """(q, qd, qdd [n, d], gravity [3]) -> Phi [n, d, 11 d] of a tree: one program for trees of one structure."""
+    program = _program(tree.parents, tree.joints, tuple(map(tuple, np.asarray(tree.axes).tolist())))
+    frames = np.asarray(tree.rotations, float), np.asarray(tree.positions, float)
 
     def phi(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        # Few shapes make few programs.
+        missing = -len(q) % PADDED
+        states = [np.concatenate([each, np.repeat(each[-1:], missing, axis=0)]) for each in (q, qd, qdd)]
         with jax.enable_x64(True):
-            return np.asarray(program(q, qd, qdd, jnp.asarray(gravity, jnp.float64)))
+            return np.asarray(program(*frames, np.asarray(gravity, float), *states))[: len(q)]
 
     return phi
+
+
+@functools.cache
+def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tuple[tuple[float, ...], ...]) -> Any:
+    d = len(parents)
+
+    def one(rotations, positions, gravity, q, qd, qdd):
+        inertias, armature = np.zeros((d, 10)), np.zeros(d)
+        tree = Tree(parents, joints, rotations, positions, np.array(axes), inertias, armature, gravity)
+        return regressor(tree, q, qd, qdd)
+
+    batch = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))
+    return jax.jit(batch, compiler_options=quick_compilation())
 
 
 def named_order(robot: Robot, names: tuple[str, ...]) -> list[Finding]:

@@ -29,12 +29,16 @@ def page(examined: Examination, name: str) -> list[str]:
             f"robot: the motions determine {on_tree.rank} of {on_tree.parameters} parameters, with friction's (some "
             f"are never determined alone); condition {on_tree.condition:.3g}"
         )
-        if on_tree.delays is not None:
-            lines.append(
-                f"robot: torques are {on_tree.delays.delay:.2f} samples late, and explained to "
-                f"{1 - on_tree.delays.error.min():.2%} by some parameters of it"
-            )
         lines.append("")
+    torques = on_tree.torques if on_tree is not None else examined.regression
+    if torques is not None:
+        by = "parameters near the robot's" if on_tree is not None else "an energy of any arm and friction"
+        lines.append(
+            f"torques: {by} predict blocks that were left out to {torques.explained.mean():.1%}; the likeliest delay "
+            f"is {torques.likely_delay:.2f} samples"
+        )
+    elif "tau" not in data.estimated:
+        lines.append("torques: signs, order of columns and delay cannot be checked in this log")
     if not examined.findings:
         lines.append("nothing was found")
     return [*lines, *(finding.line for finding in examined.findings)]
@@ -56,6 +60,7 @@ def _table(examined: Examination) -> list[str]:
         columns.append(("max |tau|", "N m|N", np.abs(data.tau).max(axis=0)))
         if smoothed is not None:
             columns.append(("noise tau", "N m|N", smoothed.noise_tau))
+    regression = on_tree.torques if on_tree is not None else regression
     if regression is not None:
         columns.append(("viscous", "N m s", regression.viscous))
         columns.append(("dry", "N m|N", regression.coulomb))

@@ -1,46 +1,51 @@
-"""Checks of torques against motions without a robot's description: signs, delay, friction, degrees."""
+"""Findings on torques: signs, columns, delay, friction, and angles that may be degrees."""
 
 import numpy as np
 
 from dln_jax.data.checks.channels import TURNS
 from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.checks.surrogate import Surrogate, surrogate
+from dln_jax.data.checks.hypotheses import Torques, any_energy, examine_torques
 from dln_jax.data.schema import Trajectories
 
 TRUSTED = 0.8
-"""Of the variance that the regression has to explain before its word counts."""
-SEEN = 0.05
-"""By so much the squared error grows without a term that is there."""
-LATE = 2.0
-"""Samples of delay that are worth a word: without a robot's description it is known to about one or two."""
-LATE_GAIN = 1.04
-"""By which the squared error falls with it."""
+"""Of a torque's variance, which has to be predicted before its friction counts."""
 DRY = 0.02
 """Of a torque's standard deviation, from which dry friction is named."""
+SURE = 5.0
+"""Standard deviations of dry friction, by which it is above zero."""
+FEWER = 300
+"""Equations by which degrees and radians are compared."""
 
 
-def check_torques(data: Trajectories, found: Surrogate, *, friction_stated: bool) -> list[Finding]:
-    """What the regression tells of torques."""
-    findings = []
-    sure = found.explained > TRUSTED
-    wrong = np.flatnonzero(sure & (found.inertia < 0) & (found.inertia_seen > SEEN))
+def check_torques(data: Trajectories, found: Torques, *, friction_stated: bool, by: str = "") -> list[Finding]:
+    """What the torques tell; `by` names the robot's file, if there is one."""
+    log, findings = found.log, []
+    before, after = (each.unexplained.mean() for each in (found.explanation, found.repaired))
+    gain = f"unexplained in blocks left out: {before:.2%} now, {after:.2%} then"
+    wrong = np.flatnonzero(log.signs < 0)
     if len(wrong):
-        said = f"the torque of {named(wrong)} points against its acceleration"
-        findings.append(Finding("error", "torque-sign", said, "turn that tau or that q round", tuple(map(int, wrong))))
-    if sure.any() and abs(found.delay) > LATE and found.delay_gain > LATE_GAIN:
-        step = float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
-        word = "late" if found.delay > 0 else "early"
-        said = f"torques are about {abs(found.delay) * step * 1e3:.2g} ms {word} against positions"
+        check = "tree-sign" if by else "torque-sign"
+        said = f"the torque of {named(wrong)} has the wrong sign ({gain})"
+        findings.append(Finding("error", check, said, "turn that tau or that q round", tuple(map(int, wrong))))
+    if log.order != tuple(range(len(log.order))):
+        moved = tuple(joint for joint, source in enumerate(log.order) if joint != source)
+        order = ", ".join(str(source + 1) for source in log.order)
+        said = f"the torques of {named(moved)} are exchanged: columns {order} of tau fit q ({gain})"
+        findings.append(Finding("error", "order", said, "order the columns of tau as those of q", moved))
+    if log.delay:
+        step = 1e3 * float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0]))
+        word = "late" if log.delay > 0 else "early"
+        said = f"torques are {abs(log.delay) * step:.3g} ms {word} against positions ({gain})"
         findings.append(Finding("warning", "delay", said, "shift one of them in time, or repair the clock of the log"))
-    elif not friction_stated:
-        findings += _friction(data, found, sure)
+    elif not friction_stated and not findings:
+        findings += _friction(found)
     return findings
 
 
-def _friction(data: Trajectories, found: Surrogate, sure: np.ndarray) -> list[Finding]:
-    size = data.tau[found.rows].std(axis=0)
-    positive = (found.coulomb > DRY * size) | (found.viscous * np.sqrt(np.mean(data.qd**2, axis=0)) > DRY * size)
-    rubbing = np.flatnonzero(sure & positive & (found.friction_seen > 4 * SEEN))
+def _friction(found: Torques) -> list[Finding]:
+    size = found.log.torques().std(axis=0)
+    sure = (found.explained > TRUSTED) & (found.coulomb > DRY * size) & (found.coulomb > SURE * found.coulomb_error)
+    rubbing = np.flatnonzero(sure)
     if not len(rubbing):
         return []
     sizes = ", ".join(f"{found.coulomb[joint]:.2g}" for joint in rubbing)
@@ -49,8 +54,8 @@ def _friction(data: Trajectories, found: Surrogate, sure: np.ndarray) -> list[Fi
     return [Finding("note", "friction", said, remedy, tuple(map(int, rubbing)))]
 
 
-def check_degrees(data: Trajectories, joints: tuple[str, ...], now: Surrogate | None, farthest: int) -> list[Finding]:
-    """Angles so large that they may be degrees, or those of motors; `now` is the regression as they are."""
+def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) -> list[Finding]:
+    """Angles so large that they may be degrees, or those of motors."""
     largest = np.abs(data.q).max(axis=0)
     large = np.array([kind == "revolute" for kind in joints]) & (largest > TURNS)
     if not large.any():
@@ -58,8 +63,8 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], now: Surrogate | 
     where = np.flatnonzero(large)
     factor = np.where(large, np.pi / 180, 1.0)
     converted = data._replace(q=data.q * factor, qd=data.qd * factor, qdd=data.qdd * factor)
-    then = None if now is None else surrogate(converted, joints, farthest=farthest)
-    better = now is not None and then is not None and _unexplained(then) < 0.7 * _unexplained(now)
+    now, then = (_unexplained(each, joints) if driven else None for each in (data, converted))
+    better = now is not None and then is not None and then < 0.7 * now
     if not better and largest.max() < 10 * TURNS:
         said = f"q of {named(where)} goes to {largest.max():.3g} rad, which is {largest.max() / 2 / np.pi:.1f} turns"
         remedy = "nothing if it turns on and on; else convert from degrees, or from the motor's angle by the gear ratio"
@@ -69,5 +74,6 @@ def check_degrees(data: Trajectories, joints: tuple[str, ...], now: Surrogate | 
     return [Finding("error", "q-unit", said, remedy, tuple(map(int, where)))]
 
 
-def _unexplained(found: Surrogate) -> float:
-    return float(np.mean(1 - np.maximum(found.explained, 0.0)))
+def _unexplained(data: Trajectories, joints: tuple[str, ...]) -> float | None:
+    found = examine_torques(data, any_energy(joints), farthest=0, equations=FEWER, ambiguous=False, faults=False)
+    return None if found is None else float(found.explanation.unexplained.mean())

@@ -1,12 +1,17 @@
 """Checks of a log against a robot's description: signs, gravity, gears, excitation, and which joint is which."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.data.checks.delays import Delays, away_from_ends, delay_of
+from dln_jax.data.checks.delays import away_from_ends
+from dln_jax.data.checks.evidence import Prior
 from dln_jax.data.checks.findings import Finding, named
+from dln_jax.data.checks.hypotheses import Build, Log, States, Torques, examine_torques
+from dln_jax.data.checks.hypotheses import friction as friction_of
 from dln_jax.data.checks.joints import better_order, limits, named_order, parameters_of, regressor_of
+from dln_jax.data.checks.torques import check_torques
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.solvers import least_squares
@@ -17,35 +22,20 @@ RELATED = 0.5
 """Correlation of a torque and the tree's, friction apart, from which they are of one joint."""
 GEAR = 5.0
 """A torque so many times the tree's, or less than it by so much, is that of another side of a gear."""
-SEEN = 0.02
-"""By so much the squared error grows without a term that counts."""
-TILTED = 20.0
-"""Degrees between the gravity of the data and that of the description."""
-TILT_EXPLAINS = 0.8
-"""Of the squared error, which a free gravity has to come below before it is believed."""
+TILTED = 4.0
+"""Degrees between the gravity of the data and that of the description, from which a tilt is looked for."""
+PACE = 0.03
+"""Logarithm of the factor between the motions' speeds by the robot and by t, from which a wrong clock is looked for."""
+LENGTH = 0.1
+"""m, by which the centre of a body may be elsewhere than its file says."""
+EQUATIONS = 1000
+"""Torques, over all joints, by which faults are looked for."""
 ILL = 1000.0
 """Condition of the scaled regressor, above which noise decides parameters."""
 RANK = 1e-7
 """Singular values below it, relative to the largest, are not determined."""
 FRICTION_SCALE = 0.05
 """Of a joint's typical velocity, on which dry friction is smooth."""
-
-
-class FrictionSeen(NamedTuple):
-    """Torques without what any parameters of a tree explain of them but friction."""
-
-    rows: np.ndarray
-    """Samples [n]."""
-    rest: np.ndarray
-    """Friction and error [n, d], N m or N."""
-    viscous: np.ndarray
-    """[d], N m s or N s/m."""
-    coulomb: np.ndarray
-    """[d], N m or N."""
-    velocity_scale: np.ndarray
-    """[d], 1/s or m/s, on which dry friction is smooth."""
-    explained: np.ndarray
-    """Share of each torque's variance, friction included [d]."""
 
 
 class OnTree(NamedTuple):
@@ -63,10 +53,8 @@ class OnTree(NamedTuple):
     parameters: int
     condition: float
     """Of the scaled columns that count."""
-    delays: Delays | None
-    """Of torques against positions, by any parameters of the tree; `None` without torques."""
-    friction: FrictionSeen | None
-    """Beside the parameters of the tree that fit best; `None` without torques."""
+    torques: Torques | None
+    """By parameters near those of the tree; `None` without torques or with too few samples."""
 
 
 class _Forces(NamedTuple):
@@ -83,7 +71,13 @@ class _Forces(NamedTuple):
 
 
 def against_tree(
-    data: Trajectories, robot: Robot, names: tuple[str, ...], *, driven: bool, farthest: int = 0
+    data: Trajectories,
+    robot: Robot,
+    names: tuple[str, ...],
+    *,
+    driven: bool,
+    farthest: int = 0,
+    equations: int = EQUATIONS,
 ) -> OnTree:
     """Compares samples whose rates are sound with the tree.
 
@@ -93,6 +87,7 @@ def against_tree(
         names: the data's joints, where they state them.
         driven: whether there are torques.
         farthest: samples of delay that are tried.
+        equations: torques, over all joints, by which faults are looked for.
     """
     found = named_order(robot, names) + limits(data, robot)
     inside = away_from_ends(data.trajectory, farthest)
@@ -102,7 +97,7 @@ def against_tree(
     phi, theta, down = regressor_of(robot.tree), parameters_of(robot.tree), np.asarray(robot.tree.gravity, float)
     friction = _friction_columns(qd)
     columns = _with_friction(phi(q, qd, qdd, down), friction)
-    rank, parameters, condition, seen = _fitted(columns, tau, qd, chosen, driven=driven)
+    rank, condition = _determined(columns, tau, driven=driven)
     if condition > ILL:
         said = f"the condition of the regressor is {condition:.3g}"
         found.append(
@@ -110,21 +105,90 @@ def against_tree(
         )
     if not driven:
         unknown = np.full(q.shape[1], np.nan)
-        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, parameters, condition, None, None)
+        return OnTree(found, unknown, unknown, np.full(3, np.nan), rank, columns.shape[1], condition, None)
     still = np.zeros_like(q)
     along = np.stack([phi(q, still, still, axis) @ theta for axis in np.eye(3)], axis=2)
     forces = _Forces(phi(q, qd, qdd, np.zeros(3)) @ theta, along, tau, friction)
-    scale, correlation, signs = _by_joint(forces, down)
-    estimate, tilt = _gravity(forces, down)
-    wrong_order = better_order(phi, theta, down, (q, qd, qdd, tau), friction)
-    if wrong_order and not any(each.check == "order" for each in found):
-        found += wrong_order
-    else:
-        found += _signs(correlation, signs, estimate, tilt, down) + _gears(scale, correlation)
-    shifted = np.stack([data.tau[chosen + shift] for shift in range(-farthest, farthest + 1)], axis=2)
-    delays = delay_of(columns, shifted, float(np.median(np.diff(data.t)[np.diff(data.trajectory) == 0])))
-    found += delays.findings
-    return OnTree(found, scale, correlation, estimate, rank, parameters, condition, delays, seen)
+    scale, correlation = _by_joint(forces, down)
+    estimate = _gravity(forces, down)
+    torques = examine_torques(
+        data, near_tree(phi, theta, down), farthest=farthest, equations=equations,
+        ambiguous=False, others=lambda log: _mounted(log, estimate, down) + _paced(log, forces, down),
+    )  # fmt: skip
+    geared = _gears(scale, correlation)
+    if torques is not None:
+        found += check_torques(data, torques, friction_stated=True, by="robot") + _base_and_clock(torques, down)
+    if not any(each.check in ("order", "tree-sign", "gravity", "clock") for each in found):
+        # Columns of q and tau in another order than the robot's make torques of other sizes, too.
+        found += better_order(phi, theta, down, (q, qd, qdd, tau), friction) or geared
+    return OnTree(found, scale, correlation, estimate, rank, columns.shape[1], condition, torques)
+
+
+def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray) -> Build:
+    """The prior of torques of a tree whose parameters are near those of its file, and friction."""
+    d = len(theta) // 11
+    bodies = np.abs(theta[: 10 * d]).reshape(d, 10)
+    mass = np.maximum(bodies[:, :1], 1e-3 * bodies[:, :1].max())
+    # A body whose file is wrong by its own mass has its centre and inertia elsewhere by as much as these.
+    spread = np.hstack([mass, mass * LENGTH * np.ones((1, 3)), mass * LENGTH**2 * np.ones((1, 6))])
+    sizes = np.concatenate([np.maximum(bodies, spread).ravel(), np.full(d, float(spread[:, 4].max()))])
+
+    def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
+        columns = phi(*states, down if gravity is None else gravity).reshape(tau.size, -1)
+        return Prior(columns @ theta, [], [columns * sizes, *friction_of(states[1])])
+
+    return build
+
+
+def _mounted(log: Log, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
+    """The log of a robot whose base is turned as the data say."""
+    length = float(np.linalg.norm(estimate))
+    if log.gravity is not None or not length > 0 or _angle(estimate, down) < TILTED:
+        return []
+    return [log._replace(gravity=estimate * np.linalg.norm(down) / length)]
+
+
+def _paced(log: Log, forces: _Forces, down: np.ndarray) -> list[Log]:
+    """The log of a robot that moved faster or slower than its times say: inertial forces go with the square."""
+    if log.speed != 1.0:
+        return []
+    rows, rhs = [], []
+    for joint, columns in enumerate(forces.friction):
+        block = np.column_stack([forces.inertial[:, joint], forces.gravity[:, joint] @ down, forces.measured[:, joint]])
+        basis = np.linalg.qr(columns)[0]
+        block = (block - basis @ (basis.T @ block)) / max(float(forces.measured[:, joint].std()), 1e-300)
+        rows.append(block[:, :2])
+        rhs.append(block[:, 2])
+    inertial, weight = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rhs), rcond=1e-10)[0]
+    if not (inertial > 0 and weight > 0):
+        return []
+    speed = float(np.sqrt(inertial / weight))
+    return [] if abs(np.log(speed)) < PACE else [log._replace(speed=speed)]
+
+
+def _base_and_clock(found: Torques, down: np.ndarray) -> list[Finding]:
+    gravity, speed = found.log.gravity, found.log.speed
+    before, after = (each.unexplained.mean() for each in (found.explanation, found.repaired))
+    gain = f"unexplained in blocks left out: {before:.2%} now, {after:.2%} then"
+    if gravity is not None and gravity @ down < 0 and _angle(gravity, -down) < 2 * TILTED:
+        said = f"gravity pulls the other way: the data say {_rounded(gravity)} m/s² ({gain})"
+        remedy = "turn gravity round in the description, or see how the arm is mounted and where its joints have zero"
+        return [Finding("error", "gravity", said, remedy)]
+    if gravity is not None:
+        said = (
+            f"gravity is tilted by {_angle(gravity, down):.0f} degrees: the data say {_rounded(gravity)} m/s² ({gain})"
+        )
+        return [Finding("error", "gravity", said, "state how the base is mounted, or see where joints have zero")]
+    if speed != 1.0:
+        said = f"the robot's inertia asks for motions about {speed:.2g} times as fast as t says ({gain})"
+        return [Finding("error", "clock", said, "see whether t is in seconds, and the rate at which the log was taken")]
+    return []
+
+
+def _angle(first: np.ndarray, second: np.ndarray) -> float:
+    """Degrees between two vectors."""
+    cosine = first @ second / max(float(np.linalg.norm(first) * np.linalg.norm(second)), 1e-300)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _scales(qd: np.ndarray) -> np.ndarray:
@@ -136,23 +200,13 @@ def _friction_columns(qd: np.ndarray) -> list[np.ndarray]:
     return [np.column_stack([qd[:, joint], dry[:, joint], np.ones(len(qd))]) for joint in range(qd.shape[1])]
 
 
-def _fitted(
-    columns: np.ndarray, tau: np.ndarray, qd: np.ndarray, chosen: np.ndarray, *, driven: bool
-) -> tuple[int, int, float, FrictionSeen | None]:
-    """Rank, parameters and condition of the columns, and the friction that their fit leaves."""
+def _determined(columns: np.ndarray, tau: np.ndarray, *, driven: bool) -> tuple[int, float]:
+    """Rank and condition of the columns."""
     n, d = tau.shape
     sizes = np.where(tau.std(axis=0) > 0, tau.std(axis=0), 1.0) if driven else np.ones(d)
     weighted = (columns.reshape(n, d, -1) / sizes[:, None]).reshape(n * d, -1)
     solution = least_squares.solve(weighted, (tau / sizes).ravel(), rank_tolerance=RANK, negligible=1e-9)
-    if not driven:
-        return solution.rank, columns.shape[1], solution.condition, None
-    left = tau - (columns @ solution.x).reshape(n, d)
-    own = np.split(solution.x[-3 * d :], d)
-    friction = np.stack([block @ own[joint] for joint, block in enumerate(_friction_columns(qd))], axis=1)
-    viscous, coulomb = np.array(own)[:, :2].T
-    explained = 1 - left.var(axis=0) / np.maximum(tau.var(axis=0), np.finfo(float).tiny)
-    seen = FrictionSeen(chosen, left + friction, viscous, coulomb, _scales(qd), explained)
-    return solution.rank, columns.shape[1], solution.condition, seen
+    return solution.rank, solution.condition
 
 
 def _with_friction(columns: np.ndarray, friction: list[np.ndarray]) -> np.ndarray:
@@ -162,25 +216,6 @@ def _with_friction(columns: np.ndarray, friction: list[np.ndarray]) -> np.ndarra
     for joint, block in enumerate(friction):
         own[:, joint, 3 * joint : 3 * joint + 3] = block
     return np.concatenate([columns, own], axis=2).reshape(len(columns) * d, -1)
-
-
-def _signs(
-    correlation: np.ndarray, signs: np.ndarray, estimate: np.ndarray, tilt: float, down: np.ndarray
-) -> list[Finding]:
-    """Torques that point the other way, or gravity that does."""
-    weights = signs[:, 1]
-    if estimate @ down < 0 and (weights < 0).any() and not (weights > 0).any() and not (signs[:, 0] < 0).any():
-        said = f"gravity pulls the other way: the data say {_rounded(estimate)} m/s²"
-        remedy = "turn gravity round in the description, or see how the arm is mounted and where its joints have zero"
-        return [Finding("error", "gravity", said, remedy)]
-    flipped = np.flatnonzero(correlation < -RELATED)
-    if len(flipped):
-        said = f"the torque of {named(flipped)} has the opposite sign of the tree's"
-        return [Finding("error", "tree-sign", said, "turn that tau or that q round", tuple(map(int, flipped)))]
-    if tilt > TILTED:
-        said = f"gravity is tilted by {tilt:.0f} degrees: the data say {_rounded(estimate)} m/s²"
-        return [Finding("error", "gravity", said, "state how the base is mounted, or see where joints have zero")]
-    return []
 
 
 def _rounded(vector: np.ndarray) -> str:
@@ -197,36 +232,22 @@ def _gears(scale: np.ndarray, correlation: np.ndarray) -> list[Finding]:
     return [Finding("error", "gear", said, remedy, tuple(map(int, geared)))]
 
 
-def _by_joint(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale and correlation of each torque to the tree's, friction apart; and signs of both its parts [d, 2].
-
-    A sign is 0 where the part makes no difference.
-    """
-    weight = forces.gravity @ down
-    scale, correlation, signs = [], [], []
+def _by_joint(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scale and correlation of each torque to the tree's, friction apart."""
+    scale, correlation = [], []
     for joint, columns in enumerate(forces.friction):
         basis = np.linalg.qr(columns)[0]
-        of_joint = (forces.inertial[:, joint], weight[:, joint], forces.measured[:, joint])
-        inertial, gravity, measured = (x - basis @ (basis.T @ x) for x in of_joint)
-        both = inertial + gravity
-        sizes = float(both @ both), float(measured @ measured)
+        of_joint = (forces.inertial[:, joint] + forces.gravity[:, joint] @ down, forces.measured[:, joint])
+        tree, measured = (x - basis @ (basis.T @ x) for x in of_joint)
+        sizes = float(tree @ tree), float(measured @ measured)
         known = min(sizes) > 0
-        scale.append(float(both @ measured) / sizes[0] if known else np.nan)
-        correlation.append(float(both @ measured) / np.sqrt(sizes[0] * sizes[1]) if known else 0.0)
-        pair = np.column_stack([inertial, gravity])
-        fit = np.linalg.lstsq(pair, measured, rcond=1e-10)[0]
-        error = max(float(np.sum((measured - pair @ fit) ** 2)), 1e-12 * sizes[1], np.finfo(float).tiny)
-        seen = []
-        for part in range(2):
-            other, own = pair[:, 1 - part], pair[:, part]
-            own = own - other * (other @ own) / max(float(other @ other), np.finfo(float).tiny)
-            seen.append(float(np.sign(fit[part])) if fit[part] ** 2 * (own @ own) / error > SEEN else 0.0)
-        signs.append(seen)
-    return np.array(scale), np.array(correlation), np.array(signs)
+        scale.append(float(tree @ measured) / sizes[0] if known else np.nan)
+        correlation.append(float(tree @ measured) / np.sqrt(sizes[0] * sizes[1]) if known else 0.0)
+    return np.array(scale), np.array(correlation)
 
 
-def _gravity(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, float]:
-    """The gravity that explains all joints' torques best, and its angle to the tree's in degrees, 0 where unsure."""
+def _gravity(forces: _Forces, down: np.ndarray) -> np.ndarray:
+    """The gravity that explains all joints' torques best, with inertial forces of any size."""
     rows, rhs = [], []
     for joint, columns in enumerate(forces.friction):
         measured = forces.measured[:, joint]
@@ -237,13 +258,7 @@ def _gravity(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, float]:
         block = block - basis @ (basis.T @ block)
         rows.append(block[:, :4])
         rhs.append(block[:, 4])
-    if not rows:
-        return np.full(3, np.nan), 0.0
-    A, b = np.concatenate(rows), np.concatenate(rhs)
-    free = least_squares.solve(A, b, rank_tolerance=1e-6, negligible=1e-9)
-    described = least_squares.solve(np.column_stack([A[:, 0], A[:, 1:] @ down]), b, negligible=1e-9)
-    estimate = free.x[1:]
-    length = float(np.linalg.norm(estimate) * np.linalg.norm(down))
-    if length == 0 or free.residual**2 > TILT_EXPLAINS * described.residual**2:
-        return estimate, 0.0
-    return estimate, float(np.degrees(np.arccos(np.clip(estimate @ down / length, -1, 1))))
+    if not rows or not np.any(down):
+        return np.full(3, np.nan)
+    free = least_squares.solve(np.concatenate(rows), np.concatenate(rhs), rank_tolerance=1e-6, negligible=1e-9)
+    return free.x[1:]

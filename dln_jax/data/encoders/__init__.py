@@ -6,16 +6,20 @@
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import derivatives, low_pass
 from dln_jax.data.encoders.noise import noise_of, step_of
+from dln_jax.data.encoders.repeats import Repeats, find_repeats, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
 
 __all__ = [
     "Choice",
+    "Repeats",
     "Smoothed",
     "choose_cutoff",
     "derivatives",
+    "find_repeats",
     "labels_of_parts",
     "low_pass",
     "noise_of",
     "smooth",
     "step_of",
+    "without_repeats",
 ]

@@ -8,14 +8,20 @@ H leaves of the motion's acceleration 1 - H missing, and lets H of the noise's t
 The weight of frequencies falls out of the place of the minimum for a steep filter, which is where S = N whatever is
 differentiated: so one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967), so that
 the motion does not leak into the floor, and divided by the gain of the differences.
+
+Spectra are means of squares, which a single jump decides; the noise is a median, which no jump changes. So jumps are
+interpolated over before spectra are taken, and where the top of a spectrum is flat and higher than the median's floor,
+that is the floor. Noise need not be white: from where the spectrum of accelerations rises for good, it is noise.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.encoders.filters import ORDER, gain
+from dln_jax.data.encoders.noise import NORMAL
 from dln_jax.types import InputError, require_positive
 
 SEGMENT = 8.0
@@ -25,11 +31,23 @@ SEEN = 1.5
 CANDIDATES = 200
 """Cut-offs that are tried."""
 TOP = 0.45
-"""Of the rate: where the best cut-off would be no lower, nothing is to be filtered."""
+"""Highest cut-off that is tried, as a fraction of the rate."""
 MOVES = 2.0
 """Standard deviations of noise, by more than which a joint has to move."""
 WORTH = 1e-4
-"""Relative error of unfiltered accelerations, below which nothing is to be filtered either."""
+"""Relative error of unfiltered accelerations, below which nothing is filtered; above it there always is a cut-off."""
+JUMP = 8.0
+"""Standard deviations by which a sample of a jump differs from what its neighbours predict."""
+RARE = 0.1
+"""Largest share of the samples that can be jumps; more of them are a motion, or noise that is not white."""
+PREDICTION = math.sqrt(1 + 524 / 400)
+"""Standard deviation of the prediction's error, in that of the noise."""
+MEDIAN = math.log(2)
+"""Median of a spectrum's lines over their mean, where few segments are averaged."""
+RISES = 3.0
+"""Times its lowest value, which a spectrum of accelerations exceeds at high frequencies where those are noise."""
+FLAT = 4.0
+"""Largest ratio between the parts of the upper half of a spectrum at which it counts as flat."""
 
 
 class Choice(NamedTuple):
@@ -70,8 +88,9 @@ def choose_cutoff(
         InputError: no stretch has sixteen samples, or nothing moves by more than its noise.
     """
     require_positive(rate=rate, order=order)
-    f, spectrum = spectra(q, trajectory, rate=rate)
-    floor = 2 * noise**2 / rate
+    f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
+    white = np.maximum(2 * noise**2 / rate, _flat_top(f, spectrum))
+    floor = np.maximum(white, _rising(f, spectrum))
     signal = _motion(f, spectrum, floor)
     tried = np.geomspace(max(f[0], rate / 500), TOP * rate, CANDIDATES)
     weight = (2 * np.pi * f) ** 4
@@ -85,9 +104,62 @@ def choose_cutoff(
         left = weight @ ((1 - H) ** 2 * signal + H**2 * floor)
         error[place] = np.mean(left[moves] / sizes[moves])
     best = int(np.argmin(error))
-    raw = np.mean((weight @ np.broadcast_to(floor, spectrum.shape))[moves] / sizes[moves])
-    cutoff = float(tried[best]) if best < CANDIDATES - 1 and raw > WORTH**2 else np.inf
-    return Choice(cutoff, tried, error, f, spectrum, floor)
+    raw = np.mean((weight @ floor)[moves] / sizes[moves])
+    cutoff = float(tried[best]) if raw > WORTH**2 else np.inf
+    return Choice(cutoff, tried, error, f, spectrum, white)
+
+
+def without_jumps(
+    values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], noise: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "N k"]:
+    """Values in which rare samples that neither noise nor the motion explains are interpolated.
+
+    A sample is compared with what the quintic through three samples on either side predicts, (1, -6, 15, 15, -6, 1)
+    / 20. A jump is an error of many standard deviations both of the noise and of such errors elsewhere.
+    """
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import maximum_filter1d
+
+    inside = np.flatnonzero(trajectory[6:] == trajectory[:-6]) + 3
+    if not len(inside):
+        return values
+    sums = [values[inside - k] + values[inside + k] for k in (1, 2, 3)]
+    errors = np.zeros_like(values)
+    errors[inside] = np.abs(values[inside] - (15 * sums[0] - 6 * sums[1] + sums[2]) / 20)
+    usual = np.maximum(PREDICTION * noise, np.median(errors[inside], axis=0) / NORMAL)
+    # Errors of the samples beside a jump come from the jump.
+    wrong = (errors > JUMP * usual) & (errors == maximum_filter1d(errors, 7, axis=0))
+    values, places = values.copy(), np.arange(len(values))
+    for channel in np.flatnonzero(wrong.any(axis=0) & (wrong.mean(axis=0) < RARE)):
+        bad = wrong[:, channel]
+        values[bad, channel] = make_interp_spline(places[~bad], values[~bad, channel], k=5)(places[bad])
+    return values
+
+
+def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, " d"]:
+    """The level of the upper half of each spectrum where that is flat, as white noise is; zero elsewhere."""
+    parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
+    if len(parts) < 3:
+        return np.zeros(spectrum.shape[1])
+    levels = np.array(parts)
+    flat = levels.max(axis=0) < FLAT * levels.min(axis=0)
+    return np.where(flat, levels.min(axis=0) / MEDIAN, 0.0)
+
+
+def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
+    """The part of each spectrum above the lowest power of the accelerations, where that rises up to half the rate.
+
+    Forces of finite power make accelerations whose spectrum falls, so what rises is noise, white or not: samples that
+    are late by a part of a step, for one, are noise whose size is that of the velocity. Zero elsewhere.
+    """
+    accelerations = f[:, None] ** 4 * _smoothed(spectrum)
+    found = np.zeros_like(spectrum)
+    for channel, power in enumerate(accelerations.T):
+        peak = int(np.argmax(power[f < f[-1] / 4])) if (f < f[-1] / 4).any() else 0
+        lowest = peak + int(np.argmin(power[peak:]))
+        if power[f > f[-1] / 2].min() > RISES * power[lowest]:
+            found[lowest:, channel] = spectrum[lowest:, channel]
+    return found
 
 
 def spectra(
@@ -117,7 +189,7 @@ def spectra(
 
 
 def _motion(
-    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, " d"]
+    f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, "F d"]
 ) -> Float[np.ndarray, "F d"]:
     """S of each joint: what stands out of the floor, up to where it first does not."""
     smooth = _smoothed(spectrum)

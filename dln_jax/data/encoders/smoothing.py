@@ -1,6 +1,7 @@
 """From q, t and tau of a log to trajectories with rates.
 
-1. Gaps cut a trajectory, short ones are bridged; samples at unequal steps are interpolated to one rate.
+1. Rows that repeat the one before are left out (see `repeats`). Gaps cut a trajectory, short ones are bridged; samples
+   at unequal steps are interpolated to one rate.
 2. The noise of each channel is estimated, and from it and the spectra of q the cut-off, unless that is given.
 3. q is filtered without delay, and qd and qdd are derivatives of the result; tau is filtered too where samples are left
    out, which it has to be, and where one asks for it.
@@ -21,6 +22,7 @@ from dln_jax.data.encoders import sampling
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
 from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.stretches import stretches
 from dln_jax.types import InputError, require_positive
@@ -59,6 +61,8 @@ class Smoothed(NamedTuple):
     """Trajectories, after cuts at longer gaps."""
     left_out: int
     """Stretches that were too short."""
+    repeats: Repeats
+    """Samples of the log that repeat the one before; they were resampled over."""
 
 
 def smooth(
@@ -92,6 +96,7 @@ def smooth(
     require_positive(order=order, decimate=decimate)
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
+    data, repeats = without_repeats(data)
     if rate is None:
         # Differences of times are rounded.
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
@@ -124,7 +129,7 @@ def smooth(
     share = np.sqrt(min(1.0, 2 * cutoff / rate)) if filtered else 1.0
     return Smoothed(
         smoothed, cutoff, rate, noise_q, noise_tau * share, choice, order, filtered, decimate, trim,
-        bridged=gaps, parts=len(kept), left_out=len(pieces) - len(kept),
+        bridged=gaps, parts=len(kept), left_out=len(pieces) - len(kept), repeats=repeats,
     )  # fmt: skip
 
 

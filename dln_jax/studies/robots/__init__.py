@@ -10,7 +10,14 @@ from matplotlib.figure import Figure
 from dln_jax.figures.robots import errors_by_arm, errors_by_joint
 from dln_jax.precision import in_float64
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.robots import before_fitting, double_pendulum, known_kinematics, learned_kinematics, speed
+from dln_jax.studies.robots import (
+    before_fitting,
+    double_pendulum,
+    known_kinematics,
+    learned_kinematics,
+    log_checks,
+    speed,
+)
 from dln_jax.studies.robots.recorded_arm import recorded_arm
 
 MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
@@ -22,6 +29,11 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
         "kernels": learned_kinematics.kernels,
     },
     "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
+    "logs": {
+        "sound": functools.partial(log_checks.sound, with_robot=False),
+        "faulty": log_checks.faulty,
+        "sound-with-robot": functools.partial(log_checks.sound, with_robot=True),
+    },
     "speed": {"seven-axis": speed.speed},
 }
 """quick -> findings, by subject and by name; only `speed` depends on the machine."""

@@ -1,11 +1,13 @@
 """Every check finds the fault that is planted, names its joint, and is silent on data without it."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.checks import as_recording, examine, page, quick, read
+from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariance
 from dln_jax.data.robots import Robot
 from dln_jax.datasets import generators
 from dln_jax.mechanics import trees
@@ -100,6 +102,20 @@ def one_run(arrays):
     return {key: value if key == "needs" else value[kept] for key, value in arrays.items()}
 
 
+def with_spikes(arrays):
+    tau = arrays["tau"].copy()
+    tau[100::500, 2] += 5 * tau[:, 2].std()
+    return {**arrays, "tau": tau[: len(arrays["t"])]}
+
+
+def with_repeats(arrays):
+    rows = np.arange(100, len(arrays["t"]) - 5, 101)
+    changed = {key: arrays[key].copy() for key in ("q", "qd", "tau")}
+    for values in changed.values():
+        values[rows] = values[rows - 1]
+    return {**arrays, **changed}
+
+
 LOG_FAULTS = {
     "degrees per second": (lambda a: {**a, "qd": np.degrees(a["qd"])}, "qd-unit", (0, 1, 2), "degrees"),
     "q in degrees": (lambda a: {**a, "q": np.degrees(a["q"])}, "qd-unit", (0, 1, 2), "q from degrees"),
@@ -131,6 +147,14 @@ LOG_FAULTS = {
     "constant torque": (
         lambda a: {**a, "tau": column(a["tau"], 0, lambda x: 0 * x + 2)}, "constant-torque", (0,), "constant"
     ),
+    "torques exchanged": (lambda a: {**a, "tau": a["tau"][:, [0, 2, 1]]}, "order", (1, 2), "1, 3, 2"),
+    "dead torque": (lambda a: {**a, "tau": column(a["tau"], 1, np.zeros_like)}, "dead-torque", (1,), "zero"),
+    "all torques dead": (lambda a: {**a, "tau": 0 * a["tau"]}, "dead-torque", (0, 1, 2), "zero"),
+    "qd and qdd exchanged": (
+        lambda a: {**a, "qd": motions(seed=1)[3].reshape(-1, 3), "qdd": a["qd"]}, "qd-exchanged", (), "exchange"
+    ),
+    "spikes": (with_spikes, "spikes", (2,), "5 spike"),
+    "repeated rows": (with_repeats, "repeated", (), "27 of rows"),
     "friction not stated": (lambda a: without(["needs"], a), "friction", None, "friction is seen"),
 }  # fmt: skip
 
@@ -191,8 +215,8 @@ def test_a_clean_log_suits_its_robot(clean):
     assert examined.findings == []
     assert on_tree.scale == pytest.approx(np.ones(3), rel=0.1)
     assert on_tree.gravity == pytest.approx([0, 0, -9.81], abs=0.3)
-    assert abs(on_tree.delays.delay) < 0.2
-    assert on_tree.friction.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
+    assert abs(on_tree.torques.likely_delay) < 0.2
+    assert on_tree.torques.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
     assert 0 < on_tree.rank < on_tree.parameters and 1 < on_tree.condition < 1000
     assert "nothing was found" in page(examined, "log.npz")
 
@@ -208,7 +232,7 @@ def test_a_fault_against_the_robot_is_found(clean, name):
     if name == "upside down":
         assert "-9." in found[0].said
     if name == "torques late":
-        assert examined.on_tree.delays.delay == pytest.approx(2, abs=0.3)
+        assert examined.on_tree.torques.log.delay == pytest.approx(2, abs=0.3)
 
 
 def test_a_robot_of_another_size_is_refused(clean):
@@ -232,6 +256,68 @@ def test_times_out_of_order_or_double_are_repaired_and_said(clean, tmp_path):
     )
     findings = examine(recording, arm()).findings
     assert {"time-order", "time-double", "order"} <= {finding.check for finding in findings}
+
+
+def test_spikes_are_not_taken_for_a_delay(clean):
+    checks = {finding.check for finding in quick(schema.from_arrays(with_spikes(clean)))}
+    assert checks == {"spikes"}
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_exact_logs_of_planar_arms_have_no_false_sign_or_delay(seed):
+    t, q, qd, qdd = motions(seed)
+    links = [trees.inertial_parameters(m, [0.2, 0, 0], 0.02 * np.eye(3)) for m in (2.0, 1.0, 0.5)]
+    frames = trees.dh_frames([[0, 0.4 * (k > 0), 0, 0] for k in range(3)])
+    tree = trees.serial(*frames, links, gravity=(0.0, -9.81, 0.0))
+    states = [x[0] for x in (q, qd, qdd)]
+    tau = np.asarray(jax.jit(jax.vmap(lambda *state: trees.newton_euler(tree, *state)))(*states)) + 0.2 * states[1]
+    data = schema.from_arrays({"t": t, "q": states[0], "tau": tau, "trajectory": np.zeros(SAMPLES, int)})
+    examined = examine(as_recording(data), equations=300)
+    assert [finding.check for finding in examined.findings if finding.severity != "note"] == ["split"]
+    assert abs(examined.regression.likely_delay) < 0.05
+    assert examined.regression.viscous == pytest.approx(np.full(3, 0.2), abs=0.02)
+
+
+def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
+    tilted = arm(gravity=(9.81 * np.sin(0.3), 0.0, -9.81 * np.cos(0.3)))
+    on_tree = examine(as_recording(schema.from_arrays(clean)), tilted, equations=300).on_tree
+    assert [finding.check for finding in on_tree.findings] == ["gravity"]
+    assert "17 degrees" in on_tree.findings[0].said
+    slow = without(["qd"], {**clean, "t": 1.25 * clean["t"]})
+    on_tree = examine(as_recording(schema.from_arrays(slow)), arm(), equations=300).on_tree
+    assert [finding.check for finding in on_tree.findings] == ["clock"]
+    assert on_tree.torques.log.speed == pytest.approx(1.25, rel=0.03)
+
+
+def test_covariance_of_torques_is_that_of_an_energy():
+    """The closed form equals derivatives of the energies' covariance by JAX."""
+    random, joints, sizes = np.random.default_rng(0), ("revolute", "prismatic"), np.array([1.0, 0.4])
+    states, others = (tuple(random.normal(size=(2, 2)) for _ in range(3)) for _ in range(2))
+    found = covariance(states, others, joints, sizes)
+    strength = np.clip(STRONGEST * np.sqrt(sizes), WEAKEST, STRONGEST)
+    ranges = np.ptp(states[0], axis=0)
+
+    def kernel(q, other, power):
+        turning = ((1 + strength[0] * jnp.cos(q[0] - other[0])) / (1 + strength[0])) ** power
+        return turning * jnp.exp(-0.5 * ((q[1] - other[1]) / (2 * ranges[1])) ** 2)
+
+    def torque(energy, q, qd, qdd):
+        return jax.jvp(jax.grad(energy, 1), (q, qd), (qd, qdd))[1] - jax.grad(energy)(q, qd)
+
+    def kinetic(state, other):
+        def by_state(p, v):
+            return torque(lambda q, u: kernel(q, p, 2) * (u * sizes @ v) ** 2, *state)
+
+        return jnp.stack([torque(lambda p, v, i=i: by_state(p, v)[i], *other) for i in range(2)])
+
+    with jax.enable_x64(True):
+        for a in range(2):
+            for b in range(2):
+                state, other = ([jnp.asarray(x[k]) for x in xs] for xs, k in ((states, a), (others, b)))
+                block = (slice(2 * a, 2 * a + 2), slice(2 * b, 2 * b + 2))
+                assert found.kinetic[block] == pytest.approx(np.asarray(kinetic(state, other)), abs=1e-12)
+                potential = jax.jacfwd(jax.grad(lambda q, p: kernel(q, p, 1)), 1)(state[0], other[0])
+                assert found.potential[block] == pytest.approx(np.asarray(potential), abs=1e-12)
 
 
 def test_a_file_that_is_none_is_refused(tmp_path):

@@ -1,0 +1,112 @@
+"""What a log says for one explanation of its torques against another: predictions of blocks that were left out.
+
+An explanation is a Gaussian prior of all torques: a mean, and a sum of covariances whose weights are variances. The
+weights are those of largest likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.07426). Explanations are
+compared by the probability of each block of time given all others, so that a fault has to be visible in most of the
+log before it is one.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+ITERATIONS = 12
+"""Steps to the largest likelihood, which needs no more than a digit of the weights."""
+BLOCKS = 10
+
+
+class Prior(NamedTuple):
+    """Of the torques of n samples, sample by sample, [n d]."""
+
+    mean: Float[np.ndarray, " a"]
+    parts: list[Float[np.ndarray, "a a"]]
+    """Covariances that are weighted."""
+    columns: list[Float[np.ndarray, "a k"]]
+    """Factors of more such covariances, C Cᵀ."""
+
+
+class Explanation(NamedTuple):
+    """How well a prior explains torques."""
+
+    weights: Float[np.ndarray, " w"]
+    """Variance of each part, each factor, and each joint's noise."""
+    inverse: Float[np.ndarray, "a a"]
+    """Of the covariance."""
+    pull: Float[np.ndarray, " a"]
+    """inverse (y - mean)."""
+    densities: Float[np.ndarray, " B"]
+    """Logarithm of the probability of each block given the others."""
+    unexplained: Float[np.ndarray, "B d"]
+    """Squared error of each block's predictions over the variance of the joint's torque."""
+
+
+def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = ITERATIONS) -> Explanation:
+    """The weights of largest likelihood, and how well each block is predicted from the others."""
+    n, d = tau.shape
+    y = tau.ravel() - prior.mean
+    sizes = tau.var(axis=0)
+    joint = np.tile(np.arange(d), n)
+    noise = np.tile(np.maximum(sizes, 1e-12 * sizes.max()), n)
+    weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
+    count, factors = len(prior.parts), len(prior.columns)
+    for last in [False] * iterations + [True]:
+        K = np.diag(weights[count + factors :][joint] * noise)
+        for weight, part in zip(weights, prior.parts, strict=False):
+            K += weight * part
+        for weight, columns in zip(weights[count:], prior.columns, strict=False):
+            K += weight * (columns @ columns.T)
+        inverse = _inverse(K)
+        pull = inverse @ y
+        if last:
+            break
+        slopes = [(pull @ part @ pull, np.sum(inverse * part)) for part in prior.parts]
+        for columns in prior.columns:
+            slopes.append((np.sum((columns.T @ pull) ** 2), np.sum(columns * (inverse @ columns))))
+        own = pull**2 * noise, np.diag(inverse) * noise
+        slopes += [(own[0][joint == each].sum(), own[1][joint == each].sum()) for each in range(d)]
+        weights = weights * np.array([np.sqrt(fit / max(size, 1e-300)) for fit, size in slopes])
+        weights[count + factors :] = np.maximum(weights[count + factors :], 1e-7)
+    densities, unexplained = [], []
+    for block in blocks_of(n, d):
+        block = block.ravel()
+        own = inverse[np.ix_(block, block)]
+        error = np.linalg.solve(own, pull[block])
+        densities.append(0.5 * np.linalg.slogdet(own)[1] - 0.5 * error @ own @ error)
+        unexplained.append(np.mean(error.reshape(-1, d) ** 2, axis=0) / np.maximum(sizes, 1e-300))
+    return Explanation(weights, inverse, pull, np.array(densities), np.array(unexplained))
+
+
+def blocks_of(n: int, d: int) -> list[np.ndarray]:
+    """Equations of each block of samples."""
+    return np.array_split(np.arange(n * d).reshape(n, d), min(BLOCKS, n))
+
+
+def screened(found: Explanation, prior: Prior, trials: Sequence[Float[np.ndarray, "n d"]]) -> Float[np.ndarray, "B H"]:
+    """Logarithm of each block's density for other torques, with the same weights, less that of the first of them."""
+    n, d = trials[0].shape
+    Y = np.stack([trial.ravel() for trial in trials], axis=1) - prior.mean[:, None]
+    pull = found.inverse @ Y
+    losses = []
+    for block in blocks_of(n, d):
+        own = pull[block.ravel()]
+        losses.append(-0.5 * np.sum(own * np.linalg.solve(found.inverse[np.ix_(block.ravel(), block.ravel())], own), 0))
+    return np.array(losses) - np.array(losses)[:, :1]
+
+
+def _start(prior: Prior, size: float, noise: np.ndarray) -> np.ndarray:
+    traces = [np.mean(np.diag(part) / noise) for part in prior.parts]
+    traces += [np.mean(np.sum(columns**2, axis=1) / noise) for columns in prior.columns]
+    return np.array([size / max(trace, 1e-300) for trace in traces]) / max(len(traces), 1)
+
+
+def _inverse(K: np.ndarray) -> np.ndarray:
+    from scipy.linalg import lapack
+
+    factor, _ = lapack.dpotrf(K, lower=True)
+    inverse, failed = lapack.dpotri(factor, lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the torques is not positive definite")
+    lower = np.tril(inverse)
+    return lower + np.tril(inverse, -1).T

@@ -1,0 +1,287 @@
+"""Faults of torques as hypotheses: a sign, two columns, a delay and others; each against the log as it is.
+
+A hypothesis counts when blocks of time that were left out are predicted far better with it, nearly all of them. Without
+a robot the torques' prior is that of any energy with friction (`energies`), which holds for arms of any kinematics; a
+robot's file gives a narrower one (`tree`). One fault at a time is taken, the best supported, and the search goes on
+with the log repaired.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.checks import evidence
+from dln_jax.data.checks.delays import away_from_ends, vertex
+from dln_jax.data.checks.energies import SCALES, covariance, friction_columns
+from dln_jax.data.checks.evidence import Explanation, Prior
+from dln_jax.data.schema import Trajectories
+
+DECISIVE = 15.0
+"""Logarithm of the likelihood ratio over all blocks: odds of three million to one."""
+MOST_BLOCKS = 0.8
+"""Of the blocks, which have to agree."""
+BETTER = 0.8
+"""Of the unexplained variance, below which a sign or an order has to bring it."""
+LESS_LATE = 0.95
+"""The same for a delay."""
+LATE = 0.2
+"""Samples of delay that are worth a word."""
+MOST_FAULTS = 3
+SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
+"""Equations and iterations by which all single faults are ranked, and how many of a kind are looked at closely."""
+INERTIAS = 8
+"""Configurations at which the sign of inertias is looked at."""
+NEGATIVE = -5.0
+"""Standard deviations of the sum over joints, below which inertias are negative."""
+
+States = tuple[np.ndarray, np.ndarray, np.ndarray]
+Build = Callable[[States, np.ndarray, np.ndarray | None], Prior]
+"""(q, qd, qdd [n, d]), torques [n, d], gravity [3] or `None` for what is usual -> the prior of those torques."""
+
+
+class Log(NamedTuple):
+    """A log, and the faults that are repaired in it."""
+
+    data: Trajectories
+    rows: np.ndarray
+    """Samples that are looked at [n]."""
+    signs: Float[np.ndarray, " d"]
+    """-1 for torques that have the wrong sign."""
+    order: tuple[int, ...]
+    """Columns of tau that belong to the joints."""
+    delay: float = 0.0
+    """Samples by which torques are late."""
+    speed: float = 1.0
+    """Times the speed that t states, with which the joints moved."""
+    gravity: np.ndarray | None = None
+    """m/s² [3], where it is another than stated."""
+
+    def states(self) -> States:
+        """At the times of the rows, or a part of a sample earlier if torques are late."""
+        whole = int(np.floor(-self.delay))
+        part, first = -self.delay - whole, self.rows + whole
+
+        def at(values: np.ndarray) -> np.ndarray:
+            return (1 - part) * values[first] + part * values[first + 1]
+
+        return at(self.data.q), self.speed * at(self.data.qd), self.speed**2 * at(self.data.qdd)
+
+    def torques(self, shift: int = 0) -> np.ndarray:
+        """Of the joints, with their signs, so many samples later."""
+        return self.data.tau[self.rows + shift][:, list(self.order)] * self.signs
+
+
+class Torques(NamedTuple):
+    """What the torques of a log tell."""
+
+    explanation: Explanation
+    """Of the log as it is."""
+    log: Log
+    """Without its faults."""
+    repaired: Explanation
+    """Of that."""
+    tried: Float[np.ndarray, " S"]
+    """Delays, samples."""
+    loss: Float[np.ndarray, " S"]
+    """Logarithm of the likelihood ratio of no delay against each."""
+    likely_delay: float
+    """Samples of the delay with the lowest loss."""
+    viscous: Float[np.ndarray, " d"]
+    """N m s or N s/m."""
+    coulomb: Float[np.ndarray, " d"]
+    """N m or N."""
+    coulomb_error: Float[np.ndarray, " d"]
+    """Its standard deviation."""
+    velocity_scale: Float[np.ndarray, " d"]
+    """1/s or m/s, on which dry friction changes its sign."""
+    rest: Float[np.ndarray, "n d"]
+    """Torques without what is explained by anything but friction."""
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Samples that were looked at."""
+        return self.log.rows
+
+    @property
+    def explained(self) -> Float[np.ndarray, " d"]:
+        """Share of each torque's variance that is predicted in blocks that were left out, without the faults."""
+        return 1 - self.repaired.unexplained.mean(axis=0)
+
+
+def examine_torques(
+    data: Trajectories,
+    build: Build,
+    *,
+    farthest: int,
+    equations: int,
+    ambiguous: bool,
+    faults: bool = True,
+    others: Callable[[Log], list[Log]] = lambda _: [],
+) -> Torques | None:
+    """Looks for signs, exchanged columns, a delay and `others`; `None` with too few samples.
+
+    Args:
+        data: at equal steps, with sound rates.
+        build: of priors.
+        farthest: samples of delay that are tried.
+        equations: that are taken, n d.
+        ambiguous: whether the prior allows negative inertias, so that the sign of all torques is to be found.
+        faults: whether faults are looked for at all.
+        others: more faults, as logs without them.
+    """
+    d = data.degrees_of_freedom
+    inside = away_from_ends(data.trajectory, farthest + 1)
+    count = min(equations // d, len(inside))
+    if count < 2 * evidence.BLOCKS:
+        return None
+    rows = inside[np.linspace(0, len(inside) - 1, count).astype(int)]
+    log = Log(data, rows, np.ones(d), tuple(range(d)))
+    first = now = _explained(log, build)
+    loss, likely = _late(log, build, now, farthest)
+    for _ in range(MOST_FAULTS if faults else 0):
+        better = _better(log, build, now, farthest, others)
+        if better is None:
+            break
+        log, now = better
+    if ambiguous and _inertias(log, now) < NEGATIVE:
+        log = log._replace(signs=-log.signs)
+    return Torques(first, log, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(log, build, now))
+
+
+def any_energy(joints: tuple[str, ...]) -> Build:
+    """The prior without a robot: torques of any kinetic and potential energy, and friction."""
+
+    def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
+        del gravity  # any
+        sizes = _sizes(states[2], tau)
+        parts = covariance(states, states, joints, sizes)
+        return Prior(np.zeros(tau.size), [parts.kinetic, parts.potential], friction(states[1]))
+
+    return build
+
+
+def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:
+    """Columns [n d, 4] of each joint's friction."""
+    own = friction_columns(qd, np.maximum(qd.std(axis=0), 1e-12))
+    n, d, count = own.shape
+    found = []
+    for joint in range(d):
+        columns = np.zeros((n, d, count))
+        columns[:, joint] = own[:, joint]
+        found.append(columns.reshape(n * d, count))
+    return found
+
+
+def _sizes(qdd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    found = tau.std(axis=0) / np.maximum(qdd.std(axis=0), 1e-12)
+    return np.maximum(found, 1e-3 * max(float(found.max()), 1e-300))
+
+
+def _explained(log: Log, build: Build, iterations: int = evidence.ITERATIONS) -> Explanation:
+    tau = log.torques()
+    return evidence.explain(build(log.states(), tau, log.gravity), tau, iterations=iterations)
+
+
+def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
+    """Loss of each delay, and the best one to a fraction of a sample."""
+    tau = log.torques()
+    trials = [tau, *(log.torques(shift) for shift in range(-farthest, farthest + 1))]
+    loss = -evidence.screened(now, build(log.states(), tau, log.gravity), trials)[:, 1:].sum(axis=0)
+    best = int(np.argmin(loss))
+    return loss, best - farthest + vertex(loss, best)
+
+
+def _better(
+    log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]]
+) -> tuple[Log, Explanation] | None:
+    """The log without its likeliest fault, if that is beyond doubt."""
+    d = len(log.order)
+    flips = [log._replace(signs=np.where(np.arange(d) == joint, -log.signs, log.signs)) for joint in range(d)]
+    exchanges = []
+    for first in range(d):
+        for second in range(first):
+            order = list(log.order)
+            order[first], order[second] = order[second], order[first]
+            exchanges.append(log._replace(order=tuple(order)))
+    chosen = [*_likeliest(log, flips, build), *_likeliest(log, exchanges, build), *others(log)]
+    if log.delay == 0 and farthest > 0:
+        _, delay = _late(log, build, now, farthest)
+        if abs(delay) > LATE and abs(delay) < farthest:
+            chosen.append(log._replace(delay=delay))
+    found: list[tuple[float, Log, Explanation]] = []
+    for trial in chosen:
+        explained = _explained(trial, build)
+        limit = LESS_LATE if trial.delay != log.delay else BETTER
+        if decisive(now, explained, limit):
+            found.append((float(explained.densities.sum()), trial, explained))
+    if not found:
+        return None
+    _, trial, explained = max(found, key=lambda each: each[0])
+    return trial, explained
+
+
+def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
+    """The few of many faults that are likelier than the log, by fewer samples and rough weights."""
+
+    def density(trial: Log) -> float:
+        few = -(-len(trial.rows) * len(trial.order) // SCANNED)
+        rough = trial._replace(rows=trial.rows[::few])
+        return float(_explained(rough, build, iterations=ROUGHLY).densities.sum())
+
+    if not trials:
+        return []
+    now, densities = density(log), np.array([density(trial) for trial in trials])
+    return [trials[place] for place in np.argsort(densities)[::-1][:CANDIDATES] if densities[place] > now]
+
+
+def decisive(now: Explanation, other: Explanation, limit: float) -> bool:
+    """Whether another explanation is better beyond doubt, and by so much that it matters."""
+    gains = other.densities - now.densities
+    return bool(
+        gains.sum() > DECISIVE
+        and np.mean(gains > 0) >= MOST_BLOCKS
+        and other.unexplained.mean() < limit * now.unexplained.mean()
+    )
+
+
+def _inertias(log: Log, now: Explanation) -> float:
+    """Sum over joints of the mean inertia about each, in its standard deviations over the root of their number."""
+    tau, (q, qd, qdd) = log.torques(), log.states()
+    n, d = q.shape
+    chosen = q[np.linspace(0, n - 1, INERTIAS).astype(int)]
+    total = 0.0
+    joints = ("revolute",) * d if log.data.needs is None else log.data.needs.joints
+    for joint in range(d):
+        push = np.zeros_like(chosen)
+        push[:, joint] = 1.0
+        pushed = (chosen, np.zeros_like(chosen), push)
+        sizes = _sizes(qdd, tau)
+        with_log = covariance(pushed, (q, qd, qdd), joints, sizes).kinetic
+        alone = covariance(pushed, pushed, joints, sizes).kinetic
+        mean_with = now.weights[0] * with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
+        variance = now.weights[0] * alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
+        variance = max(float(variance - mean_with @ now.inverse @ mean_with), 1e-12 * float(variance))
+        total += float(mean_with @ now.pull) / np.sqrt(variance)
+    return total / np.sqrt(d)
+
+
+def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...]:
+    """Viscous and dry friction, the error of the latter, its scale, and torques without all else."""
+    tau, (_, qd, _) = log.torques(), log.states()
+    n, d = tau.shape
+    prior = build(log.states(), tau, log.gravity)
+    start = len(prior.parts) + len(prior.columns) - d
+    typical = np.maximum(qd.std(axis=0), 1e-12)
+    noise = now.weights[len(prior.parts) + len(prior.columns) :] * np.maximum(tau.var(axis=0), 0.0)
+    rest, found = now.pull.reshape(n, d) * noise, []
+    for joint in range(d):
+        columns, weight = prior.columns[len(prior.columns) - d + joint], now.weights[start + joint]
+        own = weight * (columns.T @ now.pull)
+        rest[:, joint] += (columns @ own).reshape(n, d)[:, joint]
+        spread = weight * np.eye(len(own)) - weight**2 * columns.T @ now.inverse @ columns
+        dry = np.r_[0.0, np.ones(len(SCALES)), 0.0]
+        found.append([own[0] / typical[joint], own @ dry, np.sqrt(max(dry @ spread @ dry, 0.0))])
+    viscous, coulomb, error = np.array(found).T
+    return viscous, coulomb, error, SCALES[0] * typical, rest
