@@ -6,7 +6,7 @@ robot's own file. A joint is
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
-    doubtful      in between
+    doubtful      in between; if the mean of e / v over all joints is beyond FAILED, the fit is refused
     unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: nothing is said of it
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
@@ -23,8 +23,9 @@ from dln_jax.types import InputError
 Level = Literal["good", "doubtful", "refused"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "refused")
 """In the order of the numbers that metrics.json holds: 0, 1 and 2."""
-UNEXPLAINED = 0.05
-"""Share of a torque's variance that a good model may leave unexplained: an rms error of 22 %."""
+UNEXPLAINED, FAILED = 0.05, 0.25
+"""Share of a torque's variance that a good model may leave unexplained in each joint (an rms error of 22 %), and mean
+share of all joints from which it is refused (50 %)."""
 NOISE = 2.0
 """Errors up to this multiple of the noise's variance count as noise, which is itself an estimate."""
 WORSE, MUCH_WORSE = 0.01, 2.0
@@ -131,10 +132,11 @@ def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
     unseen = (noise >= 0.5) & (share > UNEXPLAINED) & (share <= NOISE * noise)
     numbers = _numbers(found, share, noise, names)
     unexplained = (share >= 1) & ~unseen
-    if share.mean() >= 1 or unexplained.any():
-        which = _listed(names, unexplained) if unexplained.any() else "the robot as a whole"
+    if share.mean() >= 1 or unexplained.any() or np.where(unseen, 0.0, share - NOISE * noise).mean() >= FAILED:
+        beyond = f"more than {FAILED:.0%} of all torques is unexplained"
+        constant = f"the torque of {_listed(names, unexplained)} is predicted no better than by a constant"
         remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
-        return Verdict("refused", f"the torque of {which} is predicted no better than by a constant: {numbers}", remedy)
+        return Verdict("refused", f"{constant if unexplained.any() else beyond}: {numbers}", remedy)
     worse = 0.0 if found.file is None else share.mean() - np.mean(found.file / found.unit)
     if found.file is not None and worse > WORSE:
         level = "refused" if share.mean() > MUCH_WORSE * np.mean(found.file / found.unit) else "doubtful"

@@ -45,7 +45,7 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
 
 def searched(fit: TreeFit, found: HeldOut) -> tuple[Verdict | None, dict[str, float | int]]:
     """What a search for joint frames says of itself: whether descents agree, and how far from the noise they end."""
-    numbers = {"descents": len(fit.losses), "descents_agreeing": fit.agreeing}
+    numbers: dict[str, float | int] = {"descents": len(fit.losses), "descents_agreeing": fit.agreeing}
     above = None
     if found.noise is not None and (found.noise > 0).all():
         above = float(np.mean(found.error / found.noise))
