@@ -36,9 +36,12 @@ def check_limits(path: Path, root: ET.Element, held: Collection[str]) -> None:
 def velocity_limits(root: ET.Element, names: Sequence[str]) -> np.ndarray:
     """What <limit velocity="..."> of each joint says, rad/s or m/s; infinite where it says nothing, or 0, which some
     files write for what nobody knows."""
-    limits = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
-    stated = [0.0 if limits.get(name) is None else float(limits[name].get("velocity", 0)) for name in names]
-    return np.array([each if each > 0 else np.inf for each in stated])
+    stated = {}
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        stated[joint.get("name")] = "0" if limit is None else limit.get("velocity", "0")
+    numbers = [_number(stated.get(name, "0")) for name in names]
+    return np.array([each if each > 0 else np.inf for each in numbers])
 
 
 def _check_urdf(joint: ET.Element) -> None:

@@ -7,7 +7,6 @@ from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.kinematics.fit import TreeFit
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
@@ -31,7 +30,11 @@ def judged(task: Task, predicted: np.ndarray) -> tuple[Verdict | None, dict[str,
     names = None if robot is None else robot.tree.names
     found = held_out(predicted, test.tau, noise=torque_noise(task.sets.train), file=file)
     verdict = judge(found, names)
-    own, numbers = (None, {}) if task.search is None else searched(task.search, found)
+    own, numbers = (
+        (None, {})
+        if task.search is None
+        else searched(task.search.losses, task.search.agreeing, task.search.agreement, found)
+    )
     verdict = verdict if own is None else worst(verdict, own)
     return verdict, verdict_metrics(found, verdict) | numbers
 
@@ -43,21 +46,30 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
     return np.asarray(every(data.q, data.qd, data.qdd))
 
 
-def searched(fit: TreeFit, found: HeldOut) -> tuple[Verdict | None, dict[str, float | int]]:
-    """What a search for joint frames says of itself: whether descents agree, and how far from the noise they end."""
-    numbers: dict[str, float | int] = {"descents": len(fit.losses), "descents_agreeing": fit.agreeing}
+def searched(
+    losses: np.ndarray, agreeing: int, agreement: int, found: HeldOut
+) -> tuple[Verdict | None, dict[str, float | int]]:
+    """What a search for joint frames says of itself: whether descents agree, and how far from the noise they end.
+
+    Args:
+        losses: of all descents.
+        agreeing: descents that reached the lowest.
+        agreement: how many the search wanted to.
+        found: errors on held-out motions.
+    """
+    numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}
     above = None
     if found.noise is not None and (found.noise > 0).all():
         above = float(np.mean(found.error / found.noise))
         numbers |= {"error_over_noise": above}
         if above <= AT_NOISE:
             return None, numbers
-    if fit.agreeing < fit.agreement:
-        reason = f"only {fit.agreeing} of {len(fit.losses)} descents reached the lowest loss, so a lower one may exist"
+    if agreeing < agreement:
+        reason = f"only {agreeing} of {len(losses)} descents reached the lowest loss, so a lower one may exist"
         remedy = "try another --seed, more --seconds or a --sketch of the arm"
         return Verdict("doubtful", reason, remedy), numbers
     if above is not None and above > FAR_FROM_NOISE:
-        reason = f"held-out errors are {above:.2g} times the noise, though {fit.agreeing} descents agree"
+        reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
         remedy = "record more and different motions, or add a --sketch; friction that the tree lacks looks the same"
         return Verdict("doubtful", reason, remedy), numbers
     return None, numbers
