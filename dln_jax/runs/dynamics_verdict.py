@@ -30,11 +30,9 @@ def judged(task: Task, predicted: np.ndarray) -> tuple[Verdict | None, dict[str,
     names = None if robot is None else robot.tree.names
     found = held_out(predicted, test.tau, noise=torque_noise(task.sets.train), file=file)
     verdict = judge(found, names)
-    own, numbers = (
-        (None, {})
-        if task.search is None
-        else searched(task.search.losses, task.search.agreeing, task.search.agreement, found)
-    )
+    own, numbers, search = None, {}, task.search
+    if search is not None:
+        own, numbers = searched(search.losses, search.agreeing, search.agreement, found)
     verdict = verdict if own is None else worst(verdict, own)
     return verdict, verdict_metrics(found, verdict) | numbers
 

@@ -4,7 +4,6 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.encoders import torque_noise
-from dln_jax.data.schema import Trajectories
 from dln_jax.identification.identify import Identification, parameters_of
 from dln_jax.metrics.errors import normalised_error
 from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
@@ -42,7 +41,7 @@ def judged(
         robust: whether held-out samples that are spikes are left out.
     """
     test, d = case.sets.test, case.sets.test.degrees_of_freedom
-    peaks = spikes(test)
+    peaks = spikes(test.tau)
     rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
     noise = torque_noise(case.sets.train) if case.noise is None else case.noise
     errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
@@ -50,7 +49,9 @@ def judged(
     mine = parameters_of(found.theta, case.known)
     still = np.zeros_like(test.q)
     friction = predict(mine, still, test.qd, still).friction
-    every += [friction_verdict(case, test, friction)]
+    scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
+    fitted = np.array(scales) if isinstance(scales, list) else None
+    every += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
     bodies = [predict(without_joints(each), test.q, test.qd, test.qdd).torque for each in (mine, case.known)]
     every += [weight_verdict(*bodies)]
     verdict = worst(*every)
@@ -62,14 +63,14 @@ def judged(
     return verdict, verdict_metrics(errors, verdict)
 
 
-def spikes(data: Trajectories) -> np.ndarray:
+def spikes(tau: Float[np.ndarray, "N d"]) -> np.ndarray:
     """Which torques [N, d] are single samples far from their neighbours (Hampel's identifier, a window of five)."""
-    padded = np.pad(data.tau, ((2, 2), (0, 0)), mode="edge")
+    padded = np.pad(tau, ((2, 2), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
-    away = np.abs(data.tau - np.median(windows, axis=-1))
-    usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-3 * data.tau.std(axis=0))
+    away = np.abs(tau - np.median(windows, axis=-1))
+    usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-3 * tau.std(axis=0))
     # Jumps of the motion, such as those of dry friction, are not alone, and never larger than the torque's range.
-    size = np.median(np.abs(data.tau - np.median(data.tau, axis=0)), axis=0)
+    size = np.median(np.abs(tau - np.median(tau, axis=0)), axis=0)
     return away > np.maximum(SPIKE * usual, 2 * size)
 
 
@@ -88,19 +89,22 @@ def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, t
     return Verdict(level, reason, remedy)
 
 
-def friction_verdict(case: Case, data: Trajectories, friction: Float[np.ndarray, "N d"]) -> Verdict:
-    """Whether friction takes energy away, and changes its sign within the speeds of the data."""
-    every, counts = [Verdict("good", "")], np.std(friction, axis=0) > COUNTS * np.std(data.tau, axis=0)
-    power = np.mean(data.qd * (friction - friction.mean(axis=0)), axis=0)
+def friction_verdict(
+    names: tuple[str, ...],
+    qd: Float[np.ndarray, "N d"],
+    tau: Float[np.ndarray, "N d"],
+    friction: Float[np.ndarray, "N d"],
+    scales: Float[np.ndarray, " d"] | None,
+) -> Verdict:
+    """Whether friction takes energy away, and whether the joints reach the velocity scales that were fitted to it."""
+    every, counts = [Verdict("good", "")], np.std(friction, axis=0) > COUNTS * np.std(tau, axis=0)
+    power = np.mean(qd * (friction - friction.mean(axis=0)), axis=0)
     for k in np.flatnonzero(counts & (power < 0)):
-        reason = f"friction of {case.names[k]} drives it: {-power[k]:.3g} W on average"
+        reason = f"friction of {names[k]} drives it: {-power[k]:.3g} W on average"
         every.append(Verdict("refused", reason, "check the signs of tau and qd; keep --consistent"))
-    scales = case.description.get("velocity_scale")
-    if {"coulomb", "stribeck"} & set(case.laws) and isinstance(scales, list):
-        for k in np.flatnonzero(counts & (np.array(scales) > np.quantile(np.abs(data.qd), FAST, axis=0))):
-            reason = (
-                f"{case.names[k]} hardly reaches {scales[k]:.3g} rad/s or m/s, the velocity scale of its dry friction"
-            )
+    if scales is not None:
+        for k in np.flatnonzero(counts & (scales > np.quantile(np.abs(qd), FAST, axis=0))):
+            reason = f"{names[k]} hardly reaches {scales[k]:.3g}/s, the velocity scale of its dry friction"
             every.append(Verdict("doubtful", reason, "state it (--velocity-scale 0.05), or record faster motions"))
     return worst(*every)
 

@@ -1,7 +1,5 @@
 """What verdicts add to errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -27,8 +25,7 @@ def held_out(error, noise=1e-4):
     ],
 )
 def test_learned_tree_says_how_its_frames_were_found(agreeing, error, noise, said):
-    fit = SimpleNamespace(losses=np.arange(31.0), agreeing=agreeing, agreement=5)
-    verdict, numbers = searched(fit, held_out(error, noise))  # pyright: ignore[reportArgumentType]
+    verdict, numbers = searched(np.arange(31.0), agreeing, 5, held_out(error, noise))
     assert numbers["descents"] == 31 and numbers["descents_agreeing"] == agreeing
     assert verdict is None if said is None else verdict is not None and verdict.level == "doubtful"
     assert said is None or (verdict is not None and said in verdict.reason)
@@ -45,18 +42,15 @@ def test_bodies_are_compared_with_the_file(factor, level):
 
 def test_friction_that_drives_is_refused_and_a_fast_scale_doubted():
     qd = np.random.default_rng(0).uniform(-1, 1, (500, 2))
-    data = SimpleNamespace(qd=qd, tau=np.tile([3.0, -3.0], (250, 2)).reshape(500, 2) + qd)
+    tau = 3 * np.where(np.arange(500) % 2, 1, -1)[:, None] + qd
 
-    def verdict(friction, scales):
-        case = SimpleNamespace(
-            names=("hip", "knee"), laws=("viscous", "coulomb"), description={"velocity_scale": scales}
-        )
-        return friction_verdict(case, data, friction)  # pyright: ignore[reportArgumentType]
+    def verdict(friction, *scales):
+        return friction_verdict(("hip", "knee"), qd, tau, friction, np.array(scales))
 
-    assert verdict(np.tanh(qd / 0.1), [0.1, 0.1]).level == "good"
-    assert verdict(np.tanh(qd / [0.1, 1.5]), [0.1, 1.5]).level == "doubtful"
-    assert verdict(1e-3 * np.tanh(qd / [0.1, 1.5]), [0.1, 1.5]).level == "good"
-    driving = verdict(qd * [1.0, -1.8], [0.1, 0.1])
+    assert verdict(np.tanh(qd / 0.1), 0.1, 0.1).level == "good"
+    assert verdict(np.tanh(qd / [0.1, 1.5]), 0.1, 1.5).level == "doubtful"
+    assert verdict(1e-3 * np.tanh(qd / [0.1, 1.5]), 0.1, 1.5).level == "good"
+    driving = verdict(qd * [1.0, -1.8], 0.1, 0.1)
     assert driving.level == "refused" and "friction of knee drives it" in driving.reason
 
 
@@ -64,7 +58,6 @@ def test_spikes_are_single_samples_and_dry_friction_has_none():
     t = np.arange(0, 20, 0.01)
     torque = np.stack([5 * np.sin(2 * t) + 2 * np.sign(np.cos(3 * t)), np.sign(np.sin(t))], axis=1)
     torque += 0.05 * np.random.default_rng(0).normal(size=torque.shape)
-    data = SimpleNamespace(tau=torque)
-    assert not spikes(data).any()  # pyright: ignore[reportArgumentType]
+    assert not spikes(torque).any()
     torque[[300, 700], [0, 1]] += 60
-    assert np.argwhere(spikes(data)).tolist() == [[300, 0], [700, 1]]  # pyright: ignore[reportArgumentType]
+    assert np.argwhere(spikes(torque)).tolist() == [[300, 0], [700, 1]]
