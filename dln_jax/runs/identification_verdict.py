@@ -55,7 +55,7 @@ def judged(
     bodies = [predict(without_joints(each), test.q, test.qd, test.qdd).torque for each in (mine, case.known)]
     every += [weight_verdict(*bodies)]
     verdict = worst(*every)
-    share = peaks.mean(axis=0)
+    share = spikes(case.sets.train.tau).mean(axis=0)
     if verdict.level != "good" and not robust and share.max() > SPIKES:
         which = ", ".join(case.names[k] for k in range(d) if share[k] > SPIKES)
         reason = f"{share.max():.2%} of the torques of {which} are spikes: {verdict.reason}"
