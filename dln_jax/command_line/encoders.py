@@ -76,6 +76,13 @@ def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
     return lines
 
 
+def fitted_torque(found: Smoothed | None) -> str:
+    """Which torque a model is fitted to and its bands are of, in words."""
+    if found is None or not found.filtered_torque:
+        return "measured torques"
+    return f"torques low-passed at {found.cutoff:.3g} Hz (measured ones scatter more)"
+
+
 def checked(given: Filtered, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
     """What the quick part of `check_data` finds, a line each; none where nothing is found.
 

@@ -62,13 +62,16 @@ class Arguments(Folder, Drawn):
     share: float = 0.9
     """Of every limit that is used: the rest is for the controller."""
     position: Unstated[str] = None
-    """Half the range of positions about zero, rad or m (default: the file's, or pi where a joint turns freely)."""
+    """Half the range of positions about zero, rad or m (default: the file's)."""
     velocity: Unstated[str] = None
     """Limits, rad/s or m/s (default: those of a URDF)."""
     acceleration: Unstated[str] = None
     """Limits, rad/s² or m/s² (default: full velocity in 0.2 s)."""
     torque: Unstated[str] = None
     """Limits, N m or N (default: the file's)."""
+    allow_unlimited: Unstated[str] = None
+    """Joints that may lack limits of position and torque, comma separated; "*wheel*" names all with wheel in their
+    name. Positions then go pi to either side. (default: such joints are refused)"""
     noise: str = "1"
     """Deviation of the torque's noise, of which only the ratios of joints matter."""
     height: Unstated[float] = None
@@ -122,9 +125,15 @@ def prepare(given: Arguments) -> Prepared:
         carried = inertial_parameters(given.payload, centre, np.zeros((3, 3)))
         robot = robot._replace(tree=with_payload(robot.tree, d - 1, carried))
     stated = {name: _numbers(name, getattr(given, name)) for name in ("position", "velocity", "acceleration")}
-    limits, assumed = limits_of_robot(robot, **stated, force=_numbers("torque", given.torque))
+    free = [name.strip() for name in (given.allow_unlimited or "").split(",")]
+    limits, assumed = limits_of_robot(
+        robot,
+        **stated,
+        force=_numbers("torque", given.torque),
+        allow_unlimited=[name for name in free if name],
+    )
     for line in assumed:
-        print(line)
+        print(f"warning: {line}")
     limits = used(limits, given.share)
     model = make_rigid_tree(robot.tree, friction=given.friction, velocity_scale=given.velocity_scale)
     parameters: Any = model.init(jax.random.key(0))

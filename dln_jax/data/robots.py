@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.data.urdf import link_inertias, velocity_limits, without_inertias
+from dln_jax.data.joint_limits import check_limits, velocity_limits
+from dln_jax.data.urdf import link_inertias, without_inertias
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -61,8 +62,8 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
 
     Raises:
         InputError: MuJoCo is missing; the file is not there, broken or cyclic; a joint that is not held is of another
-            kind than revolute, continuous or prismatic, or follows another; one that is held is not there; nothing
-            moves; or a link that moves has no mass.
+            kind than revolute, continuous or prismatic, follows another, or states limits that are NaN, equal, swapped
+            or half stated; one that is held is not there; nothing moves; or a link that moves has no mass.
     """
     path, root = Path(path), parsed(Path(path))
     try:
@@ -84,8 +85,11 @@ def opened(
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())
-        return mujoco, model, _matching(hold, joint_names(model))
+        held = _matching(hold, joint_names(model))
+        check_limits(path, root, held)
+        return mujoco, model, held
     held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
+    check_limits(path, root, held)
     return (*_compiled(path, root, held), held)
 
 

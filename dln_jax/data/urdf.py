@@ -1,8 +1,6 @@
 """What a URDF file says of inertias, in the frames of its links, whether or not a body could have them."""
 
-import contextlib
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -31,18 +29,6 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
                     "moments, all finite numbers"
                 ) from None
     return found
-
-
-def velocity_limits(root: ET.Element, names: Sequence[str]) -> np.ndarray:
-    """What <limit velocity="..."> of each joint says, rad/s or m/s; infinite where it says nothing."""
-    stated = {}
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        velocity = "" if limit is None else limit.get("velocity", "")
-        with contextlib.suppress(ValueError):
-            stated[joint.get("name")] = float(velocity)
-    # Some files write 0 for what nobody knows.
-    return np.array([stated[name] if stated.get(name, 0.0) > 0 else np.inf for name in names])
 
 
 def without_inertias(root: ET.Element) -> ET.Element:

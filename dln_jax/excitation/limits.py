@@ -5,7 +5,8 @@ Every limit is a number that is at most zero where it is kept, relative to the s
     |x - middle| / half - 1   for positions, velocities, accelerations and forces,   -clearance / 1 m
 """
 
-from collections.abc import Callable
+import fnmatch
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -69,12 +70,18 @@ def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[s
 
 
 def limits_of_robot(
-    robot: Robot, *, position: Any = None, velocity: Any = None, acceleration: Any = None, force: Any = None
+    robot: Robot,
+    *,
+    position: Any = None,
+    velocity: Any = None,
+    acceleration: Any = None,
+    force: Any = None,
+    allow_unlimited: Sequence[str] = (),
 ) -> tuple[MotionLimits, list[str]]:
     """The limits that a robot's file states, those given in their place, and in words what is assumed of others.
 
-    A joint without limits of position may turn by pi to either side; it may take `SECONDS_TO_SPEED` to its full
-    velocity; its force is free. Velocities are not assumed.
+    A revolute joint that may be unlimited turns by pi to either side, and its force is free. Each joint takes at least
+    `SECONDS_TO_SPEED` to its full velocity. Velocities are not assumed.
 
     Args:
         robot: as read.
@@ -82,9 +89,12 @@ def limits_of_robot(
         velocity: 1/s or m/s.
         acceleration: 1/s² or m/s².
         force: N m or N, in either direction.
+        allow_unlimited: names of joints that may lack limits of position (revolute ones) and force, with * and ? as in
+            file names.
 
     Raises:
-        InputError: no limit of velocity, a prismatic joint without one of position, or another number of them.
+        InputError: a joint without limits that is not allowed to be, no limit of velocity, a prismatic joint without
+            one of position, a name in `allow_unlimited` that no joint has, or another number of limits.
     """
     tree, said = robot.tree, []
     d, names = tree.degrees_of_freedom, tree.names or tuple(map(str, range(tree.degrees_of_freedom)))
@@ -98,7 +108,9 @@ def limits_of_robot(
         return np.stack([-np.asarray(half), np.asarray(half)], axis=1)
 
     positions = robot.position_limits if sizes["position"] is None else about_zero(sizes["position"])
+    allowed = _matching(allow_unlimited, names)
     free = np.logical_not(np.isfinite(positions).all(axis=1)) & (np.array(tree.joints) == "revolute")
+    _require_allowed("position", free & ~allowed, names)
     if free.any():
         said.append(f"no limits of position for {_listed(names, free)}: pi to either side is assumed")
         positions = np.where(free[:, None], about_zero(np.full(d, np.pi)), positions)
@@ -109,11 +121,30 @@ def limits_of_robot(
         accelerations = velocities / SECONDS_TO_SPEED
     forces = robot.force_limits if sizes["force"] is None else about_zero(sizes["force"])
     unbounded = np.logical_not(np.isfinite(forces).all(axis=1))
+    _require_allowed("force", unbounded & ~allowed, names)
     if unbounded.any():
         said.append(f"no limits of force for {_listed(names, unbounded)}: any is allowed")
     limits = MotionLimits(positions, velocities, accelerations, forces)
     require_limits(limits, d, names)
     return limits, said
+
+
+def _matching(patterns: Sequence[str], names: tuple[str, ...]) -> np.ndarray:
+    """Which joints one of the patterns names."""
+    for pattern in patterns:
+        if not fnmatch.filter(names, pattern):
+            raise InputError(f"there is no joint '{pattern}' to allow without limits; it has {', '.join(names)}")
+    return np.array([any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns) for name in names])
+
+
+def _require_allowed(kind: str, which: np.ndarray, names: tuple[str, ...]) -> None:
+    """Raises `InputError` that names the first joint that lacks a limit and may not."""
+    if which.any():
+        name, option = names[int(np.argmax(which))], {"position": "--position", "force": "--torque"}[kind]
+        raise InputError(
+            f"joint '{name}' has no limit of {kind}: state it ({option}, or in the file), or give --allow-unlimited "
+            f"{name} if it may go anywhere and take any torque"
+        )
 
 
 def _listed(names: tuple[str, ...], which: np.ndarray) -> str:

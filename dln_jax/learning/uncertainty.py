@@ -15,7 +15,13 @@ alike. Motions that were not fitted therefore scale both parts of the variance o
 
 and keeps the simplest that no other betters by more than half the logarithm of the effective samples for each further
 factor (Schwarz 1978): a few seconds that agree with the training leave it as it is. These motions are the validation's,
-and for least squares also the training's, each as if it had been left out (`posterior.left_out`).
+and for least squares also the training's, each as if it had been left out (`posterior.left_out`). Both parts are then
+multiplied by the `scatter` of the motions: what a model lacks shows more in some motions than in others, and a new one
+may be of the former.
+
+A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them:
+its states are outside where the deviation by the parameters exceeds that on the data, the noise, and `HARMLESS` of the
+torque. A network is also outside where its inputs leave the range of the data.
 """
 
 from typing import NamedTuple
@@ -43,6 +49,8 @@ FOLDS = 10
 """Groups of training trajectories that are left out in turn."""
 MOST_SAMPLES = 2_000
 """Of the validation, spread evenly."""
+HARMLESS = 0.01
+"""Share of a torque's standard deviation: a smaller uncertainty by the parameters puts no state outside."""
 STILL = 1e-3
 """rad, m, 1/s or 1/s²: how far a coordinate may move that rests in all data."""
 
@@ -120,14 +128,14 @@ def estimate(
     undetermined = found.directions[:, found.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
-    centre, reach = _reach(train, validation, quantile)
-    domain = Domain(
-        limit=margin * np.maximum(np.quantile(limits, quantile, axis=0), np.finfo(np.float64).tiny),
-        scale=scale,
-        undetermined=undetermined,
-        centre=centre,
-        reach=np.maximum(margin * reach, STILL),
-    )
+    limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), np.finfo(np.float64).tiny)
+    if ridge == 0:
+        harmless = np.maximum(chosen.noise, HARMLESS * np.asarray(torque_scale(train), np.float64))
+        limit, centre, reach = np.maximum(limit, harmless / np.sqrt(chosen.inflation)), np.zeros(0), np.zeros(0)
+    else:
+        centre, reach = _reach(train, validation, quantile)
+        reach = np.maximum(margin * reach, STILL)
+    domain = Domain(limit, scale, undetermined, centre, reach)
     uncertainty = Uncertainty(factor, chosen.noise, chosen.inflation, domain)
     return Estimate(uncertainty, chosen.ridge, chosen.posterior.degrees_of_freedom, chosen.posterior.noise)
 
@@ -158,6 +166,32 @@ def calibration(
     ]
     _, unlikeliness, a, b = min(candidates)
     return float(a), float(b), float(unlikeliness)
+
+
+def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
+    """Factor by which a variance that is right on average is raised for one more motion, at least 1.
+
+    With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
+
+        1 + sqrt((1 + 1 / M) max(var(s) - chance, 0))
+
+    which is one standard deviation of a new motion's s above their mean. By chance alone the variance of s is 2 / n for
+    normal residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
+
+        e² = 2 / (M - 1) + 12 / (n M)
+
+    Args:
+        relative: residuals in units of their predicted standard deviations.
+        trajectory: motion of each; 1 where there are fewer than three.
+    """
+    motions = [relative[trajectory == each] for each in np.unique(trajectory)]
+    if len(motions) < 3:
+        return 1.0
+    M, squares = len(motions), np.array([np.mean(each**2) for each in motions])
+    n = 1 / np.mean([1 / effective_samples(each, np.zeros(len(each))) for each in motions])
+    chance = 2 / n * (1 + 2 * np.sqrt(2 / (M - 1) + 12 / (n * M)))
+    beyond = np.var(squares, ddof=1) - chance * np.mean(squares) ** 2
+    return float(1 + np.sqrt((1 + 1 / M) * max(beyond, 0.0)))
 
 
 def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
@@ -208,6 +242,9 @@ def _calibrated(
         for r, noise, variance in zip(residual.T, found.noise, variances.T, strict=True)
     ]
     a, b, unlikeliness = (np.array(each) for each in zip(*joints, strict=True))
+    expected = np.maximum(a * found.noise**2 + b * variances, np.finfo(np.float64).tiny)
+    factors = np.array([scatter(each, trajectory) for each in (residual / np.sqrt(expected)).T])
+    a, b = factors * a, factors * b
     return _Calibrated(found, ridge, np.sqrt(a) * found.noise, b, float(unlikeliness.mean()))
 
 

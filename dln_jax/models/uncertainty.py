@@ -37,9 +37,10 @@ class Domain(NamedTuple):
     """[P, P - rank], orthonormal directions of scaled parameters that the data leave undetermined; there are none of a
     network, whose prior determines them."""
     centre: Any
-    """[3 d], middle of the range of (q, qd, qdd)."""
+    """[3 d], middle of the range of (q, qd, qdd); [0] for models that are linear in their parameters, which their
+    covariance alone puts outside."""
     reach: Any
-    """[3 d], how far from it the data come."""
+    """Likewise, how far from it the data come."""
 
 
 class Uncertainty(NamedTuple):
@@ -62,7 +63,8 @@ class Scores(NamedTuple):
     undetermined: Array
     """[], share of Phi in directions that the data leave undetermined, over `UNDETERMINED`."""
     distance: Array
-    """[], from the middle of the range of (q, qd, qdd), over its reach; the coordinate's where that is largest."""
+    """[], from the middle of the range of (q, qd, qdd), over its reach; the coordinate's where that is largest. 0 for
+    models without a range."""
 
 
 def predictive(
@@ -97,7 +99,7 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
         return Scores(
             parameters=jnp.max(jnp.sqrt(parameter_variance(rows, uncertainty.factor)) / limit),
             undetermined=jnp.sqrt(jnp.max(undetermined_share(rows, domain))) / UNDETERMINED,
-            distance=jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach),
+            distance=jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach) if len(reach) else jnp.zeros(()),
         )
 
     return of_state

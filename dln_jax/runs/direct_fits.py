@@ -49,7 +49,7 @@ def fit_learned_tree(task: Task, given: Options) -> tuple[Task, Training]:
     )
     size = f"{fit.parameter_count} parameters, of the linear ones rank {fit.rank}, condition {fit.condition:.3g}"
     print(f"learned tree: {size}")
-    return task, training_of(task, fit.parameters, fit.torque_mse, fit.seconds)
+    return task._replace(search=fit), training_of(task, fit.parameters, fit.torque_mse, fit.seconds)
 
 
 def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:

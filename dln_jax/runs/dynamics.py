@@ -13,6 +13,7 @@ from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
+from dln_jax.metrics.verdict import FitRefused
 from dln_jax.runs.direct_fits import fit_directly
 from dln_jax.runs.dynamics_data import Recorded, read
 from dln_jax.runs.dynamics_growth import grow_to_target
@@ -35,6 +36,8 @@ def run(given: Options, command: str) -> None:
 
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
+        FitRefused: the model predicts held-out torques no better than a guess, and neither --steps nor --seconds cut
+            its training short; the run folder is complete.
     """
     mesh, recorded = mesh_of(given), read(given)
     chosen = None
@@ -58,19 +61,27 @@ def run(given: Options, command: str) -> None:
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
         unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
+        metrics, verdict = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
         more = {"cutoff_hz": recorded.cutoff, "validation_units": unit}
         more = {name: value for name, value in more.items() if value is not None}
+        more |= {} if verdict is None else {"verdict": verdict._asdict()}
         write_config(folder, given, **task.description, **optimiser, **more, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
             print(f"the run keeps seed {given.seed + best}, the best in validation")
+        if verdict is not None:
+            print(verdict.line)
         print(f"run folder: {folder}")
         warn(task, training, folder)
+        if verdict is not None and verdict.level == "refused":
+            # A network that the user's own limit left unfinished is no failure of the command.
+            if task.solver is None or (given.steps is None and given.seconds is None):
+                raise FitRefused(verdict)
+            print("warning: training ended at the limit that you set; give it more --steps or --seconds")
 
 
 def announce(recorded: Recorded) -> None:

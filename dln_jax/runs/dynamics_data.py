@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dln_jax.command_line.arguments import names_listed, refuse_given
-from dln_jax.command_line.encoders import checked, preparation, smoothed
+from dln_jax.command_line.encoders import checked, fitted_torque, preparation, smoothed
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
@@ -45,6 +45,8 @@ class Recorded(NamedTuple):
     parents: tuple[int, ...] | None
     """Link that each hangs on, where that is given."""
     sketch: Sketch | None
+    torque: str = "measured torques"
+    """That models are fitted to and their bands are of."""
 
 
 def read(given: Options) -> Recorded:
@@ -94,6 +96,7 @@ def read(given: Options) -> Recorded:
         robot=robot,
         parents=parents,
         sketch=sketch_of(given, needs.degrees_of_freedom, parents),
+        torque=fitted_torque(filtered),
     )
 
 

@@ -19,9 +19,11 @@ from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
+from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_task import Task
 from dln_jax.runs.dynamics_uncertainty import uncertainty_metrics
+from dln_jax.runs.dynamics_verdict import judged
 from dln_jax.runs.results import cost_metrics, print_numbers, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -48,6 +50,10 @@ MEANINGS = {
     "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
     "share_not_definite": "states where the mass matrix is not definite",
     "largest_condition_number": "largest condition number of the mass matrix",
+    "verdict": "verdict: 0 good, 1 doubtful, 2 refused",
+    "zero_nmse": "nMSE of a guess of zero",
+    "noise_nmse": "nMSE of the true torques, from their noise",
+    "file_nmse": "nMSE of the robot's file",
     "coverage_95_share": "torques within the 95 % band",
     "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
     "outside_share": "states outside the training data",
@@ -66,8 +72,8 @@ MEANINGS = {
 
 def evaluate(
     folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
-) -> dict[str, float | int]:
-    """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
+) -> tuple[dict[str, float | int], Verdict | None]:
+    """Loads the stored model as a user would, measures and judges it on the test trajectories, and draws it."""
     dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
     functions, model = run.dynamics, build(task.description)
     predicted = predictions(run.energies, test, dtype, mesh=mesh)
@@ -79,8 +85,10 @@ def evaluate(
         models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
         of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
-    return {
+    verdict, of_verdict = judged(task, predicted["tau"])
+    metrics = {
         **errors(predicted, test),
+        **of_verdict,
         **spread,
         **definiteness_metrics(functions, task),
         **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
@@ -93,6 +101,7 @@ def evaluate(
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
         ),
     }
+    return metrics, verdict
 
 
 def best_seed(training: Training, seeds: int) -> tuple[Any, int]:

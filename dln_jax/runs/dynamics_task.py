@@ -9,6 +9,7 @@ from dln_jax.data.splits import Split, drawn
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, require_finite_start
+from dln_jax.learning.kinematics import TreeFit
 from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.learning.suited import MANY_JOINTS, suited_network
 from dln_jax.models.rigid_tree import USUAL
@@ -43,6 +44,8 @@ class Task(NamedTuple):
     """One, or several in one program."""
     seconds: float
     """Of training, after which to stop."""
+    search: TreeFit | None = None
+    """How the joint frames of a learned tree were found."""
 
     @property
     def name(self) -> str:

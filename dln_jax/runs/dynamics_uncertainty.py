@@ -43,8 +43,9 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
         # The model is trained: what its data cannot tell is left out, not refused.
         print(f"the run does not say what it does not know: {error}")
         return
-    dof = found.degrees_of_freedom.tolist()
-    save_uncertainty(folder, found.uncertainty, ridge=found.ridge, degrees_of_freedom=dof)
+    facts = {"ridge": found.ridge, "degrees_of_freedom": found.degrees_of_freedom.tolist()}
+    save_uncertainty(folder, found.uncertainty, **facts, torque=task.recorded.torque)
+    print(f"bands are of {task.recorded.torque}, for one more motion of the kind that was recorded")
 
 
 def uncertainty_metrics(

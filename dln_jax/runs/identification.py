@@ -14,6 +14,7 @@ from dln_jax.identification.consistent import is_consistent
 from dln_jax.identification.identify import Identification, identify, parameters_of
 from dln_jax.identification.report import base_rows, findings, parameter_rows, summary, text
 from dln_jax.metrics.errors import normalised_error
+from dln_jax.metrics.verdict import FitRefused, Verdict
 from dln_jax.runs.identification_additions import (
     ADDED,
     Predict,
@@ -27,6 +28,7 @@ from dln_jax.runs.identification_additions import (
     stored_description,
 )
 from dln_jax.runs.identification_task import Case, Options, prepare, with_shapes
+from dln_jax.runs.identification_verdict import judged
 from dln_jax.runs.results import print_numbers
 from dln_jax.types import InputError
 from dln_jax.zoo.run import save
@@ -40,6 +42,7 @@ def run(given: Options, command: str) -> None:
 
     Raises:
         InputError: a mistake in a file or an option; nothing is kept then.
+        FitRefused: the robot must not be used; the run folder is complete but for the robot's file.
     """
     case = prepare(given)
     with command_folder(given, command) as folder:
@@ -65,6 +68,10 @@ def run(given: Options, command: str) -> None:
         metrics, predicted = evaluate(case, found, predict)
         if added is not None and added.settings:
             predicted[ADDED] = judge_residual(case, added, metrics)
+        kept_torques = ADDED if ADDED in predicted else KEPT
+        torques = {name: each.torque for name, each in predicted.items()}
+        verdict, of_verdict = judged(case, found, predict, torques, kept_torques, robust=given.robust)
+        metrics |= of_verdict
         if given.uncertainty:
             metrics |= store_uncertainty(folder, case, found, added, figures=given.figures)
         write_json(folder / "metrics.json", {**metrics, "identify_seconds": seconds})
@@ -72,11 +79,14 @@ def run(given: Options, command: str) -> None:
         write_bytes(folder / "report.txt", text(found).encode())
         if given.figures:
             draw(folder, case, found, predict, predicted[KEPT])
-        lines = [*findings(found, case.sets.train, case.names), *write_file(folder, given, case, found)]
-        write_config(folder, given, **description)
+        lines = [*findings(found, case.sets.train, case.names), *write_file(folder, given, case, found, verdict)]
+        write_config(folder, given, **description, verdict=verdict._asdict())
         print_result(case, found, predicted)
         print(*summary(found), *shape_lines(case), *residual_lines(added), *lines, sep="\n")
+        print(verdict.line)
         print(f"run folder: {folder} (every parameter: report.txt)")
+        if verdict.level == "refused":
+            raise FitRefused(verdict)
 
 
 def announce(given: Options, case: Case) -> None:
@@ -137,10 +147,12 @@ def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept
         write_figure(folder / "friction.png", figure)
 
 
-def write_file(folder: Path, given: Options, case: Case, found: Identification) -> list[str]:
+def write_file(folder: Path, given: Options, case: Case, found: Identification, verdict: Verdict) -> list[str]:
     """Writes the robot's file with what is kept, and says what it lacks, or why there is none."""
     bodies = is_consistent(found.theta, found.columns)
     path = folder / f"{given.robot.stem}_identified{given.robot.suffix}"
+    if verdict.level == "refused":
+        return [f"no {path.name}: the fit is refused"]
     if not all(bodies):
         which = ", ".join(name for name, good in zip(case.names, bodies, strict=True) if not good)
         return [f"no {path.name}: by least squares the links behind {which} are no bodies that exist"]

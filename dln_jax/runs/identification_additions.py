@@ -127,7 +127,9 @@ def store_uncertainty(
     except (InputError, np.linalg.LinAlgError) as error:
         print(f"the run does not say what it does not know: {error}")
         return {}
-    save_uncertainty(folder, known.uncertainty, ridge=known.ridge, degrees_of_freedom=known.degrees_of_freedom.tolist())
+    facts = {"ridge": known.ridge, "degrees_of_freedom": known.degrees_of_freedom.tolist(), "torque": case.torque}
+    save_uncertainty(folder, known.uncertainty, **facts)
+    print(f"bands are of {case.torque}, for one more motion of the kind that was recorded")
     run, test = load(folder), case.sets.test
     state = tuple(map(jnp.asarray, (test.q, test.qd, test.qdd)))
     inverse = run.dynamics.inverse_dynamics

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, choice, names_in, names_listed, require_positive_if_given
-from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
+from dln_jax.command_line.encoders import Filtered, checked, fitted_torque, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema
 from dln_jax.data.encoders import labels_of_parts
@@ -95,6 +95,8 @@ class Case(NamedTuple):
     """Joints that do not move."""
     said: tuple[str, ...]
     """On where rates come from, and what was noticed of the log."""
+    torque: str = "measured torques"
+    """That the fit and its bands are of."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
@@ -126,7 +128,8 @@ def prepare(given: Options) -> Case:
     description = describe("rigid-tree", precision="f64", needs=needs, tree=tree_to_json(robot.tree), **scale)
     noise = noises(given.noise, robot.tree.degrees_of_freedom)
     sets = split(data, labels)
-    return with_description(Case(robot, robot.tree.names, sets, description, None, None, noise, held, said))
+    torque = fitted_torque(found)
+    return with_description(Case(robot, robot.tree.names, sets, description, None, None, noise, held, said, torque))
 
 
 def with_description(case: Case, **changes: Any) -> Case:

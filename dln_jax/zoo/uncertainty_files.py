@@ -56,10 +56,11 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
     try:
         stated = {key: tuple(each["shape"]) for key, each in manifest["tensors"].items()}
         (P, K), (d,), u = stated["factor"], stated["noise"], stated["domain/undetermined"][1]
+        reach = (0,) if stated["domain/reach"] == (0,) else (3 * d,)
         dtype = data_type(str(of["model"]["precision"]))
     except (KeyError, TypeError, ValueError, IndexError):
         raise InputError(f"{path}: does not state its arrays; {REMEDY}") from None
-    domain = Domain((d,), (P,), (P, u), (3 * d,), (3 * d,))
+    domain = Domain((d,), (P,), (P, u), reach, reach)
     shapes = Uncertainty((P, K), (d,), (d,), domain)
     like = jax.tree.map(
         lambda shape: jax.ShapeDtypeStruct(shape, dtype),

@@ -42,7 +42,7 @@ QUICK = ("--harmonics", 3, "--seconds", 6, "--trajectories", 1, "--starts", 1)
 def test_a_folder_with_motions(arm, tmp_path, capsys):
     out = tmp_path / "run"
     payload = ("--payload", 0.5, "--payload-position", "0.1,0,0", "--height", -0.2)
-    command(excite, "--robot", arm, "--out", out, "--rate", 50, *QUICK, *payload)
+    command(excite, "--robot", arm, "--out", out, "--rate", 50, *QUICK, *payload, "--allow-unlimited", "elbow")
     said = capsys.readouterr().out
     assert "no limits of position for elbow: pi to either side is assumed" in said and "validation" in said
     data = schema.load(out / "excitation.npz")
@@ -83,25 +83,38 @@ def test_a_folder_with_motions(arm, tmp_path, capsys):
         (("--velocity-scale", 0), "velocity_scale is 0"),
         (("--starts", 0), "starts is 0"),
         (("--rate", -5), "rate is -5"),
+        (("--allow-unlimited", "shoulder"), "joint 'elbow' has no limit of position: state it (--position"),
+        (("--allow-unlimited", "shoulder, wrist"), "there is no joint 'wrist' to allow without limits"),
     ],
 )
 def test_bad_input_is_one_line(arm, tmp_path, capsys, arguments, said):
     own = () if "--robot" in arguments else ("--robot", arm)
-    assert said in refused(capsys, excite, *own, "--out", tmp_path / "run", *arguments)
+    unlimited = () if "--allow-unlimited" in arguments else ("--allow-unlimited", "*")
+    assert said in refused(capsys, excite, *own, "--out", tmp_path / "run", *unlimited, *arguments)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_robot_without_velocities_is_refused(tmp_path, capsys):
     path = tmp_path / "arm.urdf"
     path.write_text(urdf(first='<limit lower="-2" upper="2" effort="30" velocity="0"/>'))
-    line = refused(capsys, excite, "--robot", path)
+    line = refused(capsys, excite, "--robot", path, "--allow-unlimited", "*")
     assert "joint 'shoulder' has no limit of velocity" in line
+
+
+@pytest.mark.parametrize("effort", ["", 'effort="0"', 'effort="inf"'])
+def test_joint_without_torque_limit_is_refused_unless_allowed(tmp_path, capsys, effort):
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf(first=f'<limit lower="-2" upper="2" {effort} velocity="1"/>'))
+    line = refused(capsys, excite, "--robot", path, "--allow-unlimited", "elbow")
+    assert "joint 'shoulder' has no limit of force: state it (--torque" in line
+    limits, said = limits_of_robot(read_robot(path), allow_unlimited=["shoulder", "el*"])
+    assert "no limits of force for shoulder" in said[-1] and np.isinf(limits.force[0]).all()
 
 
 def test_limits_of_a_file(arm, tmp_path):
     robot = read_robot(arm)
     assert np.allclose(robot.velocity_limits, [2.5, 3.0])
-    limits, said = limits_of_robot(robot, acceleration=[4.0, 5.0], force=12.0)
+    limits, said = limits_of_robot(robot, acceleration=[4.0, 5.0], force=12.0, allow_unlimited=["elbow"])
     assert len(said) == 1 and np.allclose(limits.position, [[-2.0, 1.5], [-np.pi, np.pi]])
     assert np.allclose(limits.acceleration, [4.0, 5.0]) and np.allclose(limits.force, [[-12.0, 12.0]] * 2)
     path = tmp_path / "slide.urdf"

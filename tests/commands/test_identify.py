@@ -117,6 +117,49 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
     assert not list((workplace / "free").glob("*.urdf")) and load(workplace / "free").dynamics is not None
 
 
+def test_sound_log_is_good(identified):
+    metrics = json.loads((identified / "metrics.json").read_text())
+    verdict = json.loads((identified / "config.json").read_text())["chosen"]["verdict"]
+    assert metrics["verdict"] == 0 and verdict["level"] == "good" and "the robot's file" in verdict["reason"]
+    assert metrics["noise_nmse"] < metrics["nmse"] < 0.05 < metrics["file_nmse"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda tau: tau * [1, -1], "no better than by a constant"),
+        (lambda tau: -tau, "no such robot"),
+        (lambda tau: 1e3 * tau, "times the torques of those in the robot's file; check the unit of tau"),
+    ],
+    ids=["one-sign", "all-signs", "millinewton-metres"],
+)
+def test_ruined_log_is_refused_without_a_robots_file(workplace, capsys, spoil, said, request):
+    name = request.node.callspec.id
+    log = dict(np.load(workplace / "log.npz"))
+    np.savez(workplace / f"{name}.npz", **{**log, "tau": spoil(log["tau"])})
+    options = ("--robot", "arm.urdf", "--data", f"{name}.npz", "--out", name, "--no-figures", "--no-uncertainty")
+    with pytest.raises(SystemExit) as ended:
+        command(identify, *options)
+    told = capsys.readouterr()
+    assert ended.value.code == 1 and told.err.startswith("error: the fit is refused: ") and told.err.count("\n") == 1
+    assert "verdict: refused: " in told.out and "no arm_identified.urdf: the fit is refused" in told.out
+    assert said in told.err or said == "no such robot"
+    assert not list((workplace / name).glob("*.urdf"))
+    assert json.loads((workplace / name / "metrics.json").read_text())["verdict"] == 2
+
+
+def test_spikes_ask_for_a_robust_fit(workplace, capsys):
+    log, random = dict(np.load(workplace / "log.npz")), np.random.default_rng(2)
+    hit = random.random(log["tau"].shape) < 0.01
+    np.savez(workplace / "spikes.npz", **{**log, "tau": log["tau"] + 20 * hit * log["tau"].std(axis=0)})
+    options = ("--robot", "arm.urdf", "--data", "spikes.npz", "--no-figures", "--no-uncertainty")
+    with pytest.raises(SystemExit):
+        command(identify, *options, "--out", "spiky")
+    assert "give --robust" in capsys.readouterr().err
+    command(identify, *options, "--out", "robust", "--robust")
+    assert json.loads((workplace / "robust" / "metrics.json").read_text())["verdict"] == 0
+
+
 def test_mistakes_are_one_line(workplace, capsys):
     data = dict(np.load(workplace / "log.npz"))
     variants = {

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from dln_jax.data.schema import from_arrays
+from dln_jax.data.splits import split
+from dln_jax.datasets.generators import uniform
 from dln_jax.learning import uncertainty as learning
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
-from dln_jax.learning.uncertainty import calibration, effective_samples, estimate
+from dln_jax.learning.uncertainty import calibration, effective_samples, estimate, scatter
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.plain import InverseForward
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
@@ -18,7 +20,9 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.uncertainty import outside, predictive, scores
+from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
 
 FRAMES = dh_frames([[0, 0, 0.3, 0], [-np.pi / 2, 0, 0, 0]])
@@ -87,8 +91,52 @@ def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     flag = jax.jit(jax.vmap(outside(ARM, parameters, found.uncertainty)))
     near, far = drawn(5, reach=0.99), drawn(6, reach=6.0)
     assert np.mean(flag(near.q, near.qd, near.qdd)) <= 0.02
-    assert np.mean(flag(far.q, far.qd, far.qdd)) >= 0.98
+    away = (far.q, far.qd, far.qdd)
+    error = jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics)(*away) - TORQUE(*away)
+    wrong = np.any(np.abs(error) > 3 * NOISE, axis=1)
+    flagged = np.asarray(flag(*away))
+    assert wrong.mean() > 0.5 and flagged[wrong].all() and flagged.mean() > 0.95
     assert flag(np.full((1, 2), np.nan), np.zeros((1, 2)), np.zeros((1, 2))).all()
+
+
+def test_exact_linear_model_is_nowhere_outside():
+    scene = two_link_arm()
+    model = make_trigonometric(scene.needs)
+    sets = split(uniform(scene, samples=300, seed=0), validation_share=0.2)
+    parameters = fit_linear(model, sets.train).parameters
+    found = estimate(model, parameters, sets.train, sets.validation, ridge=0.0)
+    random = np.random.default_rng(1)
+    away = [random.uniform(-reach, reach, (200, 2)) for reach in (6.0, 30.0, 300.0)]
+    truth = jax.vmap(dynamics(scene.energies).inverse_dynamics)(*away)
+    error = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*away) - truth
+    assert np.abs(error).max() < 1e-8 * np.abs(truth).max()
+    assert not jax.vmap(outside(model, parameters, found.uncertainty))(*away).any()
+
+
+@pytest.mark.parametrize(("motions", "samples"), [(4, 50), (8, 200), (400, 1)])
+def test_motions_that_differ_by_chance_alone_have_no_scatter(motions, samples):
+    factors = []
+    for seed in range(20):
+        relative = np.random.default_rng(seed).normal(size=motions * samples)
+        factors.append(scatter(relative, np.repeat(np.arange(motions), samples)))
+    assert np.median(factors) == 1 and np.mean(factors) < 1.1
+
+
+def test_bands_with_scatter_hold_for_new_motions():
+    """Each motion has an error of its own size, as what a model lacks has."""
+    random, levels = np.random.default_rng(0), (0.9,)
+    sizes = np.sqrt(random.lognormal(0.0, 0.7, (60, 1)))
+    errors = sizes * random.normal(size=(60, 200))
+    motion = np.repeat(np.arange(10), 200)
+    plain, scattered = [], []
+    for fitted in range(0, 50, 10):
+        known, new = errors[fitted : fitted + 10].ravel(), errors[50:]
+        std = np.sqrt(np.mean(known**2))
+        raised = std * np.sqrt(scatter(known / std, motion))
+        for shares, each in ((plain, std), (scattered, raised)):
+            shares.append([coverage(x[:, None], np.full((200, 1), each), levels=levels).shares[0, 0] for x in new])
+    assert np.min(scattered) > np.min(plain) + 0.03
+    assert np.mean(np.array(scattered) >= 0.9) > 0.75 > np.mean(np.array(plain) >= 0.9)
 
 
 def test_a_direction_that_data_never_showed_is_told_even_where_the_deviation_is_blind():

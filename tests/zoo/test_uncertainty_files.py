@@ -110,3 +110,12 @@ def test_it_is_stored_in_the_precision_of_the_model(tmp_path):
     save(tmp_path, description, build(description).init(jax.random.key(0)))
     save_uncertainty(tmp_path, known())
     assert load(tmp_path).torque_std(*STATES[0]).dtype == jnp.float32
+
+
+def test_uncertainty_without_a_range_comes_back(folder):
+    stored = known()
+    stored = stored._replace(domain=stored.domain._replace(centre=np.zeros(0), reach=np.zeros(0)))
+    save_uncertainty(folder, stored)
+    run = load(folder)
+    assert run.uncertainty is not None and run.uncertainty.domain.reach.shape == (0,)
+    assert run.outside(*STATES[0].tolist()) == outside(MODEL, PARAMETERS, stored)(*STATES[0])

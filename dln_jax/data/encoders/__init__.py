@@ -5,7 +5,7 @@
 
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import derivatives, low_pass
-from dln_jax.data.encoders.noise import noise_of, step_of
+from dln_jax.data.encoders.noise import noise_of, step_of, torque_noise
 from dln_jax.data.encoders.repeats import Repeats, find_repeats, without_repeats
 from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
 
@@ -21,5 +21,6 @@ __all__ = [
     "noise_of",
     "smooth",
     "step_of",
+    "torque_noise",
     "without_repeats",
 ]

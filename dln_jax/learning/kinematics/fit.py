@@ -52,6 +52,8 @@ class TreeFit(NamedTuple):
     """Ends of all descents, mean squares in units of each torque's standard deviation, lowest first."""
     agreeing: int
     """Descents that ended as low as the lowest."""
+    agreement: int
+    """Descents that the search wanted to agree (`Search.agreement`)."""
     seconds: float
     """Of the whole call, compilation included."""
 
@@ -129,6 +131,7 @@ def fit_tree(
         condition=solution.condition,
         losses=np.array([float(each.at.loss) for each in found]),
         agreeing=agreeing(found),
+        agreement=settings.agreement,
         seconds=time.perf_counter() - began,
     )
 
