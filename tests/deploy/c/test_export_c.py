@@ -53,7 +53,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     assert f"C format {interface.FORMAT}" in header
     assert "void arm_step(const float x[4], const float u[1], float x_next[4]);" in header
     assert "float arm_energy(const float x[3], float k);" in header
-    assert re.findall(r"#include (\S+)", source) == ["<math.h>", '"arm.h"']
+    assert re.findall(r"#include (\S+)", source) == ["<float.h>", "<math.h>", "<stdint.h>", '"arm.h"']
     assert not re.search(r"\b(malloc|static (?!const|inline|void)|double)\b", source)
     stated = json.loads(once["arm.json"])["functions"]
     for each in stated.values():
@@ -177,7 +177,7 @@ def test_the_loader_says_what_is_missing(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"could not compile the model: .*error"):
             load_c(tmp_path, flags=("--no-such-flag",))
     monkeypatch.setattr(interface, "FORMAT", 99)
-    with pytest.raises(InputError, match="C format 3; this release reads format 99"):
+    with pytest.raises(InputError, match="C format 4; this release reads format 99"):
         load_c(tmp_path)
 
 
