@@ -202,8 +202,8 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     rounding to fewer bits.
 
     Before it, the source has <float.h>, <math.h>, <stdint.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is
-    a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own because gcc vectorises
-    the loop around a call only where it inlines the call, and it inlines some sixty calls a source.
+    a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own
+    because gcc vectorises the loop around a call only where it inlines the call, and it inlines some sixty a source.
     """
     arrays = set(arrays)
     needed = set(names) | arrays

@@ -11,7 +11,8 @@ from dln_jax.deploy.c.body import Body, Called, Source
 from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES
 from dln_jax.deploy.c.moves import copied, merged
 from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
-from dln_jax.deploy.c.operations import OPERATIONS, VECTORISED, pattern
+from dln_jax.deploy.c.operations import OPERATIONS, VECTORISED
+from dln_jax.deploy.c.operations import written as written_c
 from dln_jax.deploy.c.plan import WRITTEN_OUT, plan_of, strides
 from dln_jax.deploy.c.program import Program
 
@@ -164,7 +165,8 @@ def expression(body: Body, node: Node, args: list[str], *, looped: bool = False)
     if name := _checked(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"
-    return pattern(node.op, node.dtype).format(*args, f=body.source.suffix)
+    # What is compared has a kind of its own.
+    return written_c(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
 
 
 def _checked(node: Node) -> str | None:

@@ -1,5 +1,7 @@
 """What is no product and not elementwise as C: reductions, updates at indices, factorisations, and control flow."""
 
+from collections.abc import Callable
+from functools import partial
 from textwrap import dedent
 
 import numpy as np
@@ -7,7 +9,7 @@ import numpy as np
 from dln_jax.deploy.c.body import Body
 from dln_jax.deploy.c.moves import copied
 from dln_jax.deploy.c.nodes import Node
-from dln_jax.deploy.c.operations import OPERATIONS, pattern
+from dln_jax.deploy.c.operations import OPERATIONS, written
 
 _REDUCE = tuple(f"reduce_{op}" for op in ("add", "mul", "max", "min", "and", "or", "xor"))
 _PUT = tuple(f"put_{op}" for op in ("set", "add", "sub", "mul", "min", "max"))
@@ -83,19 +85,19 @@ def definitions(names: set[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
-def _pattern(node: Node) -> tuple[str, int]:
+def _joined(node: Node) -> tuple[Callable[..., str], int]:
     """C of two terms of a reduction or update, and its floating-point operations."""
     op = node.op.partition("_")[2]
-    return pattern(op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
+    return partial(written, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
 
 
 def combined(body: Body, node: Node, k: int, terms: list[str]) -> str:
     """A reduction of few terms, written out."""
-    combining, cost = _pattern(node)
+    joined, cost = _joined(node)
     body.spend(cost * (len(terms) - 1))
     text = terms[0]
     for place, term in enumerate(terms[1:]):
-        text = combining.format(text, term)
+        text = joined(text, term)
         # A choice names what it compares twice: without a name of its own, its text doubles with each term.
         if node.op in ("reduce_max", "reduce_min") and place < len(terms) - 2:
             name = f"v{node.number}_{k}_{place}"
@@ -115,7 +117,7 @@ def _kept(body: Body, node: Node) -> str:
 def _reduction(body: Body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
-    combining, cost = _pattern(node)
+    joined, cost = _joined(node)
     body.spend(cost * rows * (count - 1))
     at, scalar = np.arange(a.size).reshape(a.shape), node not in body.plan.arrays
     name = _kept(body, node)
@@ -136,7 +138,7 @@ def _reduction(body: Body, node: Node) -> None:
         body.line(f"{kind} sum_ = {body.read(a, at[:, 0], ['r_'])};")
         body.opened(f"for (int k_ = 1; k_ < {count}; ++k_)")
         body.line(f"const {kind} term_ = {body.read(a, at, ['r_', 'k_'])};")
-        body.line(f"sum_ = {combining.format('sum_', 'term_')};")
+        body.line(f"sum_ = {joined('sum_', 'term_')};")
         body.closed()
     body.line(f"{name}{'' if scalar else '[r_]'} = sum_;")
     body.closed()
@@ -174,8 +176,8 @@ def _put(body: Body, node: Node) -> None:
     body.line(f"const long long target_ = {body.read(targets, index, ['k_'])};")
     body.line(f"const {body.c_type(node.dtype)} update_ = {body.read(updates, index, ['k_'])};")
     at = f"{name}[target_]"
-    combining = "{1}" if node.op == "put_set" else _pattern(node)[0]
-    body.line(f"if (target_ >= 0) {at} = {combining.format(at, 'update_')};")
+    new = "update_" if node.op == "put_set" else _joined(node)[0](at, "update_")
+    body.line(f"if (target_ >= 0) {at} = {new};")
     body.closed()
 
 

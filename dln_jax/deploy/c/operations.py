@@ -110,9 +110,15 @@ OPERATIONS = {
 """By name."""
 
 
-def pattern(op: str, dtype: str) -> str:
-    """C of an operation on numbers of a kind."""
-    return (dtype != "real" and integers.pattern(op, dtype)) or OPERATIONS[op].c
+def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
+    """C of an operation on numbers of a kind; `suffix` is that of functions of <math.h>."""
+    alike = len(args) == 2 and args[0] == args[1]  # compilers warn of comparing a number with itself
+    if alike and (op in ("lt", "gt") or (dtype != "real" and op in ("eq", "ne", "le", "ge"))):
+        return str(int(op in ("eq", "le", "ge")))
+    if alike and op in ("max", "min"):
+        return args[0]
+    text = integers.pattern(op, dtype) if dtype != "real" else None
+    return (text or OPERATIONS[op].c).format(*args, f=suffix)
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))

@@ -6,12 +6,13 @@ order of that loop. Where there is one column, sums are kept in parts.
 """
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 
 from dln_jax.deploy.c.body import Body
 from dln_jax.deploy.c.nodes import Node, is_constant, values
-from dln_jax.deploy.c.operations import pattern
+from dln_jax.deploy.c.operations import written
 
 _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
@@ -25,17 +26,16 @@ def chain(pairs: list[tuple[str, str]], dtype: str) -> str:
     (first, second), *rest = pairs
     if dtype != "real":
         product, total = _of_integers(dtype)
-        text = product.format(first, second)
-        return functools.reduce(lambda text, pair: total.format(text, product.format(*pair)), rest, text)
+        return functools.reduce(total, [product(*pair) for pair in pairs])
     text = f"{first} * {second}"
     for first, second in rest:
         text = f"MULTIPLY_ADD({first}, {second}, {text})"
     return text
 
 
-def _of_integers(dtype: str) -> tuple[str, str]:
+def _of_integers(dtype: str) -> list[Callable[[str, str], str]]:
     """C of a product and of a sum; of truth values, both and any."""
-    return tuple(pattern(op, dtype) for op in (("and", "or") if dtype == "bool" else ("mul", "add")))
+    return [functools.partial(written, op, dtype) for op in (("and", "or") if dtype == "bool" else ("mul", "add"))]
 
 
 def contracted(body: Body, members: list[Node]) -> None:
@@ -152,7 +152,7 @@ def _whole(body: Body, node: Node) -> None:
     body.line(f"{kind} sum_ = 0;")
     first = body.read(a, ((i * m + j) * count + k)[..., 0], ["b_", "r_", "k_"])
     second = body.read(b, ((i * count + k) * columns + c)[:, 0], ["b_", "k_", "c_"])
-    term = total.format("sum_", product.format(first, second))
+    term = total("sum_", product(first, second))
     body.line(f"for (int k_ = 0; k_ < {count}; ++k_) sum_ = {term};")
     target = body.index(((i * m + j) * columns + c)[:, :, 0], ["b_", "r_", "c_"])
     body.line(f"{body.name(node)}[{target}] = sum_;")

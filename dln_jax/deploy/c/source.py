@@ -33,6 +33,7 @@ from dln_jax.deploy.c.kinds import kind_of
 from dln_jax.deploy.c.lowering import program_of
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
+from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
 
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
@@ -50,8 +51,10 @@ class TooLargeError(InputError):
 
 
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
-Results may overlap arguments: all of these are read before. What is not finite in a state is not hidden."""
-_RELIED_ON = """#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
+Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
+written. What is not finite in a state is not hidden."""
+_RELIED_ON = """\
+#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
 #error "NaN, infinities and rounding are relied on: leave out -ffast-math and what it stands for"
 #endif
 """
@@ -115,11 +118,23 @@ def source_files(
     precision = precision or _precision(functions)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
+    with computing_in(precision):
+        return _source_files(functions, name, precision, libm, casadi, leave_out_large, stack)
+
+
+def _source_files(
+    functions: Functions,
+    name: str,
+    precision: str,
+    libm: bool,
+    casadi: bool | Collection[str],
+    leave_out_large: bool,
+    stack: int,
+) -> dict[str, bytes]:
     source, signatures, texts, left_out = Source(precision, libm), {}, [], []
-    with jax.enable_x64(precision == "f64"):
-        every = {
-            check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
-        }
+    every = {
+        check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
+    }
     repeated = repeated_calls([each.closed for each in every.values()])
     for key, each in every.items():
         before = source.copy()
@@ -162,10 +177,7 @@ def _for_casadi(
 ) -> dict[str, str]:
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
-    with jax.enable_x64(True):
-        source, text, left_out = external.external_functions(
-            name, functions, libm=libm, stack=stack, leave_out=leave_out
-        )
+    source, text, left_out = external.external_functions(name, functions, libm=libm, stack=stack, leave_out=leave_out)
     absent = "\n".join(f"Left out: {each}" for each in left_out)
     about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
     return {

@@ -14,7 +14,24 @@ from jax import lax
 
 REAL, WHOLE = (jnp.float64,), (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
 TYPES = (*REAL * 3, *WHOLE[:2] * 2, *WHOLE[2:], jnp.bool_)
-SHAPES = ((), (1,), (2,), (3,), (5,), (8,), (9,), (17,), (40,), (65,), (2, 2), (3, 4), (4, 4), (7, 3), (2, 3, 4), (9, 8))
+SHAPES = (
+    (),
+    (1,),
+    (2,),
+    (3,),
+    (5,),
+    (8,),
+    (9,),
+    (17,),
+    (40,),
+    (65,),
+    (2, 2),
+    (3, 4),
+    (4, 4),
+    (7, 3),
+    (2, 3, 4),
+    (9, 8),
+)
 LARGEST = 300
 """Elements of an array."""
 Arrays = list[Any]
@@ -104,8 +121,9 @@ def _tame(x: Any) -> Any:
 ON_REAL = (
     jnp.sin, jnp.cos, jnp.tanh, jnp.arctan, jnp.arcsinh, jnp.square, jnp.abs, jnp.negative, jnp.cbrt, jnp.floor,
     jnp.sign, jnp.round, jax.nn.relu, jax.nn.softplus, jax.nn.sigmoid, lax.erf, jnp.ceil, jnp.trunc,
-    lambda x: jnp.exp(-jnp.abs(x)), lambda x: jnp.log1p(x * x), lambda x: jnp.sqrt(1 + x * x), lambda x: 1 / (1 + x * x),
-    lambda x: 0 - x, lambda x: jnp.expm1(0.1 * x), lambda x: x**3, lambda x: (1 + x * x) ** -2,
+    lambda x: jnp.exp(-jnp.abs(x)), lambda x: jnp.log1p(x * x), lambda x: jnp.sqrt(1 + x * x),
+    lambda x: 1 / (1 + x * x), lambda x: 0 - x, lambda x: jnp.expm1(0.1 * x), lambda x: x**3,
+    lambda x: (1 + x * x) ** -2,
     lambda x: lax.reduce_precision(x, 8, 10), lambda x: jnp.modf(x)[0], lambda x: jnp.log(2 + jnp.sin(x)),
     lambda x: jnp.clip(x, -0.5, 0.75), lambda x: lax.rsqrt(1 + x * x),
 )  # fmt: skip
@@ -118,7 +136,16 @@ ON_TWO_WHOLE = (
     jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lax.div, lax.rem, jnp.bitwise_and, jnp.bitwise_or,
     jnp.bitwise_xor, jnp.floor_divide, jnp.remainder,
 )  # fmt: skip
-ON_WHOLE = (jnp.negative, jnp.abs, jnp.sign, jnp.bitwise_not, jnp.square, lambda x: x**3, lambda x: x & 1, lambda x: x | 0)
+ON_WHOLE = (
+    jnp.negative,
+    jnp.abs,
+    jnp.sign,
+    jnp.bitwise_not,
+    jnp.square,
+    lambda x: x**3,
+    lambda x: x & 1,
+    lambda x: x | 0,
+)
 ON_TRUTHS = (jnp.logical_and, jnp.logical_or, jnp.logical_xor, jnp.equal, jnp.less, jnp.less_equal, jnp.maximum)
 COMPARED = (jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
 
@@ -138,7 +165,7 @@ def _two(random, known, depth):
     b = _partner(random, known, a)
     kind = jnp.dtype(a.dtype).kind
     functions = {"f": ON_TWO_REAL, "b": ON_TRUTHS}.get(kind, ON_TWO_WHOLE)
-    result = functions[random.integers(len(functions))](a, b)
+    result = functions[random.integers(len(functions))](*jnp.broadcast_arrays(a, b))
     return [_tame(result) if kind == "f" else result]
 
 
@@ -174,18 +201,24 @@ def _converted(random, known, depth):
     return [(3 * x if jnp.dtype(x.dtype).kind == "f" else x).astype(dtype)]
 
 
+OVER_REAL = (
+    lambda x, axis: _tame(x.mean(axis)), lambda x, axis: _tame(jnp.sum(x, axis)), jnp.max, jnp.min,
+    lambda x, axis: jnp.prod(jnp.cos(x), axis), jnp.argmax, jnp.argmin, lambda x, axis: jnp.sqrt(1 + jnp.var(x, axis)),
+    lambda x, axis: _tame(jnp.cumsum(x, axis or 0)),
+)  # fmt: skip
+OVER_WHOLE = (
+    jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.argmax, jnp.argmin, lambda x, axis: jnp.cumsum(x, axis or 0),
+    lambda x, axis: jnp.bitwise_xor.reduce(x, axis or 0), lambda x, axis: jnp.bitwise_or.reduce(x, axis or 0),
+    lambda x, axis: jnp.bitwise_and.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0),
+)  # fmt: skip
+OVER_TRUTHS = (jnp.any, jnp.all, jnp.sum, jnp.max, jnp.min)
+
+
 def _reduced(random, known, depth):
     x = _chosen(random, known, rank=1)
     axis = (None, int(random.integers(x.ndim)))[random.integers(2)]
     kind = jnp.dtype(x.dtype).kind
-    functions = {
-        "f": [lambda x, axis: _tame(x.mean(axis)), lambda x, axis: _tame(jnp.sum(x, axis)), jnp.max, jnp.min,
-              lambda x, axis: jnp.prod(jnp.cos(x), axis), jnp.argmax, jnp.argmin,
-              lambda x, axis: jnp.sqrt(1 + jnp.var(x, axis)), lambda x, axis: _tame(jnp.cumsum(x, axis or 0))],
-        "b": [jnp.any, jnp.all, jnp.sum, jnp.max, jnp.min],
-    }.get(kind, [jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.argmax, jnp.argmin, lambda x, axis: jnp.cumsum(x, axis or 0),
-                 lambda x, axis: jnp.bitwise_xor.reduce(x, axis or 0), lambda x, axis: jnp.bitwise_or.reduce(x, axis or 0),
-                 lambda x, axis: jnp.bitwise_and.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0)])  # fmt: skip
+    functions = {"f": OVER_REAL, "b": OVER_TRUTHS}.get(kind, OVER_WHOLE)
     return [jnp.asarray(functions[random.integers(len(functions))](x, axis))]
 
 
@@ -230,11 +263,15 @@ def _first(x, axis):
 def _indexed(random, known, depth):
     x = _chosen(random, known, rank=1)
     index = _chosen(random, known, "iu")
+    # JAX narrows indices to 32 bits in some modes, and jitted and not it clamps large unsigned ones differently.
+    index = index % 23 if jnp.dtype(index.dtype).kind == "u" else jnp.clip(index, -23, 23)
     index = index if index.size * (x.size // x.shape[0]) <= LARGEST else index.reshape(-1)[0]
     near = index % x.shape[0]
     ways = [
         lambda: x[near],
-        lambda: jnp.take(x, index, axis=0, mode=("clip", "wrap", "fill")[random.integers(3 if x.dtype != float else 2)]),
+        lambda: jnp.take(
+            x, index, axis=0, mode=("clip", "wrap", "fill")[random.integers(3 if x.dtype != float else 2)]
+        ),
         lambda: lax.dynamic_slice_in_dim(x, index.reshape(-1)[0], max(1, x.shape[0] // 2)),
         lambda: lax.dynamic_update_slice_in_dim(x, _first(x, 0), index.reshape(-1)[0], 0),
         lambda: lax.dynamic_index_in_dim(x, near.reshape(-1)[0]),
@@ -284,7 +321,9 @@ def _branched(random, known, depth):
 
     def branch(seed):
         def inside(x):
-            return _alike(_computed(np.random.default_rng(int(seed)), [x, *known[-2:]], steps=2, depth=depth - 1)[-1], x)
+            return _alike(
+                _computed(np.random.default_rng(int(seed)), [x, *known[-2:]], steps=2, depth=depth - 1)[-1], x
+            )
 
         return inside
 
@@ -312,7 +351,7 @@ def _looped(random, known, depth):
 
 
 def _nested(random, known, depth):
-    """A jitted function with constants of its own, called once or twice; a second one differs in its constants alone."""
+    """A jitted function with constants of its own, called twice; another differs in its constants alone."""
     if not depth:
         return []
     seed = int(random.integers(1 << 30))
