@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import platform
 import re
 import shutil
 import subprocess
@@ -325,3 +326,32 @@ def test_arguments_of_another_shape_are_refused_by_name(exported, tmp_path):
     for call in (lambda: energy([1, 2, 3]), lambda: energy([1, 2, 3], 1.0, 2.0), lambda: energy([1, 2, 3], j=1)):
         with pytest.raises(InputError, match="energy takes x, k"):
             call()
+
+
+@needs_compiler
+@pytest.mark.parametrize("flags", [("-ffast-math",), ("-ffinite-math-only",), ("-mfpmath=387",)], ids=str)
+def test_flags_that_give_wrong_numbers_do_not_compile(flags, tmp_path):
+    if flags == ("-mfpmath=387",) and platform.machine() != "x86_64":
+        pytest.skip("is a flag for x86")
+    export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path)
+    with pytest.raises(InputError, match=r"#error .*(-ffast-math|-mfpmath=sse)"):
+        load_c(tmp_path, compiler="gcc", flags=flags)
+
+
+@needs_compiler
+def test_library_functions_bear_extended_precision(tmp_path):
+    if platform.machine() != "x86_64":
+        pytest.skip("is a flag for x86")
+    export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path, libm=True)
+    x = np.linspace(-3, 3, 9)
+    np.testing.assert_allclose(load_c(tmp_path, compiler="gcc", flags=("-mfpmath=387",)).f(x), np.exp(x), rtol=1e-14)
+
+
+def test_integers_have_the_types_of_stdint(tmp_path):
+    types = (np.int32, np.int64, np.uint32, np.uint64)
+    export_c({"f": (lambda *each: each[0][0] + 1, tuple(np.zeros(2, kind) for kind in types))}, tmp_path)
+    header = (tmp_path / "model.h").read_text()
+    assert "#include <stdint.h>" in header
+    for kind in types:
+        assert f"const {np.dtype(kind).name}_t " in header
+    assert not re.search(r"\bunsigned |long long", (tmp_path / "model.c").read_text())
