@@ -406,7 +406,7 @@ TYPES = {
         (SPECIAL,),
     ),
     "signs_of_zero": (lambda x: (1 / (0 - x), 1 / -x), (np.array([0.0, -0.0, 2.0]),)),
-    "modf": (jnp.modf, (np.array([0.5, -1.75, 3.0, -0.0]),)),
+    "whole_and_fraction": (jnp.modf, (np.array([0.5, -1.75, 3.0, -0.0]),)),
     **{f"result_read_by_another_{n}": (lambda x: (2 * x, 2 * x + 1), (normal(n),)) for n in (1, 7, 8, 9, 33, 64, 65)},
     "result_read_in_a_loop": (
         lambda x: (2 * x, lax.fori_loop(0, 3, lambda k, y: y + 2 * x, x), (2 * x)[::-1], (2 * x).sum()),
