@@ -1,7 +1,8 @@
 """Single and double precision: their names, and what needs which."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import jax
@@ -40,6 +41,25 @@ def require_float64(precision: str) -> None:
     """Raises `InputError` unless the precision is f64, which Gauss-Newton needs."""
     if precision != "f64":
         raise InputError(f"precision is {precision}; gauss-newton needs f64, as it squares condition numbers")
+
+
+@contextmanager
+def computing_in(precision: str) -> Iterator[None]:
+    """JAX in f32 or f64, whatever its own setting is.
+
+    JAX keeps a NumPy array that a function closes over in the precision in which it met it first (as of 0.11, by the
+    array's identity), and a function that is jitted in both gets constants of the wrong one. So where the setting is
+    another, all that JAX has compiled is forgotten on both sides. Traced programs must not outlive the context.
+    """
+    differs = jax.config.read("jax_enable_x64") != (precision == "f64")
+    if differs:
+        jax.clear_caches()
+    try:
+        with jax.enable_x64(precision == "f64"):
+            yield
+    finally:
+        if differs:
+            jax.clear_caches()
 
 
 Function = TypeVar("Function", bound=Callable)

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from dln_jax.deploy.c.interface import KINDS, Leaf, Signature
+from dln_jax.deploy.c.kinds import NUMPY_TYPES
 from dln_jax.deploy.c.text import PRECISIONS
 from dln_jax.deploy.low_latency import as_shaped
 from dln_jax.types import InputError
 
 _C = {**KINDS, "real": "real"}
-_TYPES = {"bool": np.int32, "int": np.int32, "long": np.int64, "unsigned": np.uint32, "unsigned_long": np.uint64}
+_TYPES = {**NUMPY_TYPES, "bool": np.int32}
 _GIVES = {"real": "PyFloat_FromDouble((double){})", "unsigned_long": "PyLong_FromUnsignedLongLong({})"}
 _START = Template("""\
 #include <stddef.h>

@@ -5,18 +5,17 @@ What moves elements then is indexing of that array, and a constant is stored in 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.deploy.c.kinds import C_TYPES
 from dln_jax.deploy.c.nodes import Node, Region, is_constant, values
 from dln_jax.deploy.c.plan import Plan, strides
 from dln_jax.deploy.c.program import Program
 from dln_jax.deploy.c.text import integer, literal
-
-C_TYPES = {"real": "real", "bool": "int", "int": "int", "long": "long long", "unsigned": "unsigned"}
-C_TYPES |= {"unsigned_long": "unsigned long long"}
 
 
 class Called(NamedTuple):
@@ -42,9 +41,11 @@ class Source:
     """Elementary functions of one number that are called."""
     arrays: set[str] = field(default_factory=set)
     """Elementary functions of arrays that are called."""
+    integers: set[str] = field(default_factory=set)
+    """Functions of whole numbers that are called."""
     kernels: set[str] = field(default_factory=set)
-    parts: dict[Any, "Called"] = field(default_factory=dict)
-    """Functions that others call."""
+    parts: dict[bytes, "Called"] = field(default_factory=dict)
+    """Functions that others call, by the identity of their program."""
     names: dict[str, str] = field(default_factory=dict)
     """Their names, by what they do."""
 
@@ -53,12 +54,16 @@ class Source:
         """Of functions of <math.h> and literals."""
         return "f" if self.precision == "f32" else ""
 
+    def copy(self) -> "Source":
+        """What may be changed without this one."""
+        shared = {each.name: copy(getattr(self, each.name)) for each in fields(self)}
+        return Source(**shared)
+
     def table(self, numbers: np.ndarray, dtype: str) -> str:
         """Name of a constant array."""
         array = np.ascontiguousarray(numbers)
         if dtype == "real":
             array = array.astype(np.float32 if self.precision == "f32" else np.float64)
-        array = array.astype(np.int32) if dtype == "int" else array
         key = dtype, array.tobytes() + str(array.size).encode()
         return self.tables.setdefault(key, (f"table_{len(self.tables)}", array))[0]
 
@@ -119,7 +124,7 @@ class Body:
 
     def finished(self, step: Node) -> None:
         """Gives arrays back that no later step reads."""
-        for source in self.plan.reads.get(step, ()):
+        for source in sorted(self.plan.reads.get(step, ()), key=lambda each: each.number):
             left = self.plan.readers[source]
             left.discard(step)
             if not left and source in self.names:
@@ -206,8 +211,8 @@ class Body:
         """A literal."""
         if dtype == "real":
             return literal(value, self.source.precision)
-        text = integer(int(value)) if value >= 0 else f"({integer(int(value))})"
-        return text + {"unsigned": "U", "unsigned_long": "ULL"}.get(dtype, "")
+        text = integer(int(value), dtype)
+        return f"({text})" if value < 0 else text
 
     def pointer(self, node: Node) -> str:
         """To the memory of a node."""
@@ -229,7 +234,7 @@ class Body:
         }
 
     def uses(self, node: Node) -> bool:
-        """Whether anything reads an input."""
+        """Whether anything reads a node."""
         return node in self.plan.needed and bool(self.plan.needed[node].any())
 
 

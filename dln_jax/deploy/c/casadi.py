@@ -15,7 +15,6 @@ dense and column-major, vectors are n x 1, and pointers may be null: an input of
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from copy import deepcopy
 from functools import partial
 from itertools import accumulate, pairwise, takewhile
 from typing import Any, NamedTuple
@@ -26,11 +25,10 @@ import numpy as np
 
 from dln_jax.deploy.c import sensitivities
 from dln_jax.deploy.c.body import Body, Source
-from dln_jax.deploy.c.emit import region
+from dln_jax.deploy.c.emit import region, written
 from dln_jax.deploy.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.deploy.c.jaxprs import traced
 from dln_jax.deploy.c.lowering import program_of
-from dln_jax.deploy.c.moves import copied
 from dln_jax.deploy.c.plan import plan_of
 from dln_jax.types import InputError
 
@@ -229,7 +227,7 @@ def _function(
     failure: Exception | None = None
     for way in ways:
         try:
-            body = _body(deepcopy(source), inputs, outputs, way)
+            body = _body(source.copy(), inputs, outputs, way)
         except (TypeError, ValueError, NotImplementedError) as error:  # what JAX cannot differentiate, or has no C
             failure = error
             continue
@@ -259,7 +257,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
         return jnp.split(way(x, seeds), cuts)
 
     closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
-    program, arguments, results = program_of(closed, {})
+    program, arguments, results = program_of(closed)
     names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
     body = Body(source, program, plan_of(program, results), names)
     for k, node in zip(dense, arguments, strict=True):
@@ -267,10 +265,10 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
             body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
     body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
     region(body, ())
-    # All results are written after all arguments are read, so that they may overlap.
-    for j, node in zip((j for j, each in enumerate(outputs) if each.dense), results, strict=True):
+    writers = written(body, results, apart=False)
+    for j, write in zip((j for j, each in enumerate(outputs) if each.dense), writers, strict=True):
         body.opened(f"if (res[{j}])")
-        copied(body, node, f"res[{j}]")
+        write(f"res[{j}]")
         body.closed()
     body.line("return 0;")
     return body

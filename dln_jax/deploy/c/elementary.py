@@ -72,7 +72,7 @@ BOUNDS: Mapping[str, Mapping[str, float]] = {name: {"f64": 2e5, "f32": 1e4} for 
 # A choice is made by bits: gcc moves what only one side of ?: needs into a branch, and then cannot vectorise.
 _COMMON = """
 /* Elementary functions: the bits of a number and back, and condition ? x : y without a branch */
-typedef unsigned $word elementary_word;
+typedef $word elementary_word;
 typedef union { real number; elementary_word word; } elementary_union;
 static inline elementary_word elementary_word_of(real x) { elementary_union u; u.number = x; return u.word; }
 static inline real elementary_number_of(elementary_word w) { elementary_union u; u.word = w; return u.number; }
@@ -80,6 +80,25 @@ static inline real elementary_choice(int condition, real x, real y)
 {
     const elementary_word a = elementary_word_of(x), b = elementary_word_of(y), mask = 0 - (elementary_word)condition;
     return elementary_number_of(b ^ ((a ^ b) & mask));
+}
+"""
+_EVALUATION = """
+#if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD != 0$or_double
+#error "FLT_EVAL_METHOD: extended precision makes exp and others wrong; give -mfpmath=sse -msse2, or export with --libm"
+#endif
+"""
+# The nearest number with fewer bits, ties to even, as XLA rounds it: small ones to zero, large ones to infinity.
+_ROUNDED = """static inline real elementary_rounded(real x, int exponent_bits, int mantissa_bits)
+{
+    const elementary_word bits = elementary_word_of(x), sign = bits & $sign, unit = 1;
+    const elementary_word last = unit << ($mantissa - mantissa_bits), range = (unit << (exponent_bits - 1)) - 1;
+    const elementary_word below = ((bits / last) & 1) + last / 2, size = (bits ^ sign) + (below ? below - 1 : 0);
+    const elementary_word kept = size & ~(last - 1), exponent = kept >> $mantissa;
+    if (x != x) return x;
+    if (exponent_bits == $exponent_bits) return elementary_number_of(sign | kept);
+    if (exponent > $bias_of_exponent + range) return x < 0 ? -(real)INFINITY : (real)INFINITY;
+    if (exponent <= $bias_of_exponent - range) return elementary_number_of(sign);
+    return elementary_number_of(sign | kept);
 }
 """
 _BOUNDED = """static inline real elementary_$name(real x)
@@ -179,18 +198,23 @@ VECTORISED: tuple[str, ...] = tuple(_BODIES)
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
     """C text of `elementary_NAME(x)` for the names, `elementary_NAME_each(n, x, y)` for arrays, and what they need.
 
-    The name `choice` stands for the choice between two numbers alone, which the others need too.
+    The name `choice` stands for the choice between two numbers alone, which the others need too, and `rounded` for
+    rounding to fewer bits.
 
-    Before it, the source has <math.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is a b + c, fused or not.
-    Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own because gcc vectorises
-    the loop around a call only where it inlines the call, and it inlines some sixty calls a source.
+    Before it, the source has <float.h>, <math.h>, <stdint.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is
+    a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own
+    because gcc vectorises the loop around a call only where it inlines the call, and it inlines some sixty a source.
     """
     arrays = set(arrays)
     needed = set(names) | arrays
     chosen = needed & set(VECTORISED)
-    if not chosen and "choice" not in needed:
+    if not chosen and not needed & {"choice", "rounded"}:
         return ""  # clang warns of what is not used
-    text = [fill(_COMMON, precision, **_values(precision))]
+    facts = _values(precision)
+    # By method 1 float is computed in double, which is wrong for the functions of float alone.
+    text = [fill(_EVALUATION, precision, or_double=" && FLT_EVAL_METHOD != 1" * (precision == "f64"))] * bool(chosen)
+    text.append(fill(_COMMON, precision, **facts))
+    text += [fill(_ROUNDED, precision, **facts)] * ("rounded" in needed)
     for name in (name for name in VECTORISED if name in chosen):
         bounded = name in BOUNDS
         text.append(_function(name, precision, "_within" * bounded))
@@ -212,7 +236,7 @@ def _values(precision: str) -> dict[str, str]:
     """What the texts leave open."""
     numpy_type = PRECISIONS[precision][0]
     mantissa, bias = np.finfo(numpy_type).nmant, np.finfo(numpy_type).maxexp - 1
-    word, suffix = {"f64": ("long long", "ULL"), "f32": ("int", "U")}[precision]
+    word, suffix = {"f64": ("uint64_t", "ULL"), "f32": ("uint32_t", "U")}[precision]
     root_half = int(numpy_type(math.sqrt(0.5)).view({"f64": np.uint64, "f32": np.uint32}[precision]))
     words = {"one": bias << mantissa, "one_half": (bias - 1) << mantissa, "root_half": root_half}
     words |= {"fraction_mask": (1 << mantissa) - 1, "exponent_mask": 2 * bias + 1, "sign": (2 * bias + 2) << mantissa}
@@ -224,6 +248,7 @@ def _values(precision: str) -> dict[str, str]:
     numbers |= {"bias": 2.0**mantissa + bias, "grown_bias": 2.0**mantissa + bias + mantissa + 2}
     numbers |= {"smallest": 2.0 ** (1 - bias), "growth": 2.0 ** (mantissa + 2)}
     values = {"word": word, "mantissa": str(mantissa), "to_sign": str(mantissa + bias.bit_length())}
+    values |= {"exponent_bits": str(bias.bit_length() + 1), "bias_of_exponent": str(bias)}
     values |= {key: f"{value:#x}{suffix}" for key, value in words.items()}
     values |= {key: number(value, precision) for key, value in numbers.items()}
     *first_parts, values["next_part"], values["last_part"] = (number(part, precision) for part in _HALF_PI[precision])

@@ -1,16 +1,19 @@
 """A planned program as the body of a C function: its regions, elements, loops and control flow."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dln_jax.deploy.c import kernels, products
-from dln_jax.deploy.c.body import C_TYPES, Body, Called, Source
+from dln_jax.deploy.c.body import Body, Called, Source
+from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES
 from dln_jax.deploy.c.moves import copied, merged
-from dln_jax.deploy.c.nodes import Loop, Node
+from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
 from dln_jax.deploy.c.operations import OPERATIONS, VECTORISED
-from dln_jax.deploy.c.plan import plan_of, strides
+from dln_jax.deploy.c.operations import written as written_c
+from dln_jax.deploy.c.plan import WRITTEN_OUT, plan_of, strides
 from dln_jax.deploy.c.program import Program
 
 _CHOICES = {
@@ -21,18 +24,52 @@ _CHOICES = {
 """In loops without a branch, which would keep them from being vectorised."""
 
 
-def body_of(source: Source, program: Program, results: Sequence[Node], inputs, targets: Sequence[str | None]) -> Body:
-    """The body of a function that writes each result to a target, or returns the one without."""
+def body_of(
+    source: Source, program: Program, results: Sequence[Node], inputs, targets: Sequence[str | None], *, apart=False
+) -> Body:
+    """The body of a function that writes each result to a target, or returns the one without.
+
+    Results may overlap arguments, unless they are known to be `apart`.
+    """
     body = Body(source, program, plan_of(program, results), inputs)
     region(body, ())
-    # All results are written after all arguments are read, so that they may overlap.
-    for node, target in zip(results, targets, strict=True):
-        if target is None:
-            body.line(f"return {body.read(node, np.array(0))};")
-        else:
-            copied(body, node, target)
+    if targets == [None]:
+        body.line(f"return {body.read(results[0], np.array(0))};")
+    else:
+        for target, write in zip(targets, written(body, results, apart=apart), strict=True):
+            write(str(target))
     body.bytes += max((source.parts[key].bytes for key in body.calls), default=0)
     return body
+
+
+def written(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callable[[str], None]]:
+    """What writes each result to a target.
+
+    Where these may overlap arguments, elements that are only moved from an argument are read here already.
+    """
+    writers = []
+    for k, node in enumerate(results):
+        if apart or node.size == 0 or not _moved_from_argument(body, node):
+            writers.append(partial(copied, body, node))
+            continue
+        body.declared(f"r{k}_", node.dtype, max(node.size, 1))
+        copied(body, node, f"r{k}_")
+        writers.append(partial(_from_array, body, f"r{k}_", node.size))
+    return writers
+
+
+def _moved_from_argument(body: Body, node: Node) -> bool:
+    if node.op == "arrange" and node not in body.plan.arrays:
+        return any(_moved_from_argument(body, each) for each in node.args)
+    return node.op == "input" and not body.inputs[node.attribute][1]
+
+
+def _from_array(body: Body, source: str, size: int, target: str) -> None:
+    if size <= WRITTEN_OUT:
+        for k in range(size):
+            body.line(f"{target}[{k}] = {source}[{k}];")
+    else:
+        body.line(f"for (int k_ = 0; k_ < {size}; ++k_) {target}[k_] = {source}[k_];")
 
 
 def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, only: set[Node] | None = None) -> None:
@@ -101,8 +138,8 @@ def _element(body: Body, node: Node, k: int) -> str:
         batch, row, column = np.unravel_index(k, node.shape)
         first = [body.read(a, np.array((batch * m + row) * count + each)) for each in range(count)]
         second = [body.read(b, np.array((batch * count + each) * n + column)) for each in range(count)]
-        body.spend(2 * count - 1)
-        return products.chain(list(zip(first, second, strict=True)))
+        body.spend((2 * count - 1) * (node.dtype == "real"))
+        return products.chain(list(zip(first, second, strict=True)), node.dtype)
     if node.op.startswith("reduce_"):
         (a,) = node.args
         count = a.shape[1]
@@ -123,13 +160,25 @@ def expression(body: Body, node: Node, args: list[str], *, looped: bool = False)
     if looped and node.dtype == "real" and node.op in _CHOICES:
         body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
-    if node.op in ("max", "min") and node.dtype != "real":
-        return f"({args[0]} {'>' if node.op == 'max' else '<'} {args[1]} ? {args[0]} : {args[1]})"
-    if node.op in ("lt", "gt") and args[0] == args[1]:
-        return "0"  # clang warns of comparing a number with itself
-    if node.op.startswith("to_") and node.op != "to_bool":
-        return f"(({C_TYPES[node.dtype]}){args[0]})"
-    return operation.c.format(*args, f=body.source.suffix)
+    if node.op == "rounded":
+        body.source.functions.add("rounded")
+    if name := _checked(node):
+        body.source.integers.add(name)
+        return f"elementary_{name}({', '.join(args)})"
+    # What is compared has a kind of its own.
+    return written_c(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
+
+
+def _checked(node: Node) -> str | None:
+    """The function of whole numbers that an operation needs, so that it cannot trap."""
+    if node.op in ("integer_div", "integer_rem"):
+        divisor = node.args[1]
+        if is_constant(divisor) and not np.isin(values(divisor), (0, ~NUMPY_TYPES[node.dtype](0))).any():
+            return None
+        return f"{'quotient' if node.op == 'integer_div' else 'remainder'}_{node.dtype}"
+    if node.op.startswith("to_") and node.args[0].dtype == "real" and node.dtype != "bool":
+        return f"{node.dtype}_of"
+    return None
 
 
 def _loop(body: Body, node: Node) -> None:
@@ -185,7 +234,7 @@ def part(caller: Body, key: Any) -> Called:
         inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda each: each.attribute)
         named = {each.attribute: (f"a{each.attribute}_", False) for each in inputs}
         targets = [f"r{k}_" for k in range(len(results))]
-        body = body_of(source, program, results, named, targets)
+        body = body_of(source, program, results, named, targets, apart=True)
         parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
         parameters += [
             f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)
@@ -259,7 +308,8 @@ def _repeat(body: Body, node: Node) -> None:
     stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    if stacked or any(each.op == "counter" and each.attribute == number for each in body.plan.needed):
+    counters = (each for each in body.plan.needed if each.op == "counter" and each.attribute == number)
+    if stacked or any(map(body.uses, counters)):
         body.line(f"const long long i_{number} = {turn};")
     region(body, (*node.region, number))
     for index, each in stacked.items():

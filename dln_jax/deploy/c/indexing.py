@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.deploy.c.kinds import NUMPY_TYPES, UNSIGNED
 from dln_jax.deploy.c.nodes import Node, is_constant, values
 from dln_jax.deploy.c.primitives import convert
 from dln_jax.deploy.c.program import Program
@@ -37,14 +38,22 @@ def gather(program: Program, parameters: dict[str, Any], operand: Node, indices:
 
     each = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
     positions = program.elementwise(
-        "add", program.arrange([start], placed(each)), program.constant(placed(offsets), "long")
+        "add", program.arrange([start], placed(each)), program.constant(placed(offsets), "index")
     )
     taken = take(program, operand, positions)
     if inside is None:
         return taken
     fill = parameters["fill_value"]
-    fill = (np.nan if operand.dtype == "real" else 0) if fill is None else fill
+    fill = _filled(operand.dtype) if fill is None else fill
     return program.select(program.arrange([inside], placed(each)), program.constant(fill, operand.dtype), taken)
+
+
+def _filled(kind: str) -> Any:
+    """What JAX fills places outside with, where nothing is said."""
+    if kind in ("real", "bool"):
+        return np.nan if kind == "real" else True
+    limits = np.iinfo(NUMPY_TYPES[kind])
+    return limits.max if kind in UNSIGNED else limits.min
 
 
 def scatter(name: str):
@@ -66,10 +75,10 @@ def scatter(name: str):
         arranged = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
         each = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
         shape = arranged.shape
-        offsets = program.constant(np.broadcast_to(_offsets(operand.shape, kept, window), shape), "long")
+        offsets = program.constant(np.broadcast_to(_offsets(operand.shape, kept, window), shape), "index")
         targets = program.elementwise("add", program.arrange([start], np.broadcast_to(each, shape)), offsets)
         if inside is not None:
-            minus = program.constant(-1, "long")
+            minus = program.constant(-1, "index")
             targets = program.select(program.arrange([inside], np.broadcast_to(each, shape)), minus, targets)
         return put(program, _UPDATES[name], operand, targets, program.arrange([updates], arranged))
 
@@ -143,10 +152,10 @@ def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Nod
 
 def _window(program: Program, shape, sizes, starts) -> Node:
     """Flat positions of a window whose corner is clamped into the operand."""
-    flat = program.constant(0, "long")
+    flat = program.constant(0, "index")
     for axis, start in enumerate(starts):
         flat = _plus(program, flat, _clamped(program, start, shape[axis] - sizes[axis]), _stride(shape, axis))
-    offsets = program.constant(_offsets(shape, range(len(shape)), sizes), "long")
+    offsets = program.constant(_offsets(shape, range(len(shape)), sizes), "index")
     return program.elementwise("add", flat, offsets)
 
 
@@ -154,20 +163,20 @@ def _starts(program: Program, indices: Node, shape, sizes, axes, mode, batched) 
     """Flat position of each window's corner, and whether the windows are inside where those outside are dropped."""
     batch = indices.shape[:-1]
     index = np.arange(indices.size).reshape(indices.shape)
-    flat = program.constant(np.zeros(batch, np.int64), "long")
+    flat = program.constant(np.zeros(batch, np.int64), "index")
     for axis, of_indices in batched:
         counted = np.arange(batch[of_indices]).reshape([-1 if each == of_indices else 1 for each in range(len(batch))])
         corner = np.broadcast_to(counted, batch) * _stride(shape, axis)
-        flat = program.elementwise("add", flat, program.constant(corner, "long"))
+        flat = program.elementwise("add", flat, program.constant(corner, "index"))
     fills, inside = "FILL" in str(mode).upper(), None
     for component, axis in enumerate(axes):
         start, last = program.arrange([indices], index[..., component]), shape[axis] - sizes[axis]
         if fills:
-            start = convert(program, start, "long")
+            start = _index(program, start, last + 1)
             within = program.elementwise(
                 "and",
-                program.elementwise("ge", start, program.constant(0, "long")),
-                program.elementwise("le", start, program.constant(last, "long")),
+                program.elementwise("ge", start, program.constant(0, "index")),
+                program.elementwise("le", start, program.constant(last, "index")),
             )
             inside = within if inside is None else program.elementwise("and", inside, within)
         flat = _plus(program, flat, _clamped(program, start, last), _stride(shape, axis))
@@ -177,12 +186,19 @@ def _starts(program: Program, indices: Node, shape, sizes, axes, mode, batched) 
 
 
 def _clamped(program: Program, start: Node, last: int) -> Node:
-    low, high = program.constant(0, "long"), program.constant(last, "long")
-    return program.elementwise("min", program.elementwise("max", convert(program, start, "long"), low), high)
+    low, high = program.constant(0, "index"), program.constant(last, "index")
+    return program.elementwise("min", program.elementwise("max", _index(program, start, last), low), high)
+
+
+def _index(program: Program, start: Node, most: int) -> Node:
+    """As an index, which does not hold all unsigned numbers of 64 bits: those are bounded before."""
+    if start.dtype == "unsigned_long":
+        start = program.elementwise("min", start, program.constant(max(most, 0), start.dtype))
+    return convert(program, start, "index")
 
 
 def _plus(program: Program, flat: Node, start: Node, stride: int) -> Node:
-    return program.elementwise("add", flat, program.elementwise("mul", start, program.constant(stride, "long")))
+    return program.elementwise("add", flat, program.elementwise("mul", start, program.constant(stride, "index")))
 
 
 def _stride(shape, axis: int | np.integer) -> int:

@@ -8,17 +8,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.deploy.c.lowering import kind_of
+from dln_jax.deploy.c.kinds import C_TYPES, kind_of
 from dln_jax.deploy.c.text import PRECISIONS, check_name
 from dln_jax.deploy.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
-FORMAT = 3
+FORMAT = 4
 """Version of the names and signatures in exported sources, and of their description."""
 LARGEST = 1 << 22
 """Numbers of an argument or result."""
-KINDS = {"real": None, "bool": "int", "int": "int", "long": "long long", "unsigned": "unsigned"}
-KINDS |= {"unsigned_long": "unsigned long long"}
+KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
 class Leaf(NamedTuple):

@@ -1,10 +1,12 @@
 """What jaxprs say about themselves: how they are made, what they call, and where each equation comes from."""
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend import core
 
 from dln_jax.types import InputError
@@ -28,41 +30,52 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
     return closed, shapes
 
 
-def repeated_calls(every: Sequence[Any]) -> dict[int, str]:
-    """Jaxprs, by `id`, of jitted functions that are large and called several times by these closed ones; their text.
+def repeated_calls(every: Sequence[Any]) -> set[int]:
+    """Jaxprs, by `id`, of jitted functions that are large and that these closed ones seem to call several times.
 
-    Equal texts are equal functions.
+    Calls that look alike here become one function only if their programs are identical, see `Program.identity`.
     """
-    texts: dict[int, str] = {}
-    sizes: dict[int, int] = {}
-    counts: Counter[str] = Counter()
+    known: dict[int, tuple[int, bytes]] = {}
+    counts: Counter[bytes] = Counter()
 
-    def visit(jaxpr: Any) -> int:
-        """Number of equations, those of calls included."""
-        size = 0
+    def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
+        """Number of equations, those of calls included, and a digest of primitives, types and constants."""
+        size, digest = 0, hashlib.sha256()
+        for each in consts:
+            digest.update(np.asarray(each).tobytes())
         for equation in jaxpr.eqns:
-            key = id(equation.params["jaxpr"]) if equation.primitive.name in ("jit", "pjit") else None
-            if key not in sizes:
-                within = sum(visit(each) for value in equation.params.values() for each in _jaxprs(value))
-                if key is not None and within >= _LARGE_CALL:
-                    sizes[key], texts[key] = within, str(equation.params["jaxpr"])
-            else:
-                within = sizes[key]
-            if key in texts:
-                counts[texts[key]] += 1
+            within = 0
+            literals = [variable.val for variable in equation.invars if hasattr(variable, "val")]
+            types = [
+                (each.aval.shape, str(each.aval.dtype)) for each in equation.outvars if hasattr(each.aval, "dtype")
+            ]
+            digest.update(repr((equation.primitive.name, types)).encode())
+            digest.update(b"".join(np.asarray(each).tobytes() for each in literals))
+            for inner in (each for value in equation.params.values() for each in _jaxprs(value)):
+                inside, likeness = called(inner)
+                within += inside
+                digest.update(likeness)
             size += max(1, within)
-        return size
+        return size, digest.digest()
+
+    def called(inner: Any) -> tuple[int, bytes]:
+        if id(inner) not in known:
+            closed = closed_jaxpr(inner)
+            known[id(inner)] = visit(closed.jaxpr, closed.consts)
+        size, likeness = known[id(inner)]
+        if size >= _LARGE_CALL:
+            counts[likeness] += 1
+        return size, likeness
 
     for closed in every:
-        visit(closed.jaxpr)
-    return {each: text for each, text in texts.items() if counts[text] > 1}
+        visit(closed.jaxpr, closed.consts)
+    return {each for each, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
 
 
 def _jaxprs(value: Any) -> list[Any]:
     if isinstance(value, list | tuple):
         return [each for one in value for each in _jaxprs(one)]
-    value = getattr(value, "jaxpr", value)
-    return [value] if hasattr(value, "eqns") else []
+    return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
 
 
 def expanded(primitive: Any) -> Any:

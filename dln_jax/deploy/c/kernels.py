@@ -1,5 +1,7 @@
 """What is no product and not elementwise as C: reductions, updates at indices, factorisations, and control flow."""
 
+from collections.abc import Callable
+from functools import partial
 from textwrap import dedent
 
 import numpy as np
@@ -7,18 +9,10 @@ import numpy as np
 from dln_jax.deploy.c.body import Body
 from dln_jax.deploy.c.moves import copied
 from dln_jax.deploy.c.nodes import Node
+from dln_jax.deploy.c.operations import OPERATIONS, written
 
-_REDUCE = {
-    "reduce_sum": ("{0} + {1}", 1),
-    "reduce_prod": ("{0} * {1}", 1),
-    "reduce_max": ("(({0} > {1} || {0} != {0}) ? {0} : {1})", 0),
-    "reduce_min": ("(({0} < {1} || {0} != {0}) ? {0} : {1})", 0),
-    "reduce_and": ("{0} & {1}", 0),
-    "reduce_or": ("{0} | {1}", 0),
-}
-_OF_INTEGERS = {"reduce_max": "({0} > {1} ? {0} : {1})", "reduce_min": "({0} < {1} ? {0} : {1})"}
-_PUT = {"put_set": "{1}", "put_add": "{0} + {1}", "put_sub": "{0} - {1}", "put_mul": "{0} * {1}"}
-_PUT |= {f"put_{name}": _REDUCE[f"reduce_{name}"][0] for name in ("min", "max")}
+_REDUCE = tuple(f"reduce_{op}" for op in ("add", "mul", "max", "min", "and", "or", "xor"))
+_PUT = tuple(f"put_{op}" for op in ("set", "add", "sub", "mul", "min", "max"))
 FUNCTIONS = {
     "cholesky": """
     /* Lower triangular l with l l^T = a [n, n]; all NaN where a is not positive definite */
@@ -91,19 +85,19 @@ def definitions(names: set[str], suffix: str) -> str:
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
-def _pattern(node: Node) -> tuple[str, int]:
-    """C of two terms of a reduction, and what it costs; integers are never NaN, as compilers know."""
-    pattern, cost = _REDUCE[node.op]
-    return (pattern, cost) if node.dtype == "real" else (_OF_INTEGERS.get(node.op, pattern), cost)
+def _joined(node: Node) -> tuple[Callable[..., str], int]:
+    """C of two terms of a reduction or update, and its floating-point operations."""
+    op = node.op.partition("_")[2]
+    return partial(written, op, node.dtype), OPERATIONS[op].cost * (node.dtype == "real")
 
 
 def combined(body: Body, node: Node, k: int, terms: list[str]) -> str:
     """A reduction of few terms, written out."""
-    pattern, cost = _pattern(node)
+    joined, cost = _joined(node)
     body.spend(cost * (len(terms) - 1))
     text = terms[0]
     for place, term in enumerate(terms[1:]):
-        text = f"({pattern.format(text, term)})"
+        text = joined(text, term)
         # A choice names what it compares twice: without a name of its own, its text doubles with each term.
         if node.op in ("reduce_max", "reduce_min") and place < len(terms) - 2:
             name = f"v{node.number}_{k}_{place}"
@@ -123,11 +117,11 @@ def _kept(body: Body, node: Node) -> str:
 def _reduction(body: Body, node: Node) -> None:
     (a,) = node.args
     rows, count = a.shape
-    pattern, cost = _pattern(node)
+    joined, cost = _joined(node)
     body.spend(cost * rows * (count - 1))
     at, scalar = np.arange(a.size).reshape(a.shape), node not in body.plan.arrays
     name = _kept(body, node)
-    parts = 8 if node.op == "reduce_sum" and node.dtype == "real" and count >= 16 else 1
+    parts = 8 if node.op == "reduce_add" and node.dtype == "real" and count >= 16 else 1
     body.opened(f"for (int r_ = 0; r_ < {rows}; ++r_)")
     kind = body.c_type(node.dtype)
     whole = count // parts * parts
@@ -144,7 +138,7 @@ def _reduction(body: Body, node: Node) -> None:
         body.line(f"{kind} sum_ = {body.read(a, at[:, 0], ['r_'])};")
         body.opened(f"for (int k_ = 1; k_ < {count}; ++k_)")
         body.line(f"const {kind} term_ = {body.read(a, at, ['r_', 'k_'])};")
-        body.line(f"sum_ = {pattern.format('sum_', 'term_')};")
+        body.line(f"sum_ = {joined('sum_', 'term_')};")
         body.closed()
     body.line(f"{name}{'' if scalar else '[r_]'} = sum_;")
     body.closed()
@@ -168,7 +162,7 @@ def _arg(body: Body, node: Node) -> None:
     body.line("chosen_ = k_;")
     body.closed()
     body.closed()
-    body.line(f"{name}{'' if scalar else '[r_]'} = chosen_;")
+    body.line(f"{name}{'' if scalar else '[r_]'} = ({body.c_type(node.dtype)})chosen_;")
     body.closed()
 
 
@@ -182,9 +176,8 @@ def _put(body: Body, node: Node) -> None:
     body.line(f"const long long target_ = {body.read(targets, index, ['k_'])};")
     body.line(f"const {body.c_type(node.dtype)} update_ = {body.read(updates, index, ['k_'])};")
     at = f"{name}[target_]"
-    extreme = node.op.replace("put", "reduce") if node.dtype != "real" else ""
-    pattern = _OF_INTEGERS.get(extreme, _PUT[node.op])
-    body.line(f"if (target_ >= 0) {at} = {pattern.format(at, 'update_')};")
+    new = "update_" if node.op == "put_set" else _joined(node)[0](at, "update_")
+    body.line(f"if (target_ >= 0) {at} = {new};")
     body.closed()
 
 

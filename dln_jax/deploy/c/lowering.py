@@ -1,21 +1,19 @@
 """A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
-import jax
 import numpy as np
+from jax.dtypes import float0
 
 from dln_jax.deploy.c import indexing, linear_algebra, primitives, reductions
 from dln_jax.deploy.c.jaxprs import closed_jaxpr, expanded, made_at, scanned
+from dln_jax.deploy.c.kinds import kind_of
 from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
 from dln_jax.deploy.c.program import Part, Program
+from dln_jax.deploy.c.text import PRECISIONS
 from dln_jax.types import InputError
 
-_KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int32": "int"}
-# The type of what has no derivative: nothing is computed with it.
-_KINDS |= {str(jax.dtypes.float0): "bool"}
-_KINDS |= {"int64": "long", "uint32": "unsigned", "uint64": "unsigned_long"}
 _CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
     "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
@@ -32,31 +30,26 @@ _RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_alg
 _TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
 
 
-def program_of(closed: Any, repeated: Mapping[int, str]) -> tuple[Program, list[Node], list[Node]]:
+def program_of(
+    closed: Any, repeated: Collection[int] = (), *, precision: str = "f64"
+) -> tuple[Program, list[Node], list[Node]]:
     """The program of a closed jaxpr, its inputs and its results.
 
     Args:
         closed: as `jaxprs.traced`.
         repeated: calls of these jaxprs, by `id`, are calls in the program too.
+        precision: of real numbers.
 
     Raises:
         InputError: what has no C: an unsupported primitive, with the line that made it, random numbers, another type of
             number, a shape that is not known.
     """
-    program = Program(repeated=repeated)
+    program = Program(real=PRECISIONS[precision][0], repeated=repeated)
     inputs = [
         program.make("input", variable.aval.shape, kind_of(variable.aval.dtype), attribute=number)
         for number, variable in enumerate(closed.jaxpr.invars)
     ]
     return program, inputs, _inline(program, closed, inputs)
-
-
-def kind_of(dtype: Any) -> str:
-    """What a type is in a program; InputError for one that has no C."""
-    if str(dtype) not in _KINDS:
-        hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
-        raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")
-    return _KINDS[str(dtype)]
 
 
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
@@ -79,13 +72,16 @@ def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
             text = str(error)
             where = "" if " (made at " in text else made_at(equation)
             raise InputError(text + where) from error
-        known.update(zip(equation.outvars, results, strict=True))
+        for variable, result in zip(equation.outvars, results, strict=True):
+            expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
+            assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
+            known[variable] = result
     return [read(variable) for variable in jaxpr.outvars]
 
 
 def _constant(program: Program, value: Any, aval: Any) -> Node:
     kind = kind_of(aval.dtype)
-    if aval.dtype == jax.dtypes.float0:
+    if aval.dtype == float0:
         value = np.zeros(aval.shape, bool)
     return program.constant(np.asarray(value).reshape(aval.shape), kind)
 
@@ -119,21 +115,23 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     """A call of a function of its own, which has the constants among its arguments inside."""
     fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
-    consts = tuple(np.asarray(each).tobytes() for each in closed.consts)
-    key = (program.repeated[id(closed)], consts, tuple((k, values(arg).tobytes()) for k, arg in fixed.items()))
-    if key not in program.parts:
-        part = Program(repeated=program.repeated, parts=program.parts)
+    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
+    if call not in program.lowered:
+        part = Program(real=program.real, repeated=program.repeated, parts=program.parts, lowered=program.lowered)
         inside = [
             part.constant(values(arg), arg.dtype)
             if k in fixed
             else part.make("input", arg.shape, arg.dtype, attribute=k - sum(each < k for each in fixed))
             for k, arg in enumerate(args)
         ]
-        program.parts[key] = Part(part, _inline(part, closed, inside))
+        results = _inline(part, closed, inside)
+        program.lowered[call] = part.identity(results)
+        program.parts.setdefault(program.lowered[call], Part(part, results))
+    key = program.lowered[call]
     shapes = [(each.shape, each.dtype) for each in program.parts[key].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    call = program.make("call", (), "int", passed, attribute=key)
-    return [program.make("project", shape, dtype, [call], k) for k, (shape, dtype) in enumerate(shapes)]
+    node = program.make("call", (), "int", passed, attribute=key)
+    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
 
 
 def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -185,12 +183,12 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
         return [*start, *(program.constant(np.zeros((0, *each.shape)), kind_of(each.dtype)) for each in left)]
     outer, number = _region(program, args)
     carries = _carries(program, number, outer, start)
-    turn = program.make("counter", (), "long", attribute=number, region=(*outer, number))
+    turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
     slices = []
     for each in stacked:
         size = each.size // max(length, 1)
-        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "long")
-        first = program.elementwise("mul", turn, program.constant(size, "long"))
+        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "index")
+        first = program.elementwise("mul", turn, program.constant(size, "index"))
         slices.append(indexing.take(program, each, program.elementwise("add", first, offsets)))
     results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
     program.loops[number] = Loop(carries, [], results, length, reverse)

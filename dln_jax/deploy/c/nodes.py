@@ -17,13 +17,17 @@ class Node:
     op: str
     shape: tuple[int, ...]
     dtype: str
-    """real, bool, int, long, unsigned or unsigned long."""
+    """A kind of `kinds.C_TYPES`."""
     args: tuple["Node", ...]
     attribute: Any
     value: np.ndarray | None
     """Numbers of a `const`, positions of an `arrange` [shape]."""
     region: Region
     number: int
+
+    def __hash__(self) -> int:
+        """Its number: an address would order sets of nodes, and so the text, differently in each process."""
+        return self.number
 
     @property
     def size(self) -> int:

@@ -1,13 +1,16 @@
 """Elementwise operations: how each is written in C, computed beforehand, and what it costs."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.deploy.c import integers
 from dln_jax.deploy.c.elementary import OPERATIONS as COSTS
 from dln_jax.deploy.c.elementary import VECTORISED as _VECTORISED
+from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES
 
 
 class Operation(NamedTuple):
@@ -20,7 +23,7 @@ class Operation(NamedTuple):
     cost: int = 1
     """Floating-point operations, 0 for what only compares, selects or moves."""
     dtype: str | None = None
-    """Of the result; that of the last argument by default."""
+    """Kind of the result; by default that of the arguments."""
     function: str | None = None
     """The function of <math.h> that it calls."""
 
@@ -34,21 +37,18 @@ def _comparison(symbol: str, fold: Callable[..., Any]) -> Operation:
     return Operation(f"({{0}} {symbol} {{1}})", fold, 0, "bool")
 
 
-def _integer_division(a, b):
-    return np.trunc(a / b).astype(a.dtype) if np.asarray(a).dtype.kind in "iu" else np.divide(a, b)
-
-
 OPERATIONS = {
     "add": Operation("({0} + {1})", np.add),
     "sub": Operation("({0} - {1})", np.subtract),
     "mul": Operation("({0} * {1})", np.multiply),
-    "div": Operation("({0} / {1})", _integer_division),
+    "div": Operation("({0} / {1})", np.divide),
+    "integer_div": Operation("({0} / {1})", integers.quotient),
     "neg": Operation("(-{0})", np.negative, 0),
     "abs": Operation("fabs{f}({0})", np.abs, 0),
     "integer_abs": Operation("({0} < 0 ? -{0} : {0})", np.abs, 0),
     "max": Operation("(({0} > {1} || {0} != {0}) ? {0} : {1})", np.maximum, 0),
     "min": Operation("(({0} < {1} || {0} != {0}) ? {0} : {1})", np.minimum, 0),
-    "integer_rem": Operation("({0} % {1})", np.fmod, 0),
+    "integer_rem": Operation("({0} % {1})", integers.remainder, 0),
     "rem": _function("fmod", np.fmod, arguments=2),
     "sqrt": _function("sqrt", np.sqrt),
     "pow": _function("pow", np.power, arguments=2),
@@ -86,6 +86,8 @@ OPERATIONS = {
     },
     "round": _function("round", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
     "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
+    # To so many bits of exponent and mantissa.
+    "rounded": Operation("elementary_rounded({0}, {1}, {2})", None),
     "eq": _comparison("==", np.equal),
     "ne": _comparison("!=", np.not_equal),
     "lt": _comparison("<", np.less),
@@ -99,18 +101,26 @@ OPERATIONS = {
     "integer_not": Operation("(~{0})", np.invert, 0),
     "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
     **{
-        f"to_{kind}": Operation(f"(({kind})({{0}}))", lambda x, t=dtype: np.asarray(x).astype(t), 0, kind)
-        for kind, dtype in {
-            "real": np.float64,
-            "int": np.int32,
-            "long": np.int64,
-            "unsigned": np.uint32,
-            "unsigned_long": np.uint64,
-        }.items()
+        f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(integers.converted, kind=kind), 0, kind)
+        for kind in NUMPY_TYPES
     },
-    "to_bool": Operation("({0} != 0)", lambda x: np.asarray(x) != 0, 0, "bool"),
+    "to_real": Operation("((real){0})", lambda x: x, 0, "real"),
+    "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
 }
 """By name."""
+
+
+def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
+    """C of an operation on numbers of a kind; `suffix` is that of functions of <math.h>."""
+    alike = len(args) == 2 and args[0] == args[1]  # compilers warn of comparing a number with itself
+    if alike and (op in ("lt", "gt") or (dtype != "real" and op in ("eq", "ne", "le", "ge"))):
+        return str(int(op in ("eq", "le", "ge")))
+    if alike and op in ("max", "min"):
+        return args[0]
+    text = integers.pattern(op, dtype) if dtype != "real" else None
+    return (text or OPERATIONS[op].c).format(*args, f=suffix)
+
+
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
 """Exactly so, also in floating point."""
 TRANSCENDENTAL = frozenset(name for name, each in OPERATIONS.items() if each.function and name not in ("sqrt",))

@@ -61,7 +61,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
         elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
-    root: dict[Node, Node] = _fused(nodes, readers, whole, written_out)
+    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), written_out)
     arrays -= {node for node, into in root.items() if into is not node}
     levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}

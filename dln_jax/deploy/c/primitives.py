@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dln_jax.deploy.c.kinds import UNSIGNED
 from dln_jax.deploy.c.nodes import Node
 from dln_jax.deploy.c.program import Program
 
@@ -19,12 +20,11 @@ _RENAMED = {
     "copy": None,
     "copy_p": None,
     "optimization_barrier": None,
-    "reduce_precision": None,
 }
 _AS_NAMED = (
-    "add", "sub", "mul", "div", "max", "min", "pow", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
+    "add", "sub", "mul", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
     "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
-    "erfc", "lgamma", "floor", "ceil", "is_finite", "eq", "ne", "lt", "le", "gt", "ge", "and", "or", "xor",
+    "erfc", "lgamma", "floor", "ceil", "is_finite", "and", "or", "xor",
 )  # fmt: skip
 
 
@@ -55,6 +55,31 @@ def _slice(index, parameters):
     return index[tuple(slice(int(start), int(limit), int(stride)) for start, limit, stride in limits)]
 
 
+def _power(program: Program, _, x: Node, exponent: Node, *, dtype: str) -> Node:
+    return program.elementwise("pow", convert(program, x, dtype), convert(program, exponent, dtype))
+
+
+def _comparison(name: str) -> Rule:
+    """Of truth values by logic: compilers warn of comparing those."""
+
+    def rule(program: Program, _, a: Node, b: Node) -> Node:
+        if a.dtype != "bool":
+            return program.elementwise(name, a, b)
+        if name in ("eq", "ne"):
+            different = program.elementwise("xor", a, b)
+            return different if name == "ne" else program.elementwise("not", different)
+        # a < b is (not a) and b; a <= b is (not a) or b
+        low, high = (a, b) if name in ("lt", "le") else (b, a)
+        return program.elementwise("and" if name in ("lt", "gt") else "or", program.elementwise("not", low), high)
+
+    return rule
+
+
+def _extreme(name: str) -> Rule:
+    on_truths = "or" if name == "max" else "and"
+    return lambda program, _, *args: program.elementwise(on_truths if args[0].dtype == "bool" else name, *args)
+
+
 def _integer_power(program: Program, parameters, x: Node) -> Node:
     exponent, result = parameters["y"], None
     power, left = x, abs(exponent)
@@ -63,15 +88,17 @@ def _integer_power(program: Program, parameters, x: Node) -> Node:
             result = power if result is None else program.elementwise("mul", result, power)
         left >>= 1
         power = program.elementwise("mul", power, power) if left else power
-    one = program.constant(1.0, "real")
+    one = program.constant(1, x.dtype)
     if result is None:
         return program.broadcast(one, x.shape)
     return result if exponent > 0 else program.elementwise("div", one, result)
 
 
 def _sign(program: Program, _, x: Node) -> Node:
-    zero, one = (program.constant(number, x.dtype) for number in ((0.0, 1.0) if x.dtype == "real" else (0, 1)))
-    minus = program.elementwise("neg", one)
+    zero, one = (program.constant(number, x.dtype) for number in (0, 1))
+    if x.dtype in UNSIGNED:
+        return program.elementwise("min", x, one)
+    minus = program.constant(-1, x.dtype)
     positive, negative = (program.elementwise(name, x, zero) for name in ("gt", "lt"))
     # What is neither, 0 or NaN, is its own sign.
     return program.select(positive, program.select(negative, x, minus), one)
@@ -102,7 +129,10 @@ def _select_n(program: Program, _, which: Node, *cases: Node) -> Node:
 
 
 def _by_kind(real: str, integer: str) -> Rule:
-    return lambda program, _, *args: program.elementwise(real if args[-1].dtype == "real" else integer, *args)
+    def rule(program: Program, _, *args: Node, dtype: str) -> Node:
+        return program.elementwise(real if dtype == "real" else integer, *args)
+
+    return rule
 
 
 def _not(program: Program, _, x: Node) -> Node:
@@ -117,8 +147,6 @@ def convert(program: Program, node: Node, dtype: str) -> Node:
     """The node as another type."""
     if node.dtype == dtype:
         return node
-    if node.dtype == "real" and dtype != "bool":
-        node = program.elementwise("trunc", node)
     return program.elementwise(f"to_{dtype}", node)
 
 
@@ -164,11 +192,20 @@ def _iota(program: Program, parameters, dtype: str) -> Node:
     shape, dimension = parameters["shape"], parameters["dimension"]
     expanded = [-1 if axis == dimension else 1 for axis in range(len(shape))]
     numbers = np.broadcast_to(np.arange(shape[dimension]).reshape(expanded), shape)
-    return program.constant(numbers.astype(float if dtype == "real" else numbers.dtype), dtype)
+    return program.constant(numbers, dtype)
 
 
 def _reciprocal_root(program: Program, _, x: Node) -> Node:
     return program.elementwise("div", program.constant(1.0, "real"), program.elementwise("sqrt", x))
+
+
+def _reduce_precision(program: Program, parameters, x: Node) -> Node:
+    exponent, mantissa = parameters["exponent_bits"], parameters["mantissa_bits"]
+    own = np.finfo(program.real)
+    if exponent >= own.nexp and mantissa >= own.nmant:
+        return x
+    bits = [program.constant(min(*each), "real") for each in ((exponent, own.nexp), (mantissa, own.nmant))]
+    return program.elementwise("rounded", x, *bits)
 
 
 def _identity(_, __, *nodes: Node) -> Any:
@@ -180,8 +217,9 @@ RULES: dict[str, Rule] = {
     **{name: _identity if op is None else _elementwise(op) for name, op in _RENAMED.items()},
     "square": lambda program, _, x: program.elementwise("mul", x, x),
     "neg": lambda program, _, x: program.elementwise("neg", x),
-    "abs": _by_kind("abs", "integer_abs"),
-    "rem": _by_kind("rem", "integer_rem"),
+    **{name: _comparison(name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
+    **{name: _extreme(name) for name in ("max", "min")},
+    "reduce_precision": _reduce_precision,
     "not": _not,
     "sign": _sign,
     "rsqrt": _reciprocal_root,
@@ -207,6 +245,10 @@ RULES: dict[str, Rule] = {
 }
 """By the primitive's name."""
 TYPED_RULES: dict[str, Rule] = {
+    "abs": _by_kind("abs", "integer_abs"),
+    "div": _by_kind("div", "integer_div"),
+    "rem": _by_kind("rem", "integer_rem"),
+    "pow": _power,
     "convert_element_type": lambda program, _, x, *, dtype: convert(program, x, dtype),
     "iota": lambda program, parameters, *, dtype: _iota(program, parameters, dtype),
 }

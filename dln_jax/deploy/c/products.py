@@ -5,10 +5,14 @@ the same constant are one loop, so that value and tangents go through a matrix t
 order of that loop. Where there is one column, sums are kept in parts.
 """
 
+import functools
+from collections.abc import Callable
+
 import numpy as np
 
 from dln_jax.deploy.c.body import Body
 from dln_jax.deploy.c.nodes import Node, is_constant, values
+from dln_jax.deploy.c.operations import written
 
 _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
@@ -17,19 +21,31 @@ _ROWS = 16
 """Rows of one product up to which each is named; a loop goes over more."""
 
 
-def chain(pairs: list[tuple[str, str]]) -> str:
+def chain(pairs: list[tuple[str, str]], dtype: str) -> str:
     """a b + ... as nested multiply-adds."""
     (first, second), *rest = pairs
+    if dtype != "real":
+        product, total = _of_integers(dtype)
+        return functools.reduce(total, [product(*pair) for pair in pairs])
     text = f"{first} * {second}"
     for first, second in rest:
         text = f"MULTIPLY_ADD({first}, {second}, {text})"
     return text
 
 
+def _of_integers(dtype: str) -> list[Callable[[str, str], str]]:
+    """C of a product and of a sum; of truth values, both and any."""
+    return [functools.partial(written, op, dtype) for op in (("and", "or") if dtype == "bool" else ("mul", "add"))]
+
+
 def contracted(body: Body, members: list[Node]) -> None:
     """Products of several matrices with one."""
     for node in members:
         body.kept(node)
+    if members[0].dtype != "real":
+        for node in members:
+            _whole(body, node)
+        return
     (batch, _, count), columns = members[0].args[0].shape, members[0].args[1].shape[2]
     if columns == 1:
         for node in members:
@@ -122,6 +138,25 @@ def _many(body: Body, node: Node) -> None:
         target = body.index(((i * m + j) * columns + start + c)[:, :, 0], ["b_", "r_", "c_"])
         body.line(f"for (int c_ = 0; c_ < {width}; ++c_) {body.name(node)}[{target}] = s_[c_];")
         body.closed()
+        body.closed()
+
+
+def _whole(body: Body, node: Node) -> None:
+    """A product of whole numbers or truth values."""
+    a, b = node.args
+    (batch, m, count), columns = a.shape, b.shape[2]
+    i, j, k, c = np.meshgrid(*map(np.arange, (batch, m, count, columns)), indexing="ij")
+    kind, (product, total) = body.c_type(node.dtype), _of_integers(node.dtype)
+    for name, extent in (("b_", batch), ("r_", m), ("c_", columns)):
+        body.opened(f"for (int {name} = 0; {name} < {extent}; ++{name})")
+    body.line(f"{kind} sum_ = 0;")
+    first = body.read(a, ((i * m + j) * count + k)[..., 0], ["b_", "r_", "k_"])
+    second = body.read(b, ((i * count + k) * columns + c)[:, 0], ["b_", "k_", "c_"])
+    term = total("sum_", product(first, second))
+    body.line(f"for (int k_ = 0; k_ < {count}; ++k_) sum_ = {term};")
+    target = body.index(((i * m + j) * columns + c)[:, :, 0], ["b_", "r_", "c_"])
+    body.line(f"{body.name(node)}[{target}] = sum_;")
+    for _ in range(3):
         body.closed()
 
 

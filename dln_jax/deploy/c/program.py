@@ -17,22 +17,29 @@ source it is. Arranges of arranges are one arrange.
 | `call` | a function of its own |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
 
-Simplifications keep what IEEE arithmetic gives: 1 x = x and 0 + x = x, but never 0 x = 0, which hides a NaN.
+Simplifications keep what IEEE arithmetic gives, but for the sign of a zero in 0 + x = x, which XLA simplifies too:
+1 x = x, but never 0 x = 0, which hides a NaN, nor 0 - x = -x, which has the other zero at 0.
 """
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dln_jax.deploy.c.kinds import NUMPY_TYPES, UNSIGNED
 from dln_jax.deploy.c.nodes import Loop, Node, Region, is_all, is_constant, is_uniform, values, without_unused
 from dln_jax.deploy.c.operations import COMMUTATIVE, OPERATIONS
 from dln_jax.types import InputError
 
 LARGEST = 1 << 22
 """Elements of an array."""
+
+
+_NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
+"""What leaves the other argument as it is; that of `and` has all bits of its kind."""
 
 
 class Part(NamedTuple):
@@ -50,10 +57,14 @@ class Program:
     loops: dict[int, Loop] = field(default_factory=dict)
     floor: Region = ()
     """The branch that is being built: nodes stay in it even if they need nothing that is computed there."""
-    repeated: Mapping[int, str] = field(default_factory=dict)
-    """Jaxprs, by `id`, whose calls are calls here too, and their text, which tells equal ones."""
-    parts: dict[Any, Part] = field(default_factory=dict)
-    """Functions that are called, by the attribute of a `call`."""
+    real: Any = np.float64
+    """NumPy's type of real numbers, in which constants are folded."""
+    repeated: Collection[int] = ()
+    """Jaxprs, by `id`, whose calls are calls here too."""
+    parts: dict[bytes, Part] = field(default_factory=dict)
+    """Functions that are called, by their `identity`, the attribute of a `call`."""
+    lowered: dict[Any, bytes] = field(default_factory=dict)
+    """Identities of functions by the `id` of their jaxpr and the arguments that are constant."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
 
     def make(
@@ -83,9 +94,25 @@ class Program:
         self._interned[key].append(node)
         return node
 
+    def identity(self, results: Sequence[Node]) -> bytes:
+        """A digest of all that the results depend on, constants included bit by bit."""
+        digest = hashlib.sha256()
+        for node in self.nodes:
+            value_type = None if node.value is None else node.value.dtype.str
+            args = [each.number for each in node.args]
+            digest.update(
+                repr((node.op, node.shape, node.dtype, args, node.attribute, value_type, node.region)).encode()
+            )
+            digest.update(b"" if node.value is None else node.value.tobytes())
+        for number, loop in self.loops.items():
+            inside = [[each.number for each in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
+            digest.update(repr((number, inside, loop.length, loop.reverse)).encode())
+        digest.update(repr([each.number for each in results]).encode())
+        return digest.digest()
+
     def constant(self, value: Any, dtype: str) -> Node:
-        """Numbers."""
-        array = np.asarray(value)
+        """Numbers of a kind."""
+        array = np.asarray(value).astype(self.real if dtype == "real" else NUMPY_TYPES[dtype])
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
     def arrange(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
@@ -100,8 +127,7 @@ class Program:
         positions = np.asarray(np.concatenate(flat)[np.asarray(positions, np.int64)])
         inner, positions = without_unused(inner, positions)
         if not inner or positions.size == 0:
-            dtype = sources[0].dtype
-            return self.constant(np.zeros(positions.shape, bool if dtype == "bool" else float), dtype)
+            return self.constant(np.zeros(positions.shape), sources[0].dtype)
         if all(each.op == "const" for each in inner):
             total = sum(each.size for each in inner)
             if positions.size <= max(total, 64):
@@ -121,11 +147,13 @@ class Program:
         return self.arrange([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
     def elementwise(self, op: str, *args: Node) -> Node:
-        """An operation of `OPERATIONS`, on arguments that broadcast as NumPy's."""
+        """An operation of `OPERATIONS`, on arguments of one kind that broadcast as NumPy's."""
         operation = OPERATIONS[op]
         shape = np.broadcast_shapes(*(each.shape for each in args))
         args = tuple(each if each.shape in ((), shape) else self.broadcast(each, shape) for each in args)
-        dtype = operation.dtype or args[-1].dtype
+        kinds = {each.dtype for each in (args[1:] if op == "select" else args)}
+        assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
+        dtype = operation.dtype or kinds.pop()
         # Real numbers that are only repeated stay so: a table of them would be read from memory.
         known = all(each.op == "const" or (dtype != "real" and is_constant(each)) for each in args)
         if known and operation.fold is not None:
@@ -144,14 +172,15 @@ class Program:
         """sum_k a[b, m, k] b[b, k, n]; a constant comes second."""
         (batch, m, k), n = a.shape, b.shape[2]
         if a.op == b.op == "const" and a.value is not None and b.value is not None:
-            return self.constant(np.matmul(a.value, b.value), "real")
+            return self.constant(np.matmul(a.value, b.value), a.dtype)
         if k == 0:
-            return self.constant(np.zeros((batch, m, n)), "real")
+            return self.constant(np.zeros((batch, m, n)), a.dtype)
         if k == 1:
-            return self.elementwise("mul", self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
+            product = "and" if a.dtype == "bool" else "mul"
+            return self.elementwise(product, self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
             return self.transpose(self.contract(self.transpose(b), self.transpose(a)))
-        return self.make("contract", (batch, m, n), "real", (a, b))
+        return self.make("contract", (batch, m, n), a.dtype, (a, b))
 
     def transpose(self, node: Node) -> Node:
         """With the last two axes exchanged."""
@@ -168,12 +197,13 @@ class Program:
         return self.elementwise("select", chosen, if_true, if_false)
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        neutral = {"add": 0, "mul": 1, "sub": 0, "div": 1, "or": False, "and": True}
-        for kept, other in (args, args[::-1])[: 2 if op in COMMUTATIVE else 1] if op in neutral else ():
-            if is_all(other, neutral[op]) and kept.dtype == other.dtype:
+        for kept, other in (args, args[::-1])[: 2 if op in COMMUTATIVE else 1] if op in _NEUTRAL else ():
+            if is_all(other, _neutral(op, kept.dtype)):
                 return self.broadcast(kept, shape)
-        if op == "sub" and is_all(args[0], 0) and args[0].dtype == "real":
-            return self.elementwise("neg", args[1])
+        if (known := _comparison_known(op, args)) is not None:
+            return self.broadcast(self.constant(known, "bool"), shape)
+        if op in ("max", "min") and args[0] is args[1]:
+            return self.broadcast(args[0], shape)
         if op in ("add", "sub") and args[1].op == "neg":
             return self.elementwise("sub" if op == "add" else "add", args[0], args[1].args[0])
         if op == "add" and args[0].op == "neg":
@@ -207,3 +237,21 @@ class Program:
     def _one(self, node: Node) -> Node:
         """The scalar that all elements are."""
         return node if node.shape == () else self.arrange([node], np.zeros((), np.int64))
+
+
+def _neutral(op: str, dtype: str) -> Any:
+    """The number that leaves the other argument of an operation as it is."""
+    return ~NUMPY_TYPES[dtype](0) if op == "and" else _NEUTRAL[op]
+
+
+def _comparison_known(op: str, args: tuple[Node, ...]) -> bool | None:
+    """Result of a comparison that no numbers can change; compilers warn of those."""
+    if op in ("lt", "gt") and args[0] is args[1]:
+        return False
+    if op in ("eq", "ne", "le", "ge") and args[0] is args[1] and args[0].dtype != "real":
+        return op != "ne"
+    if op in ("lt", "ge") and args[0].dtype in UNSIGNED and is_all(args[1], 0):
+        return op == "ge"
+    if op in ("gt", "le") and args[0].dtype in UNSIGNED and is_all(args[0], 0):
+        return op == "le"
+    return None

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from dln_jax.deploy.c import casadi as external
-from dln_jax.deploy.c import kernels
+from dln_jax.deploy.c import integers, kernels
 from dln_jax.deploy.c.body import Source
 from dln_jax.deploy.c.demo import cmake, demo
 from dln_jax.deploy.c.elementary import definitions
@@ -29,9 +29,11 @@ from dln_jax.deploy.c.interface import (
     result_leaves,
 )
 from dln_jax.deploy.c.jaxprs import repeated_calls, traced
-from dln_jax.deploy.c.lowering import kind_of, program_of
+from dln_jax.deploy.c.kinds import kind_of
+from dln_jax.deploy.c.lowering import program_of
 from dln_jax.deploy.c.text import PRECISIONS, check_name, comment, table
 from dln_jax.deploy.exports import described, write_exports
+from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
 
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
@@ -49,9 +51,15 @@ class TooLargeError(InputError):
 
 
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
-Results may overlap arguments: all of these are read before. What is not finite in a state is not hidden."""
-_NEEDED = """C99; needs <math.h> and nothing else. Fastest with -O3 for the processor at hand (gcc: -march=native);
-results do not rely on reordered arithmetic (-ffast-math)."""
+Results may overlap arguments, as updates in place do, but not each other: all arguments are read before results are
+written. What is not finite in a state is not hidden."""
+_RELIED_ON = """\
+#if defined __FAST_MATH__ || defined __ASSOCIATIVE_MATH__ || defined _M_FP_FAST || __FINITE_MATH_ONLY__ + 0
+#error "NaN, infinities and rounding are relied on: leave out -ffast-math and what it stands for"
+#endif
+"""
+_NEEDED = """C99; needs <math.h>, <float.h> and <stdint.h>, and nothing else. Fastest with -O3 for the processor at hand
+(gcc: -march=native); does not compile with -ffast-math, which gives wrong numbers."""
 
 
 def export_c(
@@ -110,14 +118,26 @@ def source_files(
     precision = precision or _precision(functions)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
+    with computing_in(precision):
+        return _source_files(functions, name, precision, libm, casadi, leave_out_large, stack)
+
+
+def _source_files(
+    functions: Functions,
+    name: str,
+    precision: str,
+    libm: bool,
+    casadi: bool | Collection[str],
+    leave_out_large: bool,
+    stack: int,
+) -> dict[str, bytes]:
     source, signatures, texts, left_out = Source(precision, libm), {}, [], []
-    with jax.enable_x64(precision == "f64"):
-        every = {
-            check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
-        }
+    every = {
+        check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
+    }
     repeated = repeated_calls([each.closed for each in every.values()])
     for key, each in every.items():
-        tables, parts = dict(source.tables), dict(source.parts)
+        before = source.copy()
         try:
             signature, text, lines = _function(source, name, key, each, repeated, stack)
             if leave_out_large and lines > LINES:
@@ -126,7 +146,7 @@ def source_files(
             if not leave_out_large:
                 raise
             left_out.append(str(error))
-            source.tables, source.parts = tables, parts
+            source = before
             continue
         signatures[key] = signature
         texts.append(text)
@@ -157,10 +177,7 @@ def _for_casadi(
 ) -> dict[str, str]:
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
-    with jax.enable_x64(True):
-        source, text, left_out = external.external_functions(
-            name, functions, libm=libm, stack=stack, leave_out=leave_out
-        )
+    source, text, left_out = external.external_functions(name, functions, libm=libm, stack=stack, leave_out=leave_out)
     absent = "\n".join(f"Left out: {each}" for each in left_out)
     about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
     return {
@@ -187,14 +204,14 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
 
 
 def _function(
-    source: Source, name: str, key: str, each: _Traced, repeated: Mapping[int, str], stack: int
+    source: Source, name: str, key: str, each: _Traced, repeated: Collection[int], stack: int
 ) -> tuple[Signature, str, int]:
     """Signature, C text and lines of one function, those of functions that it calls included."""
     signature = Signature(tuple(each.arguments), tuple(each.results))
     named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, _, results = program_of(each.closed, repeated)
+        program, _, results = program_of(each.closed, repeated, precision=source.precision)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -230,7 +247,8 @@ def _preamble(source: Source, name: str) -> str:
     tables = "\n".join(table(table_name, array, source.precision) for table_name, array in source.tables.values())
     upper = suffix.upper()
     return (
-        f'#include <math.h>\n\n#include "{name}.h"\n\ntypedef {real} real;\n\n'
+        f'#include <float.h>\n#include <math.h>\n#include <stdint.h>\n\n#include "{name}.h"\n\n{_RELIED_ON}\n'
+        f"typedef {real} real;\n\n"
         "/* Passes of gcc that take as long as all others here, and find nothing */\n"
         "#if defined(__GNUC__) && !defined(__clang__)\n"
         '#pragma GCC optimize("no-gcse", "no-gcse-after-reload")\n#endif\n\n'
@@ -239,7 +257,7 @@ def _preamble(source: Source, name: str) -> str:
         f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
         "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n\n"
         f"{tables}{definitions(source.functions, source.precision, arrays=source.arrays)}"
-        f"{kernels.definitions(source.kernels, suffix)}"
+        f"{integers.definitions(source.integers, source.precision)}{kernels.definitions(source.kernels, suffix)}"
     )
 
 
@@ -252,6 +270,6 @@ def _header(name: str, written_by: str, signatures: Mapping[str, Signature], rea
         facts = f"{each.operations} floating-point operations, {each.stack_bytes} bytes of stack"
         declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, each, real)};\n"
     return (
-        f'{about}#ifndef {guard}\n#define {guard}\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
+        f'{about}#ifndef {guard}\n#define {guard}\n\n#include <stdint.h>\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
         f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"
     )

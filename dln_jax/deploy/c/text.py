@@ -6,6 +6,7 @@ from textwrap import TextWrapper
 
 import numpy as np
 
+from dln_jax.deploy.c.kinds import C_TYPES, kind_of
 from dln_jax.types import InputError
 
 PRECISIONS = {"f32": (np.float32, "float", "f"), "f64": (np.float64, "double", "")}
@@ -76,16 +77,18 @@ _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", bre
 
 def table(name: str, array: np.ndarray, precision: str) -> str:
     """A constant array."""
-    real = array.dtype.kind == "f"
-    kind = "real" if real else "int" if array.dtype.itemsize <= 4 or array.dtype == bool else "long long"
-    texts = (number(each, precision) if real else integer(int(each)) for each in array.ravel())
+    kind = "real" if array.dtype.kind == "f" else kind_of(array.dtype)
+    texts = (number(each, precision) if kind == "real" else integer(int(each), kind) for each in array.ravel())
     lines = "\n".join(_wrapper.wrap(" ".join(f"{each}," for each in texts)))
-    return f"static const {kind} {name}[{array.size}] = {{\n{lines}\n}};\n"
+    return f"static const {C_TYPES[kind]} {name}[{array.size}] = {{\n{lines}\n}};\n"
 
 
-def integer(value: int) -> str:
-    """A literal; C has none for the least number of 64 bits."""
-    return str(value) if value > -(2**63) else f"{value + 1} - 1"
+def integer(value: int, kind: str) -> str:
+    """A literal of a whole number; C has none for the least ones."""
+    least = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
+    if value in least:
+        return least[value]
+    return str(value) + {"unsigned": "U", "unsigned_long": "ULL"}.get(kind, "")
 
 
 def comment(*paragraphs: str) -> str:

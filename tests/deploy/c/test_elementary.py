@@ -39,7 +39,7 @@ def source(precision: str) -> str:
         for name in VECTORISED
     )
     return (
-        f"#include <math.h>\ntypedef {real} real;\n"
+        f"#include <float.h>\n#include <math.h>\n#include <stdint.h>\ntypedef {real} real;\n"
         f"#if defined FP_FAST_FMA{suffix.upper()} && !defined UNFUSED\n"
         f"#define MULTIPLY_ADD(a, b, c) fma{suffix}(a, b, c)\n#else\n"
         "#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"

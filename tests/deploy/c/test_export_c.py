@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import platform
 import re
 import shutil
 import subprocess
@@ -53,7 +54,7 @@ def test_files_are_the_same_each_time_and_say_what_they_are():
     assert f"C format {interface.FORMAT}" in header
     assert "void arm_step(const float x[4], const float u[1], float x_next[4]);" in header
     assert "float arm_energy(const float x[3], float k);" in header
-    assert re.findall(r"#include (\S+)", source) == ["<math.h>", '"arm.h"']
+    assert re.findall(r"#include (\S+)", source) == ["<float.h>", "<math.h>", "<stdint.h>", '"arm.h"']
     assert not re.search(r"\b(malloc|static (?!const|inline|void)|double)\b", source)
     stated = json.loads(once["arm.json"])["functions"]
     for each in stated.values():
@@ -177,7 +178,7 @@ def test_the_loader_says_what_is_missing(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"could not compile the model: .*error"):
             load_c(tmp_path, flags=("--no-such-flag",))
     monkeypatch.setattr(interface, "FORMAT", 99)
-    with pytest.raises(InputError, match="C format 3; this release reads format 99"):
+    with pytest.raises(InputError, match="C format 4; this release reads format 99"):
         load_c(tmp_path)
 
 
@@ -325,3 +326,32 @@ def test_arguments_of_another_shape_are_refused_by_name(exported, tmp_path):
     for call in (lambda: energy([1, 2, 3]), lambda: energy([1, 2, 3], 1.0, 2.0), lambda: energy([1, 2, 3], j=1)):
         with pytest.raises(InputError, match="energy takes x, k"):
             call()
+
+
+@needs_compiler
+@pytest.mark.parametrize("flags", [("-ffast-math",), ("-ffinite-math-only",), ("-mfpmath=387",)], ids=str)
+def test_flags_that_give_wrong_numbers_do_not_compile(flags, tmp_path):
+    if flags == ("-mfpmath=387",) and platform.machine() != "x86_64":
+        pytest.skip("is a flag for x86")
+    export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path)
+    with pytest.raises(InputError, match=r"#error .*(-ffast-math|-mfpmath=sse)"):
+        load_c(tmp_path, compiler="gcc", flags=flags)
+
+
+@needs_compiler
+def test_library_functions_bear_extended_precision(tmp_path):
+    if platform.machine() != "x86_64":
+        pytest.skip("is a flag for x86")
+    export_c({"f": (jnp.exp, (np.zeros(9),))}, tmp_path, libm=True)
+    x = np.linspace(-3, 3, 9)
+    np.testing.assert_allclose(load_c(tmp_path, compiler="gcc", flags=("-mfpmath=387",)).f(x), np.exp(x), rtol=1e-14)
+
+
+def test_integers_have_the_types_of_stdint(tmp_path):
+    types = (np.int32, np.int64, np.uint32, np.uint64)
+    export_c({"f": (lambda *each: each[0][0] + 1, tuple(np.zeros(2, kind) for kind in types))}, tmp_path)
+    header = (tmp_path / "model.h").read_text()
+    assert "#include <stdint.h>" in header
+    for kind in types:
+        assert f"const {np.dtype(kind).name}_t " in header
+    assert not re.search(r"\bunsigned |long long", (tmp_path / "model.c").read_text())

@@ -144,6 +144,34 @@ ON_INTEGERS = {
     "integer_power": lambda a, b: a**3 + b,
     "integer_sums": lambda a, b: (a.sum(), b.prod(), a.max(), b.min(), jnp.argmin(a), jnp.cumsum(b)),
     "to_real": lambda a, b: a.astype(float) * b,
+    "wrapped": lambda a, b: (a * (2**62 + 3), a + (2**63 - 1), a.astype(jnp.int32) * 77777 * b.astype(jnp.int32) ** 5),
+    "unsigned": lambda a, b: (
+        *(a.astype(jnp.uint32) - 5, -a.astype(jnp.uint64), jnp.sign(a.astype(jnp.uint32)), a.astype(jnp.uint32) < 0),
+        *(a.astype(jnp.uint64) >= 0, a.astype(jnp.uint32) // 3, jnp.uint64(2**63 + 5) + a.astype(jnp.uint64)),
+    ),
+    "one_bit": lambda a, b: (a & 1, a | 0, a ^ 0, a & -1, (a & 3) * b, a & b),
+    "constants": lambda a, b: (
+        *(a + jnp.int64(2**53 + 1) // 3, a + lax.div(jnp.int64(-(2**53) - 1), jnp.int64(2)), a + jnp.int64(-(2**63))),
+        a.astype(jnp.int32) + jnp.int32(-(2**31)),
+    ),
+    "compared_with_itself": lambda a, b: (a == a, a != a, a <= a, a < a, jnp.maximum(a, a), a[:3].max(), a > a),
+    "truths": lambda a, b: (
+        *((a > 0) == (b > 0), (a > 0) < (b > 0), (a > 0) >= (b > 0), jnp.maximum(a > 0, b > 0), (a > 0).max()),
+        *((a > 0) <= True, jnp.dot(a > 0, b > 0), jnp.sum(a > 0), jnp.where(a > 0, 2, 3) != 0),
+    ),
+    "bitwise_reductions": lambda a, b: (
+        *(jnp.bitwise_or.reduce(a), jnp.bitwise_and.reduce(b[1:4]), jnp.bitwise_xor.reduce(a)),
+        jnp.bitwise_xor.reduce(b[:2]),
+    ),
+    "products": lambda a, b: (
+        *(a @ b, jnp.outer(a, b) @ a, jnp.dot(a.astype(jnp.uint32), b.astype(jnp.uint32))),
+        *((jnp.outer(a, b) @ jnp.outer(b, a)) % 3, a[(b @ b) % 3]),
+    ),
+    "product_of_large_numbers": lambda a, b: (a * 30370005) @ (b * 4611686018427),
+    "product_to_wider": lambda a, b: lax.dot(
+        a.astype(jnp.int32) * 99999, b.astype(jnp.int32), preferred_element_type=jnp.int64
+    ),
+    "filled": lambda a, b: (a.at[b].get(mode="fill"), a.astype(jnp.uint32).at[b].get(mode="fill")),
     "mixed": lambda a, b: (a.astype(jnp.int32), a.astype(jnp.uint32), (a > 0) & (b > 0)),
 }
 MOVES = {
@@ -347,6 +375,48 @@ PRODUCTS = {
         if n in (3, 9) or name in ("cholesky", "solve", "custom_linear_solve", "lu")
     },
 }
+DIVISIONS = {
+    f"{name}_of_{np.dtype(kind)}": (
+        division,
+        (
+            np.array([5, 2**31 - 7, 0, np.iinfo(kind).min, np.iinfo(kind).max, np.iinfo(kind).min], kind),
+            np.array([0, 0, 0, -1 if np.iinfo(kind).min else 7, 3, 1], np.int64).astype(kind),
+        ),
+    )
+    for name, division in {"div": lax.div, "rem": lax.rem, "floor_divide": jnp.floor_divide, "mod": jnp.mod}.items()
+    for kind in (np.int32, np.int64, np.uint32, np.uint64)
+    if not (np.iinfo(kind).max > 2**62 and name in ("floor_divide", "mod"))
+}
+"""By zero, and of the least number by -1."""
+HALFWAY = np.array([1 / 3, 1 + 2**-11, 1 + 3 * 2**-11, 65504.0, 65519.0, 65520.0, 6e-5, 6.1e-5, 3e-8, 2e38, 3.4e38])
+ROUNDED = {
+    f"reduce_precision_{exponent}_{mantissa}": (
+        lambda x, bits=(exponent, mantissa): lax.reduce_precision(x, *bits),
+        (np.concatenate([SPECIAL, HALFWAY, -HALFWAY]),),
+    )
+    for exponent, mantissa in ((5, 10), (8, 7), (8, 23), (11, 52), (8, 52), (11, 3), (5, 23))
+}
+TYPES = {
+    "integer_exponents": (
+        lambda x, n: (x**n, x ** n.astype(jnp.int32)),
+        (np.array([0.3, -1.2, 2.5]), np.array([2, 3, -1])),
+    ),
+    "saturating_conversions": (
+        lambda x: [(1e17 * x).astype(kind) for kind in (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)],
+        (SPECIAL,),
+    ),
+    "signs_of_zero": (lambda x: (1 / (0 - x), 1 / -x), (np.array([0.0, -0.0, 2.0]),)),
+    "whole_and_fraction": (jnp.modf, (np.array([0.5, -1.75, 3.0, -0.0]),)),
+    **{f"result_read_by_another_{n}": (lambda x: (2 * x, 2 * x + 1), (normal(n),)) for n in (1, 7, 8, 9, 33, 64, 65)},
+    "result_read_in_a_loop": (
+        lambda x: (2 * x, lax.fori_loop(0, 3, lambda k, y: y + 2 * x, x), (2 * x)[::-1], (2 * x).sum()),
+        (normal(12),),
+    ),
+    "unused": (
+        lambda x: lax.scan(lambda c, y: ((c[0] + y, c[1] * 2, y), (c[1], c[2] + x[0])), (x[0], x, x[1]), x)[0][0],
+        (normal(9),),
+    ),
+}
 INTERFACES = {
     "integers": (lambda n, flags, x: {"n": n + 1, "flags": ~flags, "y": jnp.where(flags, x, n)},
                  (np.array([3, -2]), np.array([True, False]), normal(2))),
@@ -373,6 +443,9 @@ CASES = {
     **{name: (function, (normal(5, 7), np.array([3, 0, -1, 9, 3, -8, 1]))) for name, function in INDEXED.items()},
     **{name: (function, (normal(4), np.int64(3))) for name, function in CONTROL.items()},
     **PRODUCTS,
+    **DIVISIONS,
+    **ROUNDED,
+    **TYPES,
     **INTERFACES,
 }
 """Function and first example of each of its arguments."""
