@@ -58,19 +58,6 @@ def require_positive(**numbers: int | float) -> None:
             raise InputError(f"{name} is {value}; expected a positive number")
 
 
-MOST_LAYERS = 100
-"""Hidden layers of a network: more take hours to compile, and learn nothing."""
-
-
-def require_network(*, width: int, depth: int) -> None:
-    """Raises `InputError` unless width and depth are positive whole numbers, and the layers at most `MOST_LAYERS`."""
-    for name, value in (("width", width), ("depth", depth)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise InputError(f"{name} is {value!r:.40}; expected a positive whole number")
-    if depth > MOST_LAYERS:
-        raise InputError(f"depth is {depth}; expected at most {MOST_LAYERS} hidden layers")
-
-
 LARGEST_SEED = 2**32 - 1
 """Of one that NumPy and JAX take, in 32 bits too."""
 

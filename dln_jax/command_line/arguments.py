@@ -21,6 +21,13 @@ Arguments = TypeVar("Arguments")
 Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
 """An option that is `None` where it is not given; its own text says what then holds."""
 
+UNREADABLE = {
+    r"Error parsing (--\S+): invalid literal for int\(\) with base 10: (.*)": "a whole number",
+    r"Error parsing (--\S+): Exceeds the limit \(\d+ digits\)()[^']*": "a whole number of fewer than 4,300 digits",
+    r"Error parsing (--\S+): could not convert string to float: (.*)": "a number",
+}
+"""What Python says of text that is no number, as the option and the text; and what was expected."""
+
 _rules = ConstructorRegistry()
 
 
@@ -110,7 +117,11 @@ def _complaint(box: str) -> str:
     lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
     sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
     section = sections[0] if framed else sections[min(1, len(sections) - 1)]
-    return " ".join(section.split()).rstrip(".")
+    said = " ".join(section.split()).rstrip(".")
+    for pattern, wanted in UNREADABLE.items():
+        if found := re.fullmatch(pattern, said):
+            return f"{found[1]} must be {wanted}" + (f"; got {found[2]:.60}" if found[2] else "")
+    return said
 
 
 def positive_numbers(option: str, text: str) -> tuple[float, ...]:

@@ -24,6 +24,7 @@ from dln_jax.models.lagrangian import one_network, structured_networks
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
@@ -44,7 +45,7 @@ def make_structured_hamiltonian(
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
     )
@@ -102,7 +103,8 @@ def make_separable_hamiltonian(
         initial_guess: (q, qd) -> p [d] where they start; zero by default.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth, iterations=iterations)
+    require_network(width=width, depth=depth)
+    require_positive(iterations=iterations)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
 
     def kinetic(p: Vector) -> Scalar:

@@ -20,7 +20,8 @@ from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.models.model import Model, Parameters, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector, require_network
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector
 
 TERMS: tuple[ResidualTerm, ...] = get_args(ResidualTerm)
 START = 0.1

@@ -20,7 +20,8 @@ from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.files import matches
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.precision import data_type
-from dln_jax.types import InputError, Needs, require_network
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import entry_of
 from dln_jax.zoo.parameter_files import REMEDY
 
