@@ -16,9 +16,11 @@
 Equation of motion: `tau = M(q) qdd + c(q, qd) + g(q)`, plus `dD/dqd` where there is friction.
 """
 
+import reprlib
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -56,6 +58,20 @@ def require_positive(**numbers: int | float) -> None:
     for name, value in numbers.items():
         if not value > 0:
             raise InputError(f"{name} is {value}; expected a positive number")
+
+
+def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The value as float64 of this shape; `InputError` says whether type, shape or a number is at fault."""
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {reprlib.repr(value)}; expected real numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}; expected {shape}")
+    if len(wrong := np.argwhere(~np.isfinite(array))):
+        place = tuple(map(int, wrong[0]))
+        raise InputError(f"{name} has {array[place]} at {place}; expected finite numbers")
+    return array
 
 
 LARGEST_SEED = 2**32 - 1

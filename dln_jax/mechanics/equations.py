@@ -29,7 +29,7 @@ from dln_jax.mechanics import (
     plain,
     recursive,
 )
-from dln_jax.mechanics.arguments import vectors
+from dln_jax.mechanics.arguments import answer, vectors
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow, friction_force
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -100,7 +100,7 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
         rates = system.rates
-        return PlainFlow(lambda q, p: rates(*vectors(d, q=q, p=p)))
+        return PlainFlow(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
         known = [*_DYNAMICS, PhaseRates]
         known.remove(InverseForward)
@@ -108,13 +108,12 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     H = hamiltonian_of(system)
 
     def hamilton(q, p):
-        q, p = vectors(d, q=q, p=p)
         if isinstance(system, LoadedSystem):
             qd = hamiltonian.velocity(H, q, p)
             return hamiltonian.time_derivative(H, q, p, driving_force(system, q, qd, jnp.zeros_like(q)))
         return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
 
-    return Flow(hamilton, lambda q, p: H(*vectors(d, q=q, p=p)))
+    return Flow(lambda q, p: answer(hamilton, *vectors(d, q=q, p=p)), lambda q, p: answer(H, *vectors(d, q=q, p=p)))
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
