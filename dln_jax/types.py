@@ -17,8 +17,8 @@ Equation of motion: `tau = M(q) qdd + c(q, qd) + g(q)`, plus `dD/dqd` where ther
 """
 
 import reprlib
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -85,11 +85,8 @@ def require_seed(seed: int, seeds: int = 1) -> None:
         raise InputError(f"seed is {seed}{counted}; expected whole numbers from 0 to {LARGEST_SEED}")
 
 
-class Needs(NamedTuple):
-    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
-
-    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON.
-    """
+class _Needs(NamedTuple):
+    """The fields of `Needs`."""
 
     joints: tuple[JointKind, ...]
     """Kind of each joint: a revolute angle enters a model as cos and sin, a prismatic displacement as it is."""
@@ -107,7 +104,41 @@ class Needs(NamedTuple):
     velocity_scale: float = 0.01
     """v of the joints' dry friction, which is smooth below, in rad/s or m/s."""
 
+
+class Needs(_Needs):
+    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
+
+    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. InputError for
+    unknown kinds of joints or laws of friction, and for values of another type.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *given: Any, **named: Any) -> "Needs":
+        """Checks the fields."""
+        fields = super().__new__(cls, *given, **named)
+        named_joints = _names_of("joints", fields.joints, get_args(JointKind))
+        if not named_joints:
+            raise InputError("joints are empty; expected at least one")
+        laws = _names_of("joint_friction", fields.joint_friction, get_args(FrictionLaw))
+        for name in ("gravity", "friction"):
+            if not isinstance(getattr(fields, name), bool):
+                raise InputError(f"{name} is {reprlib.repr(getattr(fields, name))}; expected True or False")
+        others = {name: getattr(fields, name) for name in fields._fields}
+        return super().__new__(cls, **{**others, "joints": named_joints, "joint_friction": laws})
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> "Needs":
+        return cls(*iterable)
+
     @property
     def degrees_of_freedom(self) -> int:
         """d."""
         return len(self.joints)
+
+
+def _names_of(field: str, given: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
+    """Names as a tuple; `InputError` for others than those known."""
+    if not isinstance(given, list | tuple) or not all(isinstance(each, str) and each in known for each in given):
+        raise InputError(f"{field}: {reprlib.repr(given)}; expected a tuple of {', '.join(known)}")
+    return tuple(given)

@@ -83,7 +83,8 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
     """
     make = _DYNAMICS.get(type(system))
     if make is None:
-        raise InputError(f"dynamics got a {type(system).__name__}; expected one of {_names(*_DYNAMICS)}")
+        hint = ": give model.energies(parameters)" if hasattr(system, "energies") else ""
+        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(*_DYNAMICS)}")
     return make(system, degrees_of_freedom=degrees_of_freedom)
 
 

@@ -24,6 +24,7 @@ from dln_jax.models.lagrangian import one_network, structured_networks
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
@@ -33,7 +34,7 @@ def make_structured_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     diagonal_shift: float = 0.0,
     diagonal_floor: float = 0.1,
     dtype: DTypeLike = jnp.float32,
@@ -46,6 +47,7 @@ def make_structured_hamiltonian(
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
     )
@@ -57,7 +59,7 @@ def make_black_box_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: Scale = 1.0,
     iterations: int = 8,
     initial_guess: Guess | None = None,
@@ -87,7 +89,7 @@ def make_separable_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: Scale = 1.0,
     iterations: int = 8,
     initial_guess: Guess | None = None,
@@ -104,6 +106,7 @@ def make_separable_hamiltonian(
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     require_positive(iterations=iterations)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
 

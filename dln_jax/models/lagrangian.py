@@ -27,6 +27,7 @@ from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.nn.activations import activation as activation_of
 from dln_jax.sizes import require_network
 from dln_jax.types import Matrix, Needs, Scalar, Vector
 
@@ -36,7 +37,7 @@ def make_delan(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     diagonal_shift: float = 2.0,
     diagonal_floor: float = 0.1,
     shared_trunk: bool = False,
@@ -52,6 +53,7 @@ def make_delan(
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
@@ -63,7 +65,7 @@ def make_black_box_lagrangian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
@@ -76,6 +78,7 @@ def make_black_box_lagrangian(
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
     require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     terms = partial(one_network, needs, "lagrangian", width, depth, activation, rates)
     return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)
