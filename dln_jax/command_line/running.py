@@ -2,11 +2,12 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import math
 import os
 import reprlib
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
@@ -27,6 +28,8 @@ from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
+FILES = "files"
+"""Key of the SHA-256 of the files that are arguments, by their names."""
 SCALE = ("devices", "processes", "coordinator", "process_id")
 """Arguments that say where a result is computed."""
 PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
@@ -189,7 +192,12 @@ def needs_from_option(text: str) -> Needs:
 def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
     """Yields the run folder of a command, with its arguments in config.json, and beside them what they came to."""
     resume = getattr(given, "resume", False)
-    folder_of_run = run_folder(given.out, command, resume=resume) if is_first(given) else copied_folder(given, resume)
+    resumable = hasattr(given, "resume") and getattr(given, "continues", True)
+    folder_of_run = (
+        run_folder(given.out, command, resume=resume, resumable=resumable)
+        if is_first(given)
+        else copied_folder(given, resume)
+    )
     with folder_of_run as folder:
         if resume:
             wait_for_all(given)
@@ -199,7 +207,9 @@ def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
 
 def write_config(folder: Path, given: Any, **chosen: Any) -> None:
     """Writes the arguments of a run into its folder, and what they came to."""
-    write_json(folder / CONFIG, {**stored_arguments(given), **({CHOSEN: chosen} if chosen else {})})
+    files = fingerprints(stored_files(given))
+    more = {CHOSEN: chosen} if chosen else {}
+    write_json(folder / CONFIG, {**stored_arguments(given), **more, **({FILES: files} if files else {})})
 
 
 def stored_arguments(given: Any) -> dict[str, Any]:
@@ -208,11 +218,28 @@ def stored_arguments(given: Any) -> dict[str, Any]:
     return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
 
 
+def stored_files(given: Any) -> dict[str, Path]:
+    """The files that decide the result, by the names of their arguments."""
+    values = dataclasses.asdict(given)
+    return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
+
+
+def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
+    """SHA-256 of each file, by which a resumed run knows it wherever it is."""
+    found = {}
+    for name, path in files.items():
+        with path.open("rb") as file:
+            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
 def with_stored_arguments(given: Arguments) -> Arguments:
     """The arguments that the run in --out was started with; what is given anew must not differ.
 
+    A file may have another path, if it is the same file.
+
     Raises:
-        InputError: --out holds no run, one of other arguments, or one whose config.json is damaged.
+        InputError: --out holds no run, one of other arguments or files, or one whose config.json is damaged.
     """
     folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
     if folder is None or not is_file(folder / CONFIG):
@@ -220,6 +247,20 @@ def with_stored_arguments(given: Arguments) -> Arguments:
     unset = stored_arguments(type(given)())
     stored = checked_arguments(folder / CONFIG, type(given), unset)
     changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
+    known = read_json(folder / CONFIG, remedy="restore it").get(FILES)
+    known = known if isinstance(known, dict) else {}
+    anew = stored_files(given)
+    for key, digest in known.items():
+        path = anew.get(key, Path(str(stored.get(key))))
+        option = f"--{key.replace('_', '-')}"
+        if not is_file(path):
+            raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
+        if fingerprints({key: path})[key] != digest:
+            raise InputError(
+                f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
+                f"started with by {option}"
+            )
+        stored[key] = str(path)
     for key, value in stored_arguments(given).items():
         if key not in changeable and value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
@@ -240,7 +281,8 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     """
     remedy = "restore the file, or train again into another folder"
     stored = read_json(path, remedy=remedy)
-    stored.pop(CHOSEN, None)
+    for each in (CHOSEN, FILES):
+        stored.pop(each, None)
     if absent := [key for key in expected if key not in stored]:
         raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
     hints = get_type_hints(arguments)

@@ -52,6 +52,7 @@ def here(at_once: int, gpus: int) -> Iterator[Engine]:
             return None
         if handle.gpu is not None:
             free.append(handle.gpu)
+        forget(handle.job)
         # What was killed says nothing; what did not start says why.
         return last_line(handle.job.paths.stderr)
 
@@ -61,6 +62,8 @@ def here(at_once: int, gpus: int) -> Iterator[Engine]:
             if not handle.job.done():
                 handle.job.cancel()
         wait(handles)
+        for handle in handles:
+            forget(handle.job)
 
     yield Engine(start, over, stop, at_once)
 
@@ -76,6 +79,12 @@ def errors_to(path: Path) -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
+
+
+def forget(job: Any) -> None:
+    """Removes the pickles by which submitit hands a job over: what they say is in the job's own files."""
+    for path in (job.paths.submitted_pickle, job.paths.result_pickle):
+        path.unlink(missing_ok=True)
 
 
 def cores() -> int:

@@ -9,6 +9,8 @@ from dln_jax.data.checks.findings import Finding
 
 LATE = 0.3
 """Samples of delay that are worth a word, where the model is that of the robot."""
+CONSTANT = 1e-9
+"""A torque whose deviation is smaller than this share of its size is constant."""
 GAIN = 1.02
 """By which the squared error falls with it."""
 
@@ -51,10 +53,13 @@ def delay_of(columns: Float[np.ndarray, "nd P"], shifted: Float[np.ndarray, "n d
         step: s, of a sample.
     """
     n, d, count = shifted.shape
-    sizes = np.maximum(shifted.std(axis=(0, 2)), np.finfo(float).tiny)
+    deviation, size = shifted.std(axis=(0, 2)), np.abs(shifted).max(axis=(0, 2))
+    sizes = np.where(deviation > CONSTANT * size, deviation, np.inf)  # a constant torque says nothing of time
     weighted = (columns.reshape(n, d, -1) / sizes[:, None]).reshape(n * d, -1)
     norms = np.linalg.norm(weighted, axis=0)
     seen = norms > 1e-9 * norms.max(initial=0.0)
+    if not seen.any():
+        return Delays(0.0, 1.0, np.arange(count) - count // 2.0, np.ones(count), [])
     left, values, _ = np.linalg.svd(weighted[:, seen] / norms[seen], full_matrices=False)
     basis = left[:, values > 1e-8 * values[0]]
     tau = (shifted / sizes[:, None]).reshape(n * d, count)
