@@ -188,10 +188,4 @@ def noises(stated: str | None, d: int) -> np.ndarray | None:
     """Of --noise."""
     if stated is None:
         return None
-    try:
-        found = np.array([float(each) for each in stated.split(",")])
-    except ValueError:
-        found = np.zeros(0)
-    if found.shape != (d,) or not (found > 0).all() or not np.isfinite(found).all():
-        raise InputError(f"--noise is {stated!r:.60}; expected {d} positive numbers with commas between them")
-    return found
+    return np.array(numbers_of("--noise", stated, [d], positive=True))

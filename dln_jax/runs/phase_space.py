@@ -12,7 +12,7 @@ import numpy as np
 from dln_jax.command_line.arguments import (
     Unstated,
     choice,
-    positive_numbers,
+    numbers_of,
     refuse_given,
     require_positive_if_given,
     resolved,
@@ -123,7 +123,8 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     needs = None if given.needs is None else needs_from_option(given.needs)
     if given.task != MEASURED:
         refuse_given(given, ["test", "noise"], "for measured")
-    stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
+    noise = None if given.noise is None else numbers_of("--noise", given.noise, positive=True)
+    stated = Stated(needs, given.test, noise)
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
     names = ("width", "depth", "activation", "degree", "coordinates")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}

@@ -94,7 +94,7 @@ def write_jobs(jobs: Sequence[Job], command: str) -> None:
         said = {"command": command, "arguments": list(job.arguments), "values": job.values, "resumes": job.resumes}
         if is_file(job.path):
             stored = read_job(job.path)
-            if {key: stored[key] for key in said} != said:
+            if any(stored[key] != said[key] for key in ("command", "arguments", "values")):
                 raise InputError(f"{job.path} is of another job; continue where the sweep was started, or remove it")
             continue
         job.folder.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import runpy
+import signal
 import socket
 import sys
 import time
@@ -30,6 +31,8 @@ class Work:
 
     def __call__(self, path: str) -> None:
         """Does the job; raises `SystemExit` with the command's exit code unless that is 0."""
+        # A sweep that was started in the background has jobs that would ignore an interrupt.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         if code := perform(Path(path)):
             raise SystemExit(code)
 

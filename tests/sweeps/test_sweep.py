@@ -163,7 +163,7 @@ def test_an_interrupt_ends_the_jobs(tmp_path, engine, monkeypatch, capsys):
 
 
 MISTAKES = [
-    (("--grid", "width=a"), "Error parsing --width"),
+    (("--grid", "width=a"), "--width must be a whole number"),
     ((), "--grid names no option"),
     (("--command", "train_delen", "--grid", "width=8"), "did you mean train_delan?"),
     (("--command", "sweep", "--grid", "width=8"), "there is no 'sweep'"),
