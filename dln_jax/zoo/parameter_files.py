@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import safetensors.numpy
 
-from dln_jax.files import is_file, read_json, write_bytes, write_json
+from dln_jax.files import is_file, matches, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 MODEL = "model"
@@ -89,6 +89,11 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         )
     if not isinstance(file_name, str) or Path(file_name).name != file_name:
         raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
+    tensors = manifest.get("tensors")
+    for key, each in tensors.items() if isinstance(tensors, dict) else [("tensors", tensors)]:
+        shape = each.get("shape") if isinstance(each, dict) else None
+        if not isinstance(shape, list) or not all(matches(size, int) and size >= 0 for size in shape):
+            raise InputError(f"{path}: {key:.80} is {reprlib.repr(each)}; expected the shape of an array; {REMEDY}")
     return manifest
 
 

@@ -160,7 +160,7 @@ def test_what_is_no_tree_is_refused_in_one_line(case, tmp_path):
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(InputError, match="no such file"):
         read_robot(tmp_path / "arm.urdf")
 
 
