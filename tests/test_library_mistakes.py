@@ -145,11 +145,6 @@ def test_states_of_another_size_than_the_system_are_refused(size):
                 function(*state)
 
 
-def test_a_model_in_place_of_its_energies_is_refused_with_the_remedy():
-    with pytest.raises(InputError, match=r"model\.energies"):
-        dln_jax.dynamics(dln_jax.make_delan(ARM, width=3, depth=1))
-
-
 def test_what_is_wrong_with_an_array_is_said():
     """And not that a shape is wrong, where it is a number."""
     one = {

@@ -286,7 +286,8 @@ def _require_numbers(robot: Robot) -> None:
         right = (np.abs(numbers) <= LARGEST_NUMBER) & ((numbers >= 0) | (what not in losses))
         for joint in np.flatnonzero(~right.all(axis=1))[:1]:
             wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
-            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {numbers[joint]}; expected {wanted}")
+            found = ", ".join(f"{each:.3g}" for each in numbers[joint])
+            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {found}; expected {wanted}")
 
 
 def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:

@@ -77,7 +77,9 @@ def make_black_box_hamiltonian(
         initial_guess: (q, qd) -> p [d] where they start; zero by default.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(iterations=iterations, width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    require_positive(iterations=iterations)
+    activation = activation_of(activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     terms = partial(one_network, needs, "hamiltonian", width, depth, activation, momenta)
     record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
