@@ -41,7 +41,9 @@ MOST: dict[str, int] = {
 """Of counts, by the name of the option or argument; `MOST_OF_OTHERS` of those that are not listed."""
 MOST_OF_OTHERS = 100_000_000
 LARGEST, SMALLEST = 1e50, 1e-50
-"""Magnitudes of physical quantities in SI units; the squares of what lies between stay finite."""
+"""Magnitudes of measured quantities in SI units; the squares of what lies between stay finite."""
+LARGEST_STATED = 1e20
+"""Of a number that is typed as an option."""
 
 
 def require_within(counts: Mapping[str, int]) -> None:
@@ -53,8 +55,10 @@ def require_within(counts: Mapping[str, int]) -> None:
 
 def require_magnitude(name: str, value: float) -> None:
     """Raises `InputError` for a number other than zero that no quantity in SI units has."""
-    if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
-        raise InputError(f"{name} is {value:.3g}; expected zero, or a size between {SMALLEST:.0e} and {LARGEST:.0e}")
+    if value != 0 and not SMALLEST <= abs(value) <= LARGEST_STATED:
+        raise InputError(
+            f"{name} is {value:.3g}; expected 0, or a size between {SMALLEST:.0e} and {LARGEST_STATED:.0e}"
+        )
 
 
 def require_network(*, width: int, depth: int) -> None:

@@ -128,7 +128,7 @@ class Needs(_Needs):
         return super().__new__(cls, **{**others, "joints": named_joints, "joint_friction": laws})
 
     @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> "Needs":
+    def _make(cls, iterable: Iterable[Any]) -> "Needs":  # type: ignore[override]  # so that `_replace` checks too
         return cls(*iterable)
 
     @property

@@ -34,7 +34,7 @@ SCALE = ("devices", "processes", "coordinator", "process_id")
 """Arguments that say where a result is computed."""
 PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not decide the result."""
-MOST_CHARACTERS = 500
+MOST_CHARACTERS = 400
 """Of each end of a message, of which the middle is left out if it is longer."""
 CHANGEABLE = ("seconds",)
 """Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""

@@ -114,6 +114,8 @@ def main(given: Arguments) -> None:
 
 def prepare(given: Arguments) -> Prepared:
     """Reads the robot, and says what is assumed of it."""
+    if given.criterion not in CRITERIA:
+        raise InputError(f"--criterion is '{given.criterion:.60}'; expected one of {', '.join(CRITERIA)}")
     require_sampling(period=given.seconds, harmonics=given.harmonics, rate=given.rate)
     robot = read_robot(given.robot)
     d = robot.tree.degrees_of_freedom

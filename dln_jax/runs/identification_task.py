@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in, require_positive_if_given
+from dln_jax.command_line.arguments import Unstated, choice, names_in, numbers_of, require_positive_if_given
 from dln_jax.command_line.encoders import Filtered, checked, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema

@@ -16,6 +16,7 @@ from calls import command, refused
 
 from dln_jax.command_line.running import with_stored_arguments, write_config
 from dln_jax.commands import (
+    arm_table,
     benchmark,
     check_data,
     excite,
@@ -67,6 +68,8 @@ OPTIONS = {
     "no noise": (excite, "--robot", "r.urdf", "--noise", "0"),
     "positions beyond all": (excite, "--robot", "r.urdf", "--position", "1e308"),
     "place of no payload": (excite, "--robot", "r.urdf", "--payload-position", "1,2,3"),
+    "unknown criterion": (excite, "--robot", "r.urdf", "--criterion", "beauty"),
+    "negative count": (arm_table, "--adam-steps", "-1"),
     "rate": (excite, "--robot", "r.urdf", "--rate", "1e30"),
     "robot of a long name": (check_data, "--data", "data.npz", "--robot", "x" * 5000),
     "lanes": (scale_report, "--lanes", DIGITS),
