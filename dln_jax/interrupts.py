@@ -1,6 +1,7 @@
 """An interrupt is no error: it is said in a word, and what is being stored is stored first."""
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -68,7 +69,7 @@ def open_standard_streams() -> None:
             os.dup2(os.open(os.devnull, os.O_RDWR), number)  # so that no other file gets this number
             setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115  to the end
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 

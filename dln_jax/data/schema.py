@@ -144,9 +144,9 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
         from_arrays(arrays)
     except InputError as error:
         raise InputError(f"{path} is not written: {error}") from None
-    arrays = {key: np.asarray(value) for key, value in arrays.items()}
+    whole: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items()}
     with writing(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **whole)
 
 
 def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
