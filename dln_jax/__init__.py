@@ -32,7 +32,8 @@ from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
-from dln_jax.zoo.run import Run, load, save
+from dln_jax.zoo.run import Run, load
+from dln_jax.zoo.run import save_model as save
 
 __version__ = importlib.metadata.version("dln-jax")
 

@@ -107,6 +107,16 @@ def matches(value: Any, hint: Any) -> bool:
     return isinstance(value, str) if hint is Path else type(value) is (NoneType if hint is None else hint)
 
 
+def in_words(hint: Any) -> str:
+    """What a type that `matches` takes is called in a message: "a whole number", "one of a, b, or null"."""
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(map(str, get_args(hint)))}"
+    if options := get_args(hint):
+        return ", or ".join(in_words(option) for option in options)
+    names = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text", Path: "a path"}
+    return names.get(hint, "null")
+
+
 def cache_folder() -> Path:
     """Where what can be made again is kept: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

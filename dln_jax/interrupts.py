@@ -1,12 +1,19 @@
-"""An interrupt while a command of this package is still being imported is a word, and no trace."""
+"""An interrupt is no error: it is said in a word, and what is being stored is stored first."""
 
+import contextlib
+import io
+import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
+from typing import Any
 
 
 def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Takes the place of `sys.excepthook`: an interrupt is no error of the program."""
+    """Takes the place of `sys.excepthook`: an interrupt while a command is still being imported leaves no trace."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
     else:
@@ -21,5 +28,52 @@ def is_command() -> bool:
     return script or (package == "dln_jax" and not name) or Path(sys.argv[0]).stem == "dln-jax"
 
 
+def terminate_as_interrupt() -> None:
+    """Lets SIGTERM end this process as Ctrl-C does, unless the process that started it has decided otherwise."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[None]:
+    """Lets what is within end before an interrupt is raised: a step of a training, and its checkpoint.
+
+    Python raises an interrupt only when a compiled program returns, so that this delays it by the checkpoint alone.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        caught.append(number)
+
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before: dict[int, Any] = {each: signal.getsignal(each) for each in signals}
+    before = {each: handler for each, handler in before.items() if callable(handler)}  # those of Python
+    for each in before:
+        signal.signal(each, note)
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        if caught:
+            before[caught[0]](caught[0], None)
+
+
+def open_standard_streams() -> None:
+    """Gives a process whose output was closed (`>&-`) somewhere to write, and prints any text in any encoding."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)  # so that no other file gets this number
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115  to the end
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 if is_command():
     sys.excepthook = in_a_word
+    terminate_as_interrupt()
+    open_standard_streams()

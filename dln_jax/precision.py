@@ -10,6 +10,8 @@ import jax.numpy as jnp
 
 from dln_jax.types import InputError
 
+KINDS = {"f32": jnp.float32, "f64": jnp.float64}
+
 
 def data_type(precision: str) -> Any:
     """float32 or float64, for "f32" or "f64".
@@ -17,12 +19,16 @@ def data_type(precision: str) -> Any:
     Raises:
         InputError: another name, or f64 while JAX computes in 32 bits.
     """
-    kinds = {"f32": jnp.float32, "f64": jnp.float64}
-    if precision not in kinds:
-        raise InputError(f"precision is '{precision}'; expected f32 or f64")
+    require_precision(precision)
     if precision == "f64":
         require_double_precision("f64")
-    return kinds[precision]
+    return KINDS[precision]
+
+
+def require_precision(precision: Any) -> None:
+    """Raises `InputError` unless the name is f32 or f64."""
+    if precision not in tuple(KINDS):
+        raise InputError(f"precision is {precision!r:.40}; expected f32 or f64")
 
 
 def require_double_precision(what: str) -> None:

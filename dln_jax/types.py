@@ -16,9 +16,11 @@
 Equation of motion: `tau = M(q) qdd + c(q, qd) + g(q)`, plus `dD/dqd` where there is friction.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+import reprlib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -58,17 +60,18 @@ def require_positive(**numbers: int | float) -> None:
             raise InputError(f"{name} is {value}; expected a positive number")
 
 
-MOST_LAYERS = 100
-"""Hidden layers of a network: more take hours to compile, and learn nothing."""
-
-
-def require_network(*, width: int, depth: int) -> None:
-    """Raises `InputError` unless width and depth are positive whole numbers, and the layers at most `MOST_LAYERS`."""
-    for name, value in (("width", width), ("depth", depth)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise InputError(f"{name} is {value!r:.40}; expected a positive whole number")
-    if depth > MOST_LAYERS:
-        raise InputError(f"depth is {depth}; expected at most {MOST_LAYERS} hidden layers")
+def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The value as float64 of this shape; `InputError` says whether type, shape or a number is at fault."""
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {reprlib.repr(value)}; expected real numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}; expected {shape}")
+    if len(wrong := np.argwhere(~np.isfinite(array))):
+        place = tuple(map(int, wrong[0]))
+        raise InputError(f"{name} has {array[place]} at {place}; expected finite numbers")
+    return array
 
 
 LARGEST_SEED = 2**32 - 1
@@ -82,11 +85,8 @@ def require_seed(seed: int, seeds: int = 1) -> None:
         raise InputError(f"seed is {seed}{counted}; expected whole numbers from 0 to {LARGEST_SEED}")
 
 
-class Needs(NamedTuple):
-    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
-
-    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON.
-    """
+class _Needs(NamedTuple):
+    """The fields of `Needs`."""
 
     joints: tuple[JointKind, ...]
     """Kind of each joint: a revolute angle enters a model as cos and sin, a prismatic displacement as it is."""
@@ -104,7 +104,41 @@ class Needs(NamedTuple):
     velocity_scale: float = 0.01
     """v of the joints' dry friction, which is smooth below, in rad/s or m/s."""
 
+
+class Needs(_Needs):
+    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
+
+    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. InputError for
+    unknown kinds of joints or laws of friction, and for values of another type.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *given: Any, **named: Any) -> "Needs":
+        """Checks the fields."""
+        fields = super().__new__(cls, *given, **named)
+        named_joints = _names_of("joints", fields.joints, get_args(JointKind))
+        if not named_joints:
+            raise InputError("joints are empty; expected at least one")
+        laws = _names_of("joint_friction", fields.joint_friction, get_args(FrictionLaw))
+        for name in ("gravity", "friction"):
+            if not isinstance(getattr(fields, name), bool):
+                raise InputError(f"{name} is {reprlib.repr(getattr(fields, name))}; expected True or False")
+        others = {name: getattr(fields, name) for name in fields._fields}
+        return super().__new__(cls, **{**others, "joints": named_joints, "joint_friction": laws})
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> "Needs":  # type: ignore[override]  # so that `_replace` checks too
+        return cls(*iterable)
+
     @property
     def degrees_of_freedom(self) -> int:
         """d."""
         return len(self.joints)
+
+
+def _names_of(field: str, given: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
+    """Names as a tuple; `InputError` for others than those known."""
+    if not isinstance(given, list | tuple) or not all(isinstance(each, str) and each in known for each in given):
+        raise InputError(f"{field}: {reprlib.repr(given)}; expected a tuple of {', '.join(known)}")
+    return tuple(given)

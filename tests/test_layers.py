@@ -10,6 +10,7 @@ FLOORS = {
     "types": -3,  # symbols: everyone may read them
     "interrupts": -3,
     "files": -2,
+    "sizes": -2,
     "precision": -2,
     "compilation": -2,
     "scale": 0,  # devices and processes

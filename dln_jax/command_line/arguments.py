@@ -6,13 +6,14 @@ import inspect
 import io
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args
 
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from dln_jax.sizes import require_magnitude
 from dln_jax.types import InputError, require_positive
 
 T = TypeVar("T")
@@ -20,6 +21,13 @@ Arguments = TypeVar("Arguments")
 
 Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
 """An option that is `None` where it is not given; its own text says what then holds."""
+
+UNREADABLE = {
+    r"Error parsing (--\S+): invalid literal for int\(\) with base 10: (.*)": "a whole number",
+    r"Error parsing (--\S+): Exceeds the limit \(\d+ digits\)()[^']*": "a whole number of fewer than 4,300 digits",
+    r"Error parsing (--\S+): could not convert string to float: (.*)": "a number",
+}
+"""What Python says of text that is no number, as the option and the text; and what was expected."""
 
 _rules = ConstructorRegistry()
 
@@ -115,16 +123,34 @@ def _complaint(box: str) -> str:
     lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
     sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
     section = sections[0] if framed else sections[min(1, len(sections) - 1)]
-    return " ".join(section.split()).rstrip(".")
+    said = " ".join(section.split()).rstrip(".")
+    for pattern, wanted in UNREADABLE.items():
+        if found := re.fullmatch(pattern, said):
+            return f"{found[1]} must be {wanted}" + (f"; got {found[2]:.60}" if found[2] else "")
+    return said
 
 
-def positive_numbers(option: str, text: str) -> tuple[float, ...]:
-    """The numbers of an option that takes several, separated by commas; `InputError` unless positive and finite."""
+def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive: bool = False) -> tuple[float, ...]:
+    """The numbers of an option that takes several, separated by commas.
+
+    Args:
+        option: such as --noise.
+        text: as it was typed.
+        counts: how many there may be (default: any).
+        positive: whether they must be.
+
+    Raises:
+        InputError: another number of them, or what is no number, or none of a possible size.
+    """
     try:
         numbers = tuple(float(each) for each in text.split(","))
     except ValueError:
-        raise InputError(f"{option} is {text!r:.60}; expected numbers, separated by commas") from None
+        numbers = ()
+    right = numbers and (not counts or len(numbers) in counts) and all(map(math.isfinite, numbers))
+    if not right or (positive and min(numbers) <= 0):
+        many = " or ".join(map(str, sorted(set(counts)))) or "finite"
+        kind = "positive numbers" if positive else "numbers"
+        raise InputError(f"{option} is {text!r:.60}; expected {many} {kind}, separated by commas")
     for number in numbers:
-        if not 0 < number < math.inf:
-            raise InputError(f"{option} has {number}; expected positive, finite numbers")
+        require_magnitude(option, number)
     return numbers

@@ -2,11 +2,12 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import math
 import os
 import reprlib
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
@@ -17,20 +18,25 @@ from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
 from dln_jax.data.schema import needs_from_text
-from dln_jax.files import is_file, matches, read_json, write_json
+from dln_jax.files import in_words, is_file, matches, read_json, write_json
 from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits
 from dln_jax.scenes.registry import SCENES
-from dln_jax.types import InputError, Needs
+from dln_jax.sizes import require_magnitude, require_within
+from dln_jax.types import InputError, Needs, require_seed
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 CHOSEN = "chosen"
 """Key in a run's config.json of what its arguments came to, beside these."""
+FILES = "files"
+"""Key of the SHA-256 of the files that are arguments, by their names."""
 SCALE = ("devices", "processes", "coordinator", "process_id")
 """Arguments that say where a result is computed."""
 PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
 """Arguments that do not decide the result."""
+MOST_CHARACTERS = 400
+"""Of each end of a message, of which the middle is left out if it is longer."""
 CHANGEABLE = ("seconds",)
 """Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""
 
@@ -55,12 +61,15 @@ def run(
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
-    with in_words(prog, None):
+    with as_one_line(prog, None):
         description = sys.modules[main.__module__].__doc__
         refuse_moved(arguments)
-        whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
+        try:
+            whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
+        finally:
+            sys.stdout.flush()  # the help, perhaps to somebody who has gone
         given = whole.own
-        require_storable(given)
+        require_possible(given)
         place = place_in(given)
         if getattr(given, "resume", False):
             given = with_stored_arguments(given)
@@ -68,7 +77,7 @@ def run(
         unkept = compilation_cache.keep(whole.compilation_cache) if from_shell else ""
 
     def work(given: Arguments) -> None:
-        with in_words(prog, given):
+        with as_one_line(prog, given):
             main(given)
             if before and (line := compilation_cache.summary(before, unkept)):
                 print(line)
@@ -77,33 +86,56 @@ def run(
     if place is None:
         work(given)
         return
-    with in_words(prog, given):
+    with as_one_line(prog, given):
         raise SystemExit(in_processes(work, given, place, limits))
 
 
 @contextlib.contextmanager
-def in_words(prog: str, given: Any) -> Iterator[None]:
-    """Turns a user's mistake into one line and exit status 2, a refused fit into 1, and an interrupt into 130."""
+def as_one_line(prog: str, given: Any) -> Iterator[None]:
+    """Turns mistakes and what the machine lacks into one line and status 2, a refused fit into 1, interrupts into 130."""
     try:
         yield
     except FitRefused as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except (RuntimeError, AssertionError):
+        raise _refusal(str(error)) from None
+    except MemoryError as error:
+        raise _refusal(f"out of memory ({error or 'no more can be had'}); ask for less") from None
+    except (RuntimeError, AssertionError) as error:
+        if "RESOURCE_EXHAUSTED" in str(error):
+            raise _refusal(f"out of memory ({str(error).splitlines()[0]:.200}); ask for less") from None
         if (line := unusable_platform()) is None:
             raise
-        print(f"error: {line}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except BrokenPipeError:
-        # Whoever read the output has gone; the interpreter must not try to flush it once more.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise _refusal(line) from None
+    except BrokenPipeError:  # whoever read the output has gone
+        _say("")
         raise SystemExit(141) from None
+    except OSError as error:  # a disk that is full, or a file that is there no more
+        where = "" if error.filename is None else f"{error.filename}: "
+        raise _refusal(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt as stop:
-        print(interrupted(prog, given, *stop.args), file=sys.stderr)
+        _say(interrupted(prog, given, *stop.args))
         raise SystemExit(130) from None
+
+
+def _refusal(message: str) -> SystemExit:
+    """Prints a message as one line, and gives the exit of a user's mistake."""
+    shown = "".join(each if each.isprintable() else repr(each)[1:-1] for each in message)
+    if len(shown) > 2 * MOST_CHARACTERS:
+        shown = f"{shown[:MOST_CHARACTERS]} ... {shown[-MOST_CHARACTERS:]}"
+    _say(f"error: {shown}")
+    return SystemExit(2)
+
+
+def _say(last: str) -> None:
+    """Says a command's last word, and keeps the interpreter from complaining that it cannot write as it ends."""
+    for stream, text in ((sys.stdout, ""), (sys.stderr, last)):
+        try:
+            print(text, end="\n" if text else "", file=stream, flush=True)
+        except OSError:
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def with_compilation_cache(arguments: type) -> Any:
@@ -139,11 +171,18 @@ def refuse_moved(arguments: type) -> None:
             raise InputError(f"{option} is a command of its own now: {where}")
 
 
-def require_storable(given: Any) -> None:
-    """Raises `InputError` for a number that is not finite: a run's config.json could not hold it."""
+def require_possible(given: Any) -> None:
+    """Raises `InputError` for a number that is not finite, or so large that it must be a mistake."""
     for name, value in dataclasses.asdict(given).items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise InputError(f"--{name.replace('_', '-')} is {value}; expected a finite number, or leave it out")
+        option = f"--{name.replace('_', '-')}"
+        if isinstance(value, float):
+            if not math.isfinite(value):
+                raise InputError(f"{option} is {value}; expected a finite number, or leave it out")
+            require_magnitude(option, value)
+        elif isinstance(value, int) and name == "seed":
+            require_seed(value)
+        elif isinstance(value, int):
+            require_within({option: value})
 
 
 def needs_from_option(text: str) -> Needs:
@@ -158,7 +197,12 @@ def needs_from_option(text: str) -> Needs:
 def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
     """Yields the run folder of a command, with its arguments in config.json, and beside them what they came to."""
     resume = getattr(given, "resume", False)
-    folder_of_run = run_folder(given.out, command, resume=resume) if is_first(given) else copied_folder(given, resume)
+    resumable = hasattr(given, "resume") and getattr(given, "continues", True)
+    folder_of_run = (
+        run_folder(given.out, command, resume=resume, resumable=resumable)
+        if is_first(given)
+        else copied_folder(given, resume)
+    )
     with folder_of_run as folder:
         if resume:
             wait_for_all(given)
@@ -168,7 +212,9 @@ def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
 
 def write_config(folder: Path, given: Any, **chosen: Any) -> None:
     """Writes the arguments of a run into its folder, and what they came to."""
-    write_json(folder / CONFIG, {**stored_arguments(given), **({CHOSEN: chosen} if chosen else {})})
+    files = fingerprints(stored_files(given))
+    more = {CHOSEN: chosen} if chosen else {}
+    write_json(folder / CONFIG, {**stored_arguments(given), **more, **({FILES: files} if files else {})})
 
 
 def stored_arguments(given: Any) -> dict[str, Any]:
@@ -177,11 +223,28 @@ def stored_arguments(given: Any) -> dict[str, Any]:
     return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
 
 
+def stored_files(given: Any) -> dict[str, Path]:
+    """The files that decide the result, by the names of their arguments."""
+    values = dataclasses.asdict(given)
+    return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
+
+
+def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
+    """SHA-256 of each file, by which a resumed run knows it wherever it is."""
+    found = {}
+    for name, path in files.items():
+        with path.open("rb") as file:
+            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found
+
+
 def with_stored_arguments(given: Arguments) -> Arguments:
     """The arguments that the run in --out was started with; what is given anew must not differ.
 
+    A file may have another path, if it is the same file.
+
     Raises:
-        InputError: --out holds no run, one of other arguments, or one whose config.json is damaged.
+        InputError: --out holds no run, one of other arguments or files, or one whose config.json is damaged.
     """
     folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
     if folder is None or not is_file(folder / CONFIG):
@@ -189,6 +252,20 @@ def with_stored_arguments(given: Arguments) -> Arguments:
     unset = stored_arguments(type(given)())
     stored = checked_arguments(folder / CONFIG, type(given), unset)
     changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
+    known = read_json(folder / CONFIG, remedy="restore it").get(FILES)
+    known = known if isinstance(known, dict) else {}
+    anew = stored_files(given)
+    for key, digest in known.items():
+        path = anew.get(key, Path(str(stored.get(key))))
+        option = f"--{key.replace('_', '-')}"
+        if not is_file(path):
+            raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
+        if fingerprints({key: path})[key] != digest:
+            raise InputError(
+                f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
+                f"started with by {option}"
+            )
+        stored[key] = str(path)
     for key, value in stored_arguments(given).items():
         if key not in changeable and value not in (stored[key], unset[key]):
             option = key.replace("_", "-")
@@ -209,7 +286,8 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     """
     remedy = "restore the file, or train again into another folder"
     stored = read_json(path, remedy=remedy)
-    stored.pop(CHOSEN, None)
+    for each in (CHOSEN, FILES):
+        stored.pop(each, None)
     if absent := [key for key in expected if key not in stored]:
         raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
     hints = get_type_hints(arguments)
@@ -221,6 +299,5 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
         if key not in expected:
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
         if not matches(value, hints[key]):
-            wanted = str(getattr(hints[key], "__name__", hints[key])).replace("typing.", "").replace("pathlib.", "")
-            raise InputError(f"{path}: {key} is {reprlib.repr(value)}, expected {wanted}; {remedy}")
+            raise InputError(f"{path}: {key} is {reprlib.repr(value)}; expected {in_words(hints[key])}; {remedy}")
     return stored

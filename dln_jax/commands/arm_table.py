@@ -18,6 +18,7 @@ from dln_jax.files import write_bytes, write_figure
 from dln_jax.studies.arm import table
 from dln_jax.studies.case import Case, measure, say_numbers
 from dln_jax.studies.report import conditions, publish
+from dln_jax.types import InputError
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,11 @@ class Arguments(Resumable):
 def main(given: Arguments) -> None:
     """Measures what has not been measured yet, prints and writes."""
     require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
+    for name in ("splits", "adam_steps", "timed_seeds"):
+        if getattr(given, name) < 0:
+            raise InputError(
+                f"--{name.replace('_', '-')} is {getattr(given, name)}; expected a whole number, 0 or more"
+            )
     sets, parts = table.data_sets(given.data, given.uniform, given.splits)
     counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
     cases = table.cases(sets, parts, **counts)

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice
+from dln_jax.command_line.arguments import Unstated, choice, numbers_of
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
@@ -32,6 +32,7 @@ from dln_jax.mechanics.trees import inertial_parameters, with_payload
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.runs.results import print_numbers
+from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive
 
 VALIDATION = "validation"
@@ -116,21 +117,27 @@ def main(given: Arguments) -> None:
 
 def prepare(given: Arguments) -> Prepared:
     """Reads the robot, and says what is assumed of it."""
+    if given.criterion not in CRITERIA:
+        raise InputError(f"--criterion is '{given.criterion:.60}'; expected one of {', '.join(CRITERIA)}")
     require_sampling(period=given.seconds, harmonics=given.harmonics, rate=given.rate)
     robot = read_robot(given.robot)
     d = robot.tree.degrees_of_freedom
+    samples = given.seconds * given.rate * (given.trajectories + 1)
+    # Measured values, rates and torques, as they are written and drawn.
+    require_memory(f"{samples:.3g} samples (--seconds, --rate and --trajectories)", 100.0 * d * samples)
     if given.payload is not None:
         require_positive(payload=given.payload)
-        centre = _numbers("payload_position", given.payload_position, 3)
+        centre = numbers_of("--payload-position", given.payload_position, [3])
         carried = inertial_parameters(given.payload, centre, np.zeros((3, 3)))
         robot = robot._replace(tree=with_payload(robot.tree, d - 1, carried))
-    stated = {name: _numbers(name, getattr(given, name)) for name in ("position", "velocity", "acceleration")}
+    elif given.payload_position != Arguments.payload_position:
+        raise InputError("--payload-position is for a --payload, which is not given; add its mass, or leave it out")
+    names = ("position", "velocity", "acceleration", "torque")
+    texts = {name: text for name in names if (text := getattr(given, name)) is not None}
+    stated = {name: numbers_of(f"--{name}", text, [1, d], positive=True) for name, text in texts.items()}
     free = [name.strip() for name in (given.allow_unlimited or "").split(",")]
     limits, assumed = limits_of_robot(
-        robot,
-        **stated,
-        force=_numbers("torque", given.torque),
-        allow_unlimited=[name for name in free if name],
+        robot, force=stated.pop("torque", None), **stated, allow_unlimited=[name for name in free if name]
     )
     for line in assumed:
         print(f"warning: {line}")
@@ -146,23 +153,11 @@ def prepare(given: Arguments) -> Prepared:
         period=given.seconds,
         harmonics=given.harmonics,
         clearance=None if given.height is None else heights_above(robot.tree, given.height),
-        noise=_numbers("noise", given.noise),
+        noise=numbers_of("--noise", given.noise, [1, d], positive=True),
         seed=given.seed,
     )
     names = robot.tree.names or tuple(f"joint_{k}" for k in range(d))
     return Prepared(robot, names, limits, model, parameters, task)
-
-
-def _numbers(name: str, text: str | None, count: int | None = None) -> list[float] | None:
-    """Of a list with commas."""
-    try:
-        found = None if text is None else [float(word) for word in text.split(",")]
-    except ValueError:
-        found = []
-    if found is not None and (not found or not np.isfinite(found).all() or count not in (None, len(found))):
-        option = name.replace("_", "-")
-        raise InputError(f"--{option} is '{text:.60}'; expected {count or 'finite'} numbers with commas between them")
-    return found
 
 
 def labels(designs: list[Design]) -> list[str]:

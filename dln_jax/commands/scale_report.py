@@ -66,7 +66,7 @@ def lanes_in(text: str | None) -> tuple[int, ...] | None:
     """The numbers of --lanes; `InputError` for what are none."""
     if text is None:
         return None
-    numbers = tuple(int(each) if each.strip().isdecimal() else 0 for each in text.split(","))
+    numbers = tuple(int(each) if each.strip().isdecimal() and len(each) < 10 else 0 for each in text.split(","))
     if 0 in numbers:
         raise InputError(f"--lanes is {text!r:.60}; expected positive whole numbers, separated by commas")
     return numbers

@@ -33,6 +33,7 @@ from dln_jax.precision import data_type
 from dln_jax.rollout import rollout
 from dln_jax.runs.results import print_numbers
 from dln_jax.runs.simulation_results import Motion, draw, line, results, warn
+from dln_jax.sizes import require_memory, require_within
 from dln_jax.softbody.driven import Example, drive, driven_step
 from dln_jax.softbody.examples import EXAMPLES
 from dln_jax.softbody.mesh.mesh import components, overlaps
@@ -126,8 +127,12 @@ def prepare(given: Arguments) -> Prepared:
     require_positive(dt=dt, seconds=seconds)
     if not dt <= seconds < math.inf:
         raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
+    steps = round(seconds / dt)
+    require_within({"steps (--seconds / --dt)": steps})
+    # Positions and velocities of every step, twice: they are joined from chunks.
+    require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
     stepper = driven_step(example, dt, INTEGRATORS[given.integrator])
-    return Prepared(given, example, stepper, dt, round(seconds / dt))
+    return Prepared(given, example, stepper, dt, steps)
 
 
 def simulate(prepared: Prepared, folder: Path) -> Moments:

@@ -16,7 +16,7 @@ from dln_jax.command_line.arguments import Unstated, require_positive_if_given
 from dln_jax.command_line.options import Resumable
 from dln_jax.command_line.running import command_folder
 from dln_jax.commands import command_names
-from dln_jax.sweeps.grid import fixed_of, grid_of
+from dln_jax.sweeps.grid import fixed_of, grid_of, pairs
 from dln_jax.sweeps.plan import closest, plan
 from dln_jax.sweeps.sweep import Asked, sweep
 from dln_jax.types import InputError
@@ -70,6 +70,10 @@ def main(given: Arguments) -> None:
         error=given.error,
         over=over_of(given.over, grid),
     )
+    if given.slurm is not None and asked.where not in ("slurm", "later"):
+        raise InputError(f"--slurm is for --where slurm; leave it out of --where {asked.where}")
+    if given.slurm is not None:
+        pairs("--slurm", given.slurm)
     name = given.command.replace("-", "_")
     arguments = arguments_of(name)
     plan(name, arguments, grid, fixed, Path())  # refused before there is a folder

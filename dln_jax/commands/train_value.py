@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from jax.sharding import Mesh
 
-from dln_jax.command_line.arguments import Unstated, choice, require_positive_if_given
+from dln_jax.command_line.arguments import Unstated, choice, numbers_of, require_positive_if_given
 from dln_jax.command_line.options import Folder, Scaled
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
@@ -40,7 +40,7 @@ from dln_jax.runs.values import (
     usual,
 )
 from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import require_positive, require_seed
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,4 @@ def posture(text: str | None) -> tuple[float, ...] | None:
     """The coordinates of --goal; `InputError` for what are no numbers."""
     if text is None:
         return None
-    try:
-        goal = tuple(float(each) for each in text.split(","))
-    except ValueError:
-        raise InputError(f"--goal is {text!r:.60}; expected numbers, separated by commas") from None
-    if not np.isfinite(goal).all():
-        raise InputError(f"--goal is {text!r:.60}; expected finite numbers")
-    return goal
+    return numbers_of("--goal", text)

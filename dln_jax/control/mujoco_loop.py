@@ -10,6 +10,7 @@ from jax import Array
 
 from dln_jax.control.closed_loop import Controller, Laboratory, Run, delivered, measured, noise_of
 from dln_jax.control.finite import where_finite
+from dln_jax.data.robots import quiet
 from dln_jax.types import InputError, require_positive
 
 INSTALL = "pip install 'dln-jax[robot]'"
@@ -80,7 +81,8 @@ def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: in
     # MuJoCo replaces what is not finite, and begins anew where it diverges: both would hide a failure.
     if np.isfinite(control).all() and np.isfinite(data.qpos).all():
         data.ctrl[:] = control
-        mujoco.mj_step(model, data, steps)
+        with quiet(mujoco):
+            mujoco.mj_step(model, data, steps)
     else:
         data.qpos[:] = np.nan
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -98,6 +100,7 @@ def _compiled(model: Any) -> tuple[Any, Any]:
     if not isinstance(model, str):
         return mujoco, model
     try:
-        return mujoco, mujoco.MjModel.from_xml_string(model)
-    except ValueError as error:
+        with quiet(mujoco):
+            return mujoco, mujoco.MjModel.from_xml_string(model)
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise InputError(f"MuJoCo refuses the model: {str(error).splitlines()[0]}") from None

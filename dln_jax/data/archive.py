@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dln_jax.files import is_file
+from dln_jax.sizes import LARGEST, SMALLEST
 from dln_jax.types import InputError
 
 Data = TypeVar("Data")
@@ -86,7 +87,12 @@ def _array(file: Any, size: int, room: int) -> np.ndarray:
 
 
 def numeric(
-    arrays: dict[str, Any], key: str, shape: tuple[int, ...] | None = None, *, to_match: str = "q"
+    arrays: dict[str, Any],
+    key: str,
+    shape: tuple[int, ...] | None = None,
+    *,
+    to_match: str = "q",
+    most: float = LARGEST,
 ) -> np.ndarray:
     """The array of that key as float64, which must hold finite real numbers.
 
@@ -110,5 +116,12 @@ def numeric(
         count = int((~finite).sum())
         raise InputError(
             f"{key} has {count} NaN or infinite value(s), the first at sample {first}; remove or repair them"
+        )
+    largest = float(np.abs(array).max(initial=0.0))
+    if largest != 0 and not SMALLEST <= largest <= most:
+        squares = "overflow" if largest > most else "vanish"
+        raise InputError(
+            f"{key} has numbers of up to {largest:.1e}, whose squares {squares}; remove the samples if they mark "
+            "missing values, else give it in SI units"
         )
     return array

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from dln_jax.data.robots import joint_names, opened, parsed
+from dln_jax.data.urdf import MOVING
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree
 from dln_jax.mechanics.trees.inertia import moved, parts, pseudo_inertia
 from dln_jax.types import InputError
 
 LUMPS = "Inertias are of all that moves with a joint: in the link behind it, none in links that are fixed to that."
-MOVING = ("revolute", "continuous", "prismatic")
 
 
 def write_robot(

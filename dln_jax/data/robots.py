@@ -3,11 +3,12 @@
 What is seen or collides is not read: meshes need not be there, unless a body's mass comes from its shapes alone.
 """
 
+import contextlib
 import fnmatch
 import functools
 import importlib
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.joint_limits import check_limits, velocity_limits
-from dln_jax.data.urdf import link_inertias, without_inertias
+from dln_jax.data.urdf import link_inertias, require_joints, without_inertias
+from dln_jax.files import is_file
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
@@ -23,7 +25,14 @@ from dln_jax.types import InputError
 INSTALL = "pip install 'dln-jax[robot]'"
 LARGEST = 64 * 2**20
 """Bytes of a file."""
+LARGEST_NUMBER = 1e20
+"""In SI units."""
 MOST_JOINTS = 200
+MOST_ELEMENTS = 20_000
+DEEPEST = 3 * MOST_JOINTS
+"""Elements within each other: an MJCF file nests a body, perhaps in a frame, for each joint."""
+REPEATING = ("replicate", "composite", "flexcomp")
+"""Elements of MJCF that stand for many."""
 
 
 class Robot(NamedTuple):
@@ -40,6 +49,34 @@ class Robot(NamedTuple):
     """N m or N, of the motors."""
     velocity_limits: Any = np.inf
     """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
+
+
+class _Elements(ET.TreeBuilder):
+    """Builds elements, and refuses more of them than any robot has, which MuJoCo would compile for minutes."""
+
+    depth = count = 0
+
+    def start(self, tag: Any, attrs: Any, /) -> ET.Element:
+        self.depth, self.count = self.depth + 1, self.count + 1
+        if self.depth > DEEPEST:
+            raise InputError(f"its elements are nested more than {DEEPEST} deep; expected the file of a robot")
+        if self.count > MOST_ELEMENTS:
+            raise InputError(f"it has more than {MOST_ELEMENTS:,} elements; expected the file of one robot")
+        if tag in REPEATING and _whole(attrs.get("count", "0")) > MOST_JOINTS:
+            raise InputError(f"<{tag}> repeats {attrs['count']:.20} times; expected at most {MOST_JOINTS}")
+        return super().start(tag, attrs)
+
+    def end(self, tag: Any, /) -> ET.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def _whole(text: str) -> float:
+    """The largest of the whole numbers in an attribute, infinite where they are none."""
+    try:
+        return max(map(float, text.split()), default=0.0)
+    except ValueError:
+        return np.inf
 
 
 class _Link(NamedTuple):
@@ -71,6 +108,7 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
         velocities = functools.partial(velocity_limits, root)
         mujoco, model, held = opened(path, root, hold)
         robot = _robot(mujoco, model, held, stated)
+        _require_numbers(robot)
         return robot._replace(velocity_limits=velocities(robot.tree.names)) if root.tag == "robot" else robot
     except InputError as error:
         raise InputError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
@@ -112,15 +150,25 @@ def _matching(hold: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
 
 def parsed(path: Path) -> ET.Element:
     """The outer element of a URDF or MJCF file, comments included; errors as `read_robot`."""
-    if not path.is_file() or path.stat().st_size > LARGEST:
-        raise InputError(f"{path}: no file of up to {LARGEST >> 20} MiB; give one of a robot, URDF or MJCF")
-    content = path.read_bytes()
-    if b"<!ENTITY" in content:
+    if not is_file(path):
+        raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
+    try:
+        size = path.stat().st_size
+        if size > LARGEST:
+            raise InputError(
+                f"{path} has {size >> 20} MiB; expected a URDF or MJCF file of at most {LARGEST >> 20} MiB"
+            )
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file that you may read") from None
+    if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
         raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
     try:
-        root = ET.fromstring(content, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    except ET.ParseError as error:
-        raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file") from None
+        root = ET.fromstring(content, ET.XMLParser(target=_Elements(insert_comments=True)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (ET.ParseError, LookupError, ValueError) as error:  # the last two of encodings that Python does not know
+        raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
     return root
@@ -131,13 +179,27 @@ def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any,
         mujoco: Any = importlib.import_module("mujoco")
     except ImportError:
         raise InputError(f"MuJoCo reads robots and is missing; {INSTALL}") from None
+    if root.tag == "robot":
+        require_joints(root, held, MOST_JOINTS)
     try:
-        return mujoco, _model(mujoco, path, root, held)
+        with quiet(mujoco):
+            return mujoco, _model(mujoco, path, root, held)
     except InputError:
         raise
-    except ValueError as error:
+    except (ValueError, RuntimeError, RecursionError, mujoco.FatalError, mujoco.UnexpectedError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: MuJoCo cannot compile it: {reason:.300}") from None
+
+
+@contextlib.contextmanager
+def quiet(mujoco: Any) -> Iterator[None]:
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder; its data still count the warnings."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> Any:
@@ -216,6 +278,20 @@ def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[s
     ranges = np.where(np.asarray(model.jnt_limited, bool)[moving, None], model.jnt_range[moving], inside)
     forces = np.where(np.asarray(model.jnt_actfrclimited, bool)[moving, None], model.jnt_actfrcrange[moving], inside)
     return Robot(tree, model.dof_damping[dofs], model.dof_frictionloss[dofs], ranges, forces)
+
+
+def _require_numbers(robot: Robot) -> None:
+    """Raises `InputError` for numbers that no robot has."""
+    tree = robot.tree
+    frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
+    losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": tree.armature}
+    for what, stated in {**frames, "gravity": [tree.gravity] * tree.degrees_of_freedom, **losses}.items():
+        numbers = np.asarray(stated, float).reshape(tree.degrees_of_freedom, -1)
+        right = (np.abs(numbers) <= LARGEST_NUMBER) & ((numbers >= 0) | (what not in losses))
+        for joint in np.flatnonzero(~right.all(axis=1))[:1]:
+            wanted = "zero or more" if what in losses else f"numbers up to {LARGEST_NUMBER:.0e}"
+            found = ", ".join(f"{each:.3g}" for each in numbers[joint])
+            raise InputError(f"the {what} of joint '{tree.names[joint]}' is {found}; expected {wanted}")
 
 
 def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:

@@ -124,13 +124,15 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
     """Writes a file that `load` reads; keys that were estimated are left out, so that the file says only what is known.
 
     Raises:
-        InputError: the file exists and `overwrite` is false, or its folder does not exist.
+        InputError: the file exists and `overwrite` is false, its folder does not exist, or the data break the schema.
     """
     path = Path(path)
     if path.suffix != ".npz":
         raise InputError(f"{path}: trajectories are stored as npz; let the name end in .npz")
-    if is_file(path) and not overwrite:
+    if (path.exists() or path.is_symlink()) and not (overwrite and is_file(path)):
         raise InputError(f"{path} exists; choose another name or ask to overwrite it")
+    if not isinstance(data, Trajectories):
+        raise InputError(f"data is a {type(data).__name__}; expected Trajectories, such as `load_trajectories` gives")
     arrays = {
         key: value
         for key, value in data._asdict().items()
@@ -138,8 +140,13 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
     }
     if data.needs is not None:
         arrays["needs"] = np.array(json.dumps(data.needs._asdict()))
+    try:
+        from_arrays(arrays)
+    except InputError as error:
+        raise InputError(f"{path} is not written: {error}") from None
+    whole: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items()}
     with writing(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **whole)
 
 
 def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
@@ -214,7 +221,7 @@ def _joint_names(given: Any, d: int) -> np.ndarray:
 
 
 def _trajectory_names(arrays: dict[str, Any], samples: int) -> tuple[np.ndarray, np.ndarray]:
-    trajectory = numeric(arrays, "trajectory", (samples,))
+    trajectory = numeric(arrays, "trajectory", (samples,), most=np.inf)
     if (trajectory != np.round(trajectory)).any() or trajectory.min() < 0 or trajectory.max() > LARGEST_INDEX:
         raise InputError("trajectory has entries that are no whole numbers >= 0; expected the index of each trajectory")
     trajectory = trajectory.astype(np.int64)

@@ -1,12 +1,17 @@
 """What a URDF file says of inertias, in the frames of its links, whether or not a body could have them."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Collection
 
 import numpy as np
 
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
+MOVING = ("revolute", "continuous", "prismatic")
+"""Types of joints that move."""
+NUMBERS = {"limit": ("lower", "upper", "effort", "velocity"), "dynamics": ("damping", "friction")}
+"""Attributes of a joint's elements that are numbers."""
 MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
 
 
@@ -29,6 +34,33 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
                     "moments, all finite numbers"
                 ) from None
     return found
+
+
+def require_joints(root: ET.Element, held: Collection[str], most: int) -> None:
+    """Raises `InputError` for joints that MuJoCo would make something else of, or for more than `most` that move."""
+    moving = [joint for joint in root.findall("joint") if joint.get("name", "") not in held]
+    moving = [joint for joint in moving if joint.get("type") != "fixed"]
+    if len(moving) > most:
+        raise InputError(f"it has {len(moving)} joints that move; expected 1 to {most}")
+    names = [joint.get("name", "") for joint in root.findall("joint")]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise InputError(f"two joints are named '{twice[0]:.60}'; give each a name of its own")
+    for joint in moving:
+        if joint.get("type") not in MOVING:
+            raise InputError(
+                f"joint '{joint.get('name')}' is of type '{joint.get('type')}'; expected {', '.join(MOVING)} or fixed: "
+                "hold it, if so"
+            )
+        for tag, keys in NUMBERS.items():
+            element = joint.find(tag)
+            for key in keys:
+                text = "0" if element is None else element.get(key, "0")
+                try:
+                    float(text)
+                except ValueError:
+                    raise InputError(
+                        f"joint '{joint.get('name')}': the {key} in <{tag}> is '{text:.40}'; expected a number"
+                    ) from None
 
 
 def without_inertias(root: ET.Element) -> ET.Element:

@@ -15,6 +15,7 @@ from dln_jax.mechanics.integrators import adaptive_rollout, rollout, second_orde
 from dln_jax.precision import in_float64
 from dln_jax.scenes.scene import Scene, actuation_matrix, closed_form_forward_dynamics
 from dln_jax.scenes.two_link_arm import joint_angles, two_link_arm
+from dln_jax.sizes import require_memory
 from dln_jax.types import InputError, require_positive, require_seed
 
 
@@ -78,6 +79,7 @@ def uniform(
         "control_bound": control_bound,
     }
     require_positive(samples=samples, **bounds)
+    _require_room(samples, scene)
     _require_finite(**bounds)
     require_seed(seed)
     d = scene.needs.degrees_of_freedom
@@ -115,11 +117,17 @@ def free_swing(
     require_positive(trajectories=trajectories, steps=steps, dt=dt, tolerance=tolerance)
     _require_finite(dt=dt)
     require_seed(seed)
+    _require_room(trajectories * steps, scene)
     if starts is None:
         random = np.random.default_rng(seed)
         starts = random.uniform(-np.pi / 2, np.pi / 2, (trajectories, scene.needs.degrees_of_freedom))
     t = dt * np.arange(steps)
     return swings(scene, t, *rollouts(scene, starts, np.zeros_like(starts), t, tolerance=tolerance))
+
+
+def _require_room(samples: int, scene: Scene) -> None:
+    # Ten arrays of the schema, and as much again while they are computed.
+    require_memory(f"{samples:,} samples", 160.0 * samples * scene.needs.degrees_of_freedom)
 
 
 def swings(scene: Scene, t, q: Float[np.ndarray, "K T d"], qd: Float[np.ndarray, "K T d"]) -> Trajectories:

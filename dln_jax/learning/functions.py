@@ -31,7 +31,8 @@ from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, activation
 from dln_jax.nn.differential_mlp import Layers
 from dln_jax.precision import data_type
-from dln_jax.types import InputError, Scalar, require_network, require_positive, require_seed
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
 WIDTHS = (2, 4, 8, 16)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dln_jax.locomotion.task import SHORTEST, Task, beginning, observe
-from dln_jax.types import require_positive
+from dln_jax.sizes import require_network
 
 WIDTH = 32
 _CLOCK = 2
@@ -33,7 +33,7 @@ class Policy(NamedTuple):
 
 def make_policy(task: Task, *, width: int = WIDTH) -> Policy:
     """The policy of a task."""
-    require_positive(width=width)
+    require_network(width=width, depth=1)
 
     def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:
         body, clock = observation[:-_CLOCK], observation[-_CLOCK:]

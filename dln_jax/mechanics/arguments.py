@@ -4,12 +4,18 @@ This is for the edge, where functions are handed out; the mechanics behind it ch
 a compiled function pays nothing for it.
 """
 
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from dln_jax.types import InputError
+
+Answer = TypeVar("Answer")
 
 
 def vectors(size: int | None = None, /, **given: Any) -> tuple[Array, ...]:
@@ -31,6 +37,56 @@ def vectors(size: int | None = None, /, **given: Any) -> tuple[Array, ...]:
         expected = array.shape
     common = jnp.result_type(float, *arrays.values())
     return tuple(array.astype(common) for array in arrays.values())
+
+
+@dataclass(frozen=True, eq=False)
+class OfSize:
+    """A function of vectors [size], which refuses others."""
+
+    function: Callable[..., Any]
+    size: int
+
+    def __call__(self, *state: Array) -> Any:
+        """The function's value; `InputError` for vectors of another size."""
+        for each in state:
+            require_shape("a state of this model", each.shape, (self.size,))
+        return self.function(*state)
+
+
+def require_size_of(energy: Callable[..., Any], size: int) -> None:
+    """Raises `InputError` if an energy (q, x) reads beyond vectors [size], or x in part only: it is of another size."""
+    q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
+    wrong = f"the system takes no states of size {size}"
+    try:
+        jax.eval_shape(lambda: energy(q, x))
+    except IndexError as error:  # of NumPy's arrays, where JAX takes the last element
+        raise InputError(f"{wrong} ({error}); give vectors [d] of its own size") from error
+    except Exception:  # an energy need not take NumPy's arrays
+        return
+    with jax.ensure_compile_time_eval():
+        slope = np.asarray(jax.jit(jax.grad(energy, argnums=1))(jnp.asarray(q), jnp.asarray(x)))
+    if not slope.all():
+        unused = ", ".join(str(k) for k in np.flatnonzero(slope == 0))
+        raise InputError(f"{wrong}: its energy does not depend on the rate of coordinate {unused} (counted from 0)")
+
+
+def answer(function: Callable[..., Answer], *state: Array) -> Answer:
+    """What a system's function answers to vectors of one size.
+
+    Raises:
+        InputError: the system is of another size, as its own operations on arrays then say.
+    """
+    try:
+        return function(*state)
+    except InputError:
+        raise
+    except (TypeError, ValueError, IndexError) as error:
+        reason = str(error).splitlines()[0] if str(error) else ""
+        if not any(word in reason.lower() for word in ("shape", "dimension", "index")):
+            raise
+        raise InputError(
+            f"the system takes no states of size {state[0].shape[0]} ({reason[:200]}); give vectors [d] of its own size"
+        ) from error
 
 
 def require_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...] | None) -> None:

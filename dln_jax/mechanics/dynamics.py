@@ -1,13 +1,14 @@
 """What every mechanical system answers, whatever energy it comes from: under forces, and in a phase space."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from dln_jax.mechanics.arguments import vectors
+from dln_jax.mechanics.arguments import answer, vectors
 from dln_jax.types import Dissipation, Potential, Scalar, Vector, VectorLike
 
 
@@ -94,16 +95,16 @@ def make_dynamics(
     def mass_matrix_or_at_rest(q, qd=None):
         if qd is None:
             (q,) = vectors(d, q=q)
-            return mass_matrix(q, jnp.zeros_like(q))
-        return mass_matrix(*vectors(d, q=q, qd=qd))
+            return answer(mass_matrix, q, jnp.zeros_like(q))
+        return answer(mass_matrix, *vectors(d, q=q, qd=qd))
 
     def friction(q, qd):
         q, qd = vectors(d, q=q, qd=qd)
-        return jnp.zeros_like(qd) if dissipation is None else friction_force(dissipation, q, qd)
+        return jnp.zeros_like(qd) if dissipation is None else answer(partial(friction_force, dissipation), q, qd)
 
     return Dynamics(
         **make_plain_dynamics(inverse_dynamics, forward_dynamics, decompose, degrees_of_freedom=d)._asdict(),
-        energy=lambda q, qd: energy(*vectors(d, q=q, qd=qd)),
+        energy=lambda q, qd: answer(energy, *vectors(d, q=q, qd=qd)),
         mass_matrix=mass_matrix_or_at_rest,
         friction=friction,
     )
@@ -119,9 +120,9 @@ def make_plain_dynamics(
     """Dynamics without an energy; arguments as those of `make_dynamics`."""
     d = degrees_of_freedom
     return PlainDynamics(
-        lambda q, qd, qdd: inverse_dynamics(*vectors(d, q=q, qd=qd, qdd=qdd)),
-        lambda q, qd, tau: forward_dynamics(*vectors(d, q=q, qd=qd, tau=tau)),
-        lambda q, qd, qdd: decompose(*vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, qdd: answer(inverse_dynamics, *vectors(d, q=q, qd=qd, qdd=qdd)),
+        lambda q, qd, tau: answer(forward_dynamics, *vectors(d, q=q, qd=qd, tau=tau)),
+        lambda q, qd, qdd: answer(decompose, *vectors(d, q=q, qd=qd, qdd=qdd)),
     )
 
 

@@ -29,7 +29,7 @@ from dln_jax.mechanics import (
     plain,
     recursive,
 )
-from dln_jax.mechanics.arguments import vectors
+from dln_jax.mechanics.arguments import answer, vectors
 from dln_jax.mechanics.closed_form import ClosedForm
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow, friction_force
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
@@ -83,7 +83,8 @@ def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynami
     """
     make = _DYNAMICS.get(type(system))
     if make is None:
-        raise InputError(f"dynamics got a {type(system).__name__}; expected one of {_names(*_DYNAMICS)}")
+        hint = ": give model.energies(parameters)" if hasattr(system, "energies") else ""
+        raise InputError(f"dynamics got a {type(system).__name__}{hint}; expected one of {_names(*_DYNAMICS)}")
     return make(system, degrees_of_freedom=degrees_of_freedom)
 
 
@@ -100,8 +101,10 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
         rates, energy = system.rates, system.hamiltonian
-        checked_rates = PlainFlow(lambda q, p: rates(*vectors(d, q=q, p=p)))
-        return checked_rates if energy is None else Flow(*checked_rates, lambda q, p: energy(*vectors(d, q=q, p=p)))
+        checked_rates = PlainFlow(lambda q, p: answer(rates, *vectors(d, q=q, p=p)))
+        if energy is None:
+            return checked_rates
+        return Flow(*checked_rates, lambda q, p: answer(energy, *vectors(d, q=q, p=p)))
     if not isinstance(system, Energies):
         known = [*_DYNAMICS, PhaseRates]
         known.remove(InverseForward)
@@ -109,13 +112,12 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
     H = hamiltonian_of(system)
 
     def hamilton(q, p):
-        q, p = vectors(d, q=q, p=p)
         if isinstance(system, LoadedSystem):
             qd = hamiltonian.velocity(H, q, p)
             return hamiltonian.time_derivative(H, q, p, driving_force(system, q, qd, jnp.zeros_like(q)))
         return hamiltonian.time_derivative(H, q, p, jnp.zeros_like(q), dissipation=system.dissipation)
 
-    return Flow(hamilton, lambda q, p: H(*vectors(d, q=q, p=p)))
+    return Flow(lambda q, p: answer(hamilton, *vectors(d, q=q, p=p)), lambda q, p: answer(H, *vectors(d, q=q, p=p)))
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:

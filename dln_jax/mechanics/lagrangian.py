@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from dln_jax.mechanics.arguments import OfSize, require_size_of
 from dln_jax.mechanics.dynamics import Dynamics, decompose_by_differences, friction_force, make_dynamics
 from dln_jax.solvers.elimination import solve
 from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
@@ -58,8 +59,19 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
 
 
 def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
-    L, dissipation = system
+    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size.
+
+    Without it, states are refused for which L reads entries that they lack, or ignores rates that they have.
+    """
+    given, dissipation = system
+    right = set() if degrees_of_freedom is None else {degrees_of_freedom}
+
+    def L(q: Vector, qd: Vector) -> Scalar:
+        size = q.shape[0]
+        if size not in right and not isinstance(given, OfSize):
+            require_size_of(given, size)
+            right.add(size)
+        return given(q, qd)
 
     def with_friction(q: Vector, qd: Vector, qdd: Vector) -> Vector:
         tau = inverse_dynamics(L, q, qd, qdd)

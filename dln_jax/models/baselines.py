@@ -20,7 +20,9 @@ from dln_jax.mechanics.plain import InverseForward, PhaseRates
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, unsaturated
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import Needs, Vector, require_positive
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
+from dln_jax.types import Needs, Vector
 
 
 def make_feed_forward(
@@ -28,7 +30,7 @@ def make_feed_forward(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     rate_scale: Scale = 1.0,
     acceleration_scale: Scale = 1.0,
     tau_scale: Scale = 1.0,
@@ -42,7 +44,8 @@ def make_feed_forward(
         tau_scale: typical size of tau.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     accelerations = per_coordinate(needs, "acceleration_scale", acceleration_scale)
     forces = per_coordinate(needs, "tau_scale", tau_scale)
@@ -63,7 +66,7 @@ def make_phase_network(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: Scale = 1.0,
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
@@ -75,7 +78,8 @@ def make_phase_network(
         rate_scale: typical size of qd and pd.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     d = needs.degrees_of_freedom

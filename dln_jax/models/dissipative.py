@@ -13,6 +13,8 @@ from dln_jax.mechanics.equations import Canonical
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.networks import joint_features, perceptron
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
@@ -22,7 +24,7 @@ def make_dissipative(
     *,
     width: int = 8,
     depth: int = 1,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     initial_friction: float = 0.05,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
@@ -37,7 +39,9 @@ def make_dissipative(
     Raises:
         InputError: a width, depth or friction that is not positive.
     """
-    require_positive(width=width, depth=depth, initial_friction=initial_friction)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
+    require_positive(initial_friction=initial_friction)
     if not needs.friction:
         return model
     d = needs.degrees_of_freedom

@@ -24,6 +24,8 @@ from dln_jax.models.lagrangian import one_network, structured_networks
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
 from dln_jax.types import Needs, Scalar, Vector, require_positive
 
 
@@ -32,7 +34,7 @@ def make_structured_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     diagonal_shift: float = 0.0,
     diagonal_floor: float = 0.1,
     dtype: DTypeLike = jnp.float32,
@@ -44,7 +46,8 @@ def make_structured_hamiltonian(
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, factor="inverse_factor"
     )
@@ -56,7 +59,7 @@ def make_black_box_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: Scale = 1.0,
     iterations: int = 8,
     initial_guess: Guess | None = None,
@@ -74,7 +77,9 @@ def make_black_box_hamiltonian(
         initial_guess: (q, qd) -> p [d] where they start; zero by default.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(iterations=iterations, width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    require_positive(iterations=iterations)
+    activation = activation_of(activation)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
     terms = partial(one_network, needs, "hamiltonian", width, depth, activation, momenta)
     record = partial(HamiltonianSystem, iterations=iterations, initial_guess=initial_guess)
@@ -86,7 +91,7 @@ def make_separable_hamiltonian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: Scale = 1.0,
     iterations: int = 8,
     initial_guess: Guess | None = None,
@@ -102,7 +107,9 @@ def make_separable_hamiltonian(
         initial_guess: (q, qd) -> p [d] where they start; zero by default.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth, iterations=iterations)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
+    require_positive(iterations=iterations)
     momenta = per_coordinate(needs, "momentum_scale", momentum_scale)
 
     def kinetic(p: Vector) -> Scalar:

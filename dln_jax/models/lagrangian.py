@@ -27,7 +27,9 @@ from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate, perceptron, viscous_dissipation
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import Matrix, Needs, Scalar, Vector, require_positive
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
+from dln_jax.types import Matrix, Needs, Scalar, Vector
 
 
 def make_delan(
@@ -35,7 +37,7 @@ def make_delan(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     diagonal_shift: float = 2.0,
     diagonal_floor: float = 0.1,
     shared_trunk: bool = False,
@@ -50,7 +52,8 @@ def make_delan(
         shared_trunk: whether factor and potential are outputs of one network instead of two.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     terms = partial(
         structured_networks, needs, width, depth, activation, diagonal_shift, diagonal_floor, shared_trunk=shared_trunk
     )
@@ -62,7 +65,7 @@ def make_black_box_lagrangian(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
@@ -74,7 +77,8 @@ def make_black_box_lagrangian(
         rate_scale: typical size of qd, which enters the network divided by it.
         needs, width, depth, activation, dtype: as for all, in `models.model`.
     """
-    require_positive(width=width, depth=depth)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     rates = per_coordinate(needs, "rate_scale", rate_scale)
     terms = partial(one_network, needs, "lagrangian", width, depth, activation, rates)
     return model_of(LagrangianSystem, terms, needs.degrees_of_freedom, dtype)

@@ -36,6 +36,8 @@ from dln_jax.models.hamiltonian import make_black_box_hamiltonian
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.principal_components import Components
 from dln_jax.nn.activations import Activation, silu, tanh
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, require_positive
 
 NEEDS = Needs(joints=("prismatic",))
@@ -74,7 +76,7 @@ def latent_field(
     *,
     width: int = 64,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
@@ -123,7 +125,7 @@ def make_latent_phase(
     framewise: bool = False,
     scale: float = 0.2,
     width: int = 200,
-    activation: Activation = silu,
+    activation: Activation | str = silu,
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> LatentModel:
@@ -140,7 +142,9 @@ def make_latent_phase(
     Raises:
         InputError: a width or scale that is not positive, or no two frames.
     """
-    require_positive(scale=scale, width=width, momentum_scale=momentum_scale)
+    require_positive(scale=scale, momentum_scale=momentum_scale)
+    require_network(width=width, depth=2)
+    activation = activation_of(activation)
     n = len(mean)
     if n % 2 or n == 0:
         raise InputError(f"mean has {n} pixels; expected those of two frames")

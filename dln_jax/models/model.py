@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from dln_jax.mechanics.arguments import OfSize
+
 Parameters = Any
 """A pytree of arrays."""
 
@@ -58,6 +60,6 @@ def model_of(
     return Model(
         init=lambda key: networks.init(key, jnp.asarray(np.arange(d), dtype)),
         energies=lambda parameters: record(
-            **{name: partial(each, parameters) for name, each in networks.apply.items()}
+            **{name: OfSize(partial(each, parameters), d) for name, each in networks.apply.items()}
         ),
     )

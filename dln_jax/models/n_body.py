@@ -23,6 +23,8 @@ from dln_jax.mechanics.natural_hamiltonian import NaturalHamiltonian
 from dln_jax.models.model import Model, model_of
 from dln_jax.models.networks import perceptron
 from dln_jax.nn.activations import Activation, tanh
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
 FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
@@ -39,7 +41,7 @@ def make_pairwise_hamiltonian(
     distance_scale: float = 1.0,
     width: int = 32,
     depth: int = 2,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
     """The (init, energies) pair of bodies with learned masses and pair energies.
@@ -57,7 +59,9 @@ def make_pairwise_hamiltonian(
         InputError: fewer than two bodies, numbers that are not positive, an unknown order, or unknown, repeated or no
             features.
     """
-    require_positive(dimension=dimension, distance_scale=distance_scale, width=width, depth=depth)
+    require_positive(dimension=dimension, distance_scale=distance_scale)
+    require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     if bodies < 2:
         raise InputError(f"bodies is {bodies}; expected at least 2, since the energy is one of pairs")
     if order not in ("bodies", "axes"):

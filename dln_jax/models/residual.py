@@ -20,7 +20,9 @@ from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.models.model import Model, Parameters, model_of
 from dln_jax.models.networks import Scale, joint_features, per_coordinate
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector, require_network
+from dln_jax.nn.activations import activation as activation_of
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vector
 
 TERMS: tuple[ResidualTerm, ...] = get_args(ResidualTerm)
 START = 0.1
@@ -52,7 +54,7 @@ def make_residual(
     terms: tuple[ResidualTerm, ...] = ("potential", "dissipation"),
     width: int = 8,
     depth: int = 1,
-    activation: Activation = tanh,
+    activation: Activation | str = tanh,
     velocity_scale: Scale = 0.05,
     torque_scale: Scale = 1.0,
     rate_scale: Scale = 1.0,
@@ -71,6 +73,7 @@ def make_residual(
         InputError: no term, an unknown one, or a size that is not positive.
     """
     require_network(width=width, depth=depth)
+    activation = activation_of(activation)
     if not terms or set(terms) - set(TERMS) or len(set(terms)) < len(terms):
         raise InputError(f"terms are {list(terms)}; expected some of {', '.join(TERMS)}, each once")
     d = needs.degrees_of_freedom

@@ -11,13 +11,15 @@ one state.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.mechanics.arguments import vectors
+from dln_jax.mechanics.arguments import answer, vectors
 from dln_jax.models.linearisation import linearised
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import Vector
@@ -80,8 +82,10 @@ def predictive(
         inflation: of the parameters' share, [d].
     """
 
+    d = np.size(noise) if np.ndim(noise) else None
+
     def torque_std(q: Any, qd: Any, qdd: Any) -> Array:
-        rows, _ = linearised(model, parameters, *vectors(q=q, qd=qd, qdd=qdd))
+        rows, _ = answer(partial(linearised, model, parameters), *vectors(d, q=q, qd=qd, qdd=qdd))
         noises, inflations = (jnp.asarray(each, rows.dtype) for each in (noise, inflation))
         return jnp.sqrt(noises**2 + inflations * parameter_variance(rows, factor))
 
@@ -92,7 +96,7 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
     """(q, qd, qdd) -> how far outside the data a state is, in three ways, each 1 at its threshold."""
 
     def of_state(q: Any, qd: Any, qdd: Any) -> Scores:
-        state = vectors(q=q, qd=qd, qdd=qdd)
+        state = vectors(len(uncertainty.noise), q=q, qd=qd, qdd=qdd)
         rows, _ = linearised(model, parameters, *state)
         domain = uncertainty.domain
         limit, centre, reach = (jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach))

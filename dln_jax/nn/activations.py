@@ -11,6 +11,7 @@ work under jit, vmap, and forward and reverse differentiation.
 """
 
 import math
+import reprlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -134,11 +135,13 @@ ALL: dict[str, Activation] = {
 """Every activation by name."""
 
 
-def activation(name: str) -> Activation:
-    """The activation of that name, for names that come from a command line or a file.
+def activation(name: str | Activation) -> Activation:
+    """The activation of that name, for names that come from a command line or a file; or the activation itself.
 
     Raises InputError for an unknown name.
     """
-    if name not in ALL:
-        raise InputError(f"unknown activation {name!r}; choose one of {', '.join(ALL)}")
+    if isinstance(name, Activation):
+        return name
+    if not isinstance(name, str) or name not in ALL:
+        raise InputError(f"activation is {reprlib.repr(name)}; choose one of {', '.join(ALL)}")
     return ALL[name]

@@ -16,6 +16,7 @@ from dln_jax.models.rigid_tree import USUAL
 from dln_jax.runs.dynamics_data import Recorded
 from dln_jax.runs.dynamics_options import OF_ADAM, SAMPLES_OF_KERNEL, Options, check_options
 from dln_jax.scenes.scene import Scene
+from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
@@ -146,7 +147,7 @@ def model_and_optimiser(
     width = 64 if adam else 8 if properties.definite else 16
     keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
     keywords |= {} if suited is None else suited.keywords
-    require_positive(width=keywords["width"], depth=keywords["depth"])
+    require_network(width=keywords["width"], depth=keywords["depth"])
     description = describe_for(kind, sets.train, needs, precision=precision, **keywords)
     reason = "" if suited is None else suited.reason
     if optimizer == "auto":

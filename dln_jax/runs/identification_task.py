@@ -8,7 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.arguments import Unstated, choice, names_in, names_listed, require_positive_if_given
+from dln_jax.command_line.arguments import (
+    Unstated,
+    choice,
+    names_in,
+    names_listed,
+    numbers_of,
+    require_positive_if_given,
+)
 from dln_jax.command_line.encoders import Filtered, checked, fitted_torque, preparation, smoothed
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.data import schema
@@ -191,10 +198,4 @@ def noises(stated: str | None, d: int) -> np.ndarray | None:
     """Of --noise."""
     if stated is None:
         return None
-    try:
-        found = np.array([float(each) for each in stated.split(",")])
-    except ValueError:
-        found = np.zeros(0)
-    if found.shape != (d,) or not (found > 0).all() or not np.isfinite(found).all():
-        raise InputError(f"--noise is {stated!r:.60}; expected {d} positive numbers with commas between them")
-    return found
+    return np.array(numbers_of("--noise", stated, [d], positive=True))

@@ -14,7 +14,7 @@ import numpy as np
 from dln_jax.command_line.arguments import (
     Unstated,
     choice,
-    positive_numbers,
+    numbers_of,
     refuse_given,
     require_positive_if_given,
     resolved,
@@ -132,7 +132,8 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
         refuse_given(given, ["field"], "for helmholtz-hnn")
     if given.model not in ("auto", PAIRWISE):
         refuse_given(given, ["order"], "for pairwise-hnn")
-    stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
+    noise = None if given.noise is None else numbers_of("--noise", given.noise, positive=True)
+    stated = Stated(needs, given.test, noise)
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
     names = ("width", "depth", "activation", "degree", "coordinates", "order", "field")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}

@@ -21,6 +21,7 @@ from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.sizes import require_memory
 from dln_jax.studies.control.learned_swing_ups import MODELS, Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
@@ -58,6 +59,7 @@ def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int
             f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: two episodes, one of them "
             "to select by"
         )
+    require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
     episodes = max(2, round(seconds_of_data / EPISODE))
     return Asked(found, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed)
 

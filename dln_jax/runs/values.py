@@ -2,11 +2,12 @@
 
 import functools
 import itertools
+import reprlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
 from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.files import matches
 from dln_jax.nn.activations import activation
 from dln_jax.studies.control.values.evaluation import evaluate, starts
 from dln_jax.studies.control.values.fits import FITS, Fit
@@ -199,18 +201,34 @@ def load_value(folder: str | Path) -> ValueRun:
         InputError: there is none, or its files are damaged or of another release.
     """
     folder = Path(folder)
-    facts = load_manifest(folder, VALUE)
+    facts, path = load_manifest(folder, VALUE), folder / f"{VALUE}.json"
+    network, goal = facts.get("network"), facts.get("goal")
+    network = network if isinstance(network, dict) else {}
+    hints = {**get_type_hints(Family), "widths": tuple[int, ...]}
+    right = {
+        "plant": isinstance(facts.get("plant"), str),
+        "goal": goal is None or (isinstance(goal, list) and all(matches(each, float) for each in goal)),
+        "dtype": facts.get("dtype") in ("float32", "float64"),
+        "network": set(network) == set(hints) and all(_stated(network[name], hint) for name, hint in hints.items()),
+    }
+    if wrong := [name for name, each in right.items() if not each]:
+        raise InputError(f"{path}: {wrong[0]} is {reprlib.repr(facts.get(wrong[0]))}, which describes none; {REMEDY}")
     try:
-        plant = plant_named(facts["plant"], facts["goal"])
-        family = Family(**{**facts["network"], "widths": tuple(facts["network"]["widths"])})
-        network, dtype = family_of(plant, family), jnp.dtype(facts["dtype"])
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder}: {VALUE}.json does not say what its value function is ({error}); {REMEDY}"
-        ) from None
+        plant = plant_named(facts["plant"], goal)
+        network = family_of(plant, Family(**{**network, "widths": tuple(network["widths"])}))
+    except InputError as error:
+        raise InputError(f"{path}: {error}; {REMEDY}") from None
+    dtype = jnp.dtype(facts["dtype"])
 
     def parameters(key: Array) -> Any:
         return jax.tree.map(lambda leaf: leaf.astype(dtype), network.init(key))
 
     like = jax.eval_shape(parameters, jax.random.key(0))
     return ValueRun(facts["plant"], plant, network, load_tree(folder, VALUE, like))
+
+
+def _stated(value: Any, hint: Any) -> bool:
+    """Whether a JSON value is one of a field of `Family`."""
+    if get_origin(hint) is tuple:
+        return isinstance(value, list) and all(matches(each, int) for each in value)
+    return matches(value, hint)

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from dln_jax.types import InputError
 
+MOST_DIGITS = 18
+"""Of a number of Slurm's."""
 FIRST_PORT, PORTS = 61440, 4096
 """Above those that Linux gives to whoever asks for any."""
 OF_STEP = ("SLURM_STEP_NUM_TASKS", "SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_STEP_NODELIST", "SLURM_PROCID")
@@ -119,7 +121,7 @@ def _tasks_here(environ: Mapping[str, str]) -> int:
     """Of this host, from a text such as 4(x2),3."""
     counts: list[int] = []
     for part in environ.get("SLURM_STEP_TASKS_PER_NODE", "1").split(","):
-        if found := re.fullmatch(r"(\d+)(?:\(x(\d+)\))?", part):
+        if found := re.fullmatch(r"(\d{1,7})(?:\(x(\d{1,7})\))?", part):
             counts += [int(found[1])] * int(found[2] or 1)
     node = _count(environ, "SLURM_NODEID", "0")
     return counts[node] if node < len(counts) else 1
@@ -127,6 +129,6 @@ def _tasks_here(environ: Mapping[str, str]) -> int:
 
 def _count(environ: Mapping[str, str], name: str, default: str | None = None) -> int:
     text = environ.get(name, default)
-    if text is None or not text.isdecimal():
+    if text is None or not text.isdecimal() or len(text) > MOST_DIGITS:
         raise InputError(f"{name} is {text!r:.40}, expected a whole number; give --processes (1: alone) and the rest")
     return int(text)

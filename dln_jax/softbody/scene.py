@@ -3,6 +3,7 @@
 What a scene does not list is never traced. Everything in `Params` is differentiable and can be mapped over.
 """
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -119,9 +120,29 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
         if unknown := [field for field in values if field not in replaced[name]._fields]:
             fields = ", ".join(replaced[name]._fields)
             raise InputError(f"term '{name}' has no parameter '{unknown[0]}'; expected one of {fields}")
-        arrays = jax.tree.map(lambda value: jnp.asarray(value, params.rest.dtype), dict(values))
-        replaced[name] = replaced[name]._replace(**arrays)
+        replaced[name] = replaced[name]._replace(
+            **{
+                field: _like(name, field, value, getattr(replaced[name], field), params)
+                for field, value in values.items()
+            }
+        )
     return params._replace(terms=replaced)
+
+
+def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any:
+    """New values of a parameter, in the precision of the scene."""
+    if not isinstance(before, Array | np.ndarray | float | int):
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.rest.dtype), value)
+    what = f"term '{name}': {field}"
+    try:
+        array = jnp.asarray(value, params.rest.dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {reprlib.repr(value)}; expected numbers") from None
+    shape, elements = np.shape(before), np.shape(array)
+    # A number may become one for each element, and values for each become one for all; vectors keep their length.
+    if elements != shape and not (() in (shape, elements) and len(shape) + len(elements) == 1):
+        raise InputError(f"{what} has shape {elements}; expected {shape}")
+    return array
 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:

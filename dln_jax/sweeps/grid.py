@@ -10,6 +10,8 @@ from dln_jax.types import InputError
 
 RANGE = re.compile(r"(-?\d+):(-?\d+)(?::(-?\d+))?")
 MOST_JOBS = 10_000
+MOST_DIGITS = 60
+"""Of a range."""
 EXAMPLE = "expected for example 'width=8,16 seed=0:10'"
 
 
@@ -75,6 +77,8 @@ def _values(name: str, text: str) -> tuple[str, ...]:
 
 def _range(name: str, first: str, end: str, step: str | None) -> list[str]:
     text = ":".join(each for each in (first, end, step) if each is not None)
+    if len(text) > MOST_DIGITS:
+        raise InputError(f"--grid: {name} has a range of {len(text)} characters; expected smaller numbers")
     if step is not None and int(step) == 0:
         raise InputError(f"--grid: {name}={text} has step 0; expected another")
     numbers = range(int(first), int(end), int(step or 1))

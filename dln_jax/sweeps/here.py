@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -52,15 +53,19 @@ def here(at_once: int, gpus: int) -> Iterator[Engine]:
             return None
         if handle.gpu is not None:
             free.append(handle.gpu)
+        forget(handle.job)
         # What was killed says nothing; what did not start says why.
         return last_line(handle.job.paths.stderr)
 
     def stop(handles: Sequence[Started]) -> None:
         wait(handles)
+        for number in (signal.SIGINT, signal.SIGKILL):
+            for handle in handles:
+                if not handle.job.done():
+                    end_processes(handle.job, number)
+            wait(handles)
         for handle in handles:
-            if not handle.job.done():
-                handle.job.cancel()
-        wait(handles)
+            forget(handle.job)
 
     yield Engine(start, over, stop, at_once)
 
@@ -76,6 +81,30 @@ def errors_to(path: Path) -> Iterator[None]:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
+
+
+def end_processes(job: Any, number: signal.Signals) -> None:
+    """Sends a signal to a job's own process, or, if it may not refuse, to submitit's that looks after it too.
+
+    submitit's own way is an interrupt of the latter, which ignores it where this process was started in the background.
+    """
+    controller = int(job.job_id)
+    children = Path(f"/proc/{controller}/task/{controller}/children")
+    try:
+        started = [int(word) for word in children.read_text().split()]
+    except OSError:  # it has ended, or the system is not Linux
+        started = []
+    if not started or number == signal.SIGKILL:
+        job.cancel() if number == signal.SIGINT else started.append(controller)
+    for process in started:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, number)
+
+
+def forget(job: Any) -> None:
+    """Removes the pickles by which submitit hands a job over: what they say is in the job's own files."""
+    for path in (job.paths.submitted_pickle, job.paths.result_pickle):
+        path.unlink(missing_ok=True)
 
 
 def cores() -> int:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import reprlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
@@ -92,12 +93,32 @@ def write_jobs(jobs: Sequence[Job], command: str) -> None:
     for job in jobs:
         said = {"command": command, "arguments": list(job.arguments), "values": job.values, "resumes": job.resumes}
         if is_file(job.path):
-            stored = read_json(job.path, remedy="remove the folder of this job")
-            if stored.get("command") != command or stored.get("arguments") != said["arguments"]:
+            stored = read_job(job.path)
+            if any(stored[key] != said[key] for key in ("command", "arguments", "values")):
                 raise InputError(f"{job.path} is of another job; continue where the sweep was started, or remove it")
             continue
         job.folder.mkdir(parents=True, exist_ok=True)
         write_json(job.path, {**said, "folder": here})
+
+
+def read_job(path: Path) -> dict[str, Any]:
+    """What a job's file says.
+
+    Raises:
+        InputError: the file is missing or damaged, or names no command.
+    """
+    remedy = "remove the folder of this job, and --resume the sweep"
+    job = read_json(path, remedy=remedy)
+    kinds = {"command": str, "arguments": list, "values": dict, "resumes": bool, "folder": str}
+    for name, kind in kinds.items():
+        if type(job.get(name)) is not kind:
+            raise InputError(f"{path}: {name} is {reprlib.repr(job.get(name))}; expected a {kind.__name__}; {remedy}")
+    words = [*job["arguments"], *job["values"].values()]
+    if not all(isinstance(word, str) for word in words) or not job["command"].isidentifier():
+        raise InputError(f"{path}: command and arguments are not words; {remedy}")
+    if not Path(job["folder"]).is_dir():
+        raise InputError(f"{path}: the sweep was started in {job['folder']:.200}, which is gone; start it again")
+    return job
 
 
 def closest(word: str, known: Sequence[str]) -> str:
@@ -127,7 +148,9 @@ def _words(target: Target, where: str, name: str, texts: Sequence[str]) -> list[
         return [f"--{option}" if TRUTH[text.lower()] else f"--no-{option}" for text in texts]
     words = [f"--{option}={text}" for text in texts]
     # All whole numbers are of the type that one is of.
-    alike = (int in kinds or float in kinds) and all(text.removeprefix("-").isdigit() for text in texts)
+    alike = (int in kinds or float in kinds) and all(
+        text.removeprefix("-").isdecimal() and len(text) < 10 for text in texts
+    )
     for index in range(1 if alike else len(texts)):
         try:
             value = getattr(_parsed(target, [*_required(target, name), words[index]]), name)

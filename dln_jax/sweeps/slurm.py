@@ -11,6 +11,7 @@ from typing import Any
 from dln_jax.files import is_file, read_json, write_json
 from dln_jax.sweeps.engines import Engine, required
 from dln_jax.sweeps.grid import pairs
+from dln_jax.sweeps.here import forget
 from dln_jax.sweeps.plan import closest
 from dln_jax.sweeps.status import status_of
 from dln_jax.sweeps.work import Work
@@ -70,9 +71,10 @@ def parameters(options: str, known: Sequence[str]) -> dict[str, Any]:
     for name, text in found.items():
         if name not in known:
             raise InputError(f"--slurm has no {name}{closest(name, known)}; there are {', '.join(known)}")
-        if name == "time" and not text.isdigit():
+        number = text.isdecimal() and len(text) < 10
+        if name == "time" and not number:
             raise InputError(f"--slurm: time is {text!r:.40}; expected whole minutes")
-        found[name] = int(text) if text.isdigit() else [text] if name in ("setup", "teardown") else text
+        found[name] = int(text) if number else [text] if name in ("setup", "teardown") else text
     return found
 
 
@@ -89,6 +91,7 @@ def over(handle: tuple[Path, Any]) -> str | None:
     """Whether a job is; its own file says so at once, and Slurm is asked now and then."""
     path, job = handle
     if status_of(path.parent).state in ("done", "failed", "killed"):
+        forget(job)
         return ""
     return job.state if job.done() and job.state != "SUSPENDED" else None
 

@@ -1,14 +1,19 @@
 """What is known of a job: one small file in its folder, written by the job itself, and by the sweep if it could not."""
 
+import re
+import reprlib
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_type_hints
 
-from dln_jax.files import is_file, read_json, write_json
+from dln_jax.files import in_words, is_file, matches, read_json, write_json
+from dln_jax.types import InputError
 
 STATUS = "status.json"
 OUTPUT = "output.txt"
 """What the command printed, errors too."""
 
+RUN = re.compile(r"run(-\d{1,9})?")
+"""Names of the folders that a job gives to its runs."""
 State = Literal["missing", "running", "done", "failed", "killed"]
 
 
@@ -29,12 +34,24 @@ class Status(NamedTuple):
 
 
 def status_of(folder: Path) -> Status:
-    """The status in a job's folder; `InputError` if its file is damaged."""
-    path = folder / STATUS
+    """The status in a job's folder; a job whose run is gone is missing again.
+
+    Raises:
+        InputError: the file is damaged, or names a run that is not in the job's folder.
+    """
+    path, remedy = folder / STATUS, "remove it, and --resume does the job again"
     if not is_file(path):
         return Status()
-    stored: dict[str, Any] = read_json(path, remedy="remove it, and --resume does the job again")
-    return Status(**{name: stored[name] for name in Status._fields if name in stored})
+    stored: dict[str, Any] = read_json(path, remedy=remedy)
+    for name, hint in get_type_hints(Status).items():
+        if name in stored and not matches(stored[name], hint):
+            raise InputError(f"{path}: {name} is {reprlib.repr(stored[name])}; expected {in_words(hint)}; {remedy}")
+    status = Status(**{name: stored[name] for name in Status._fields if name in stored})
+    if status.attempt < 0 or (status.run and not RUN.fullmatch(status.run)) or (folder / status.run).is_symlink():
+        raise InputError(f"{path}: attempt {status.attempt}, run '{status.run:.60}' are not those of a job; {remedy}")
+    if status.state == "done" and not (status.run and any((folder / status.run).glob("*"))):
+        return Status(line="its run is gone", attempt=status.attempt)
+    return status
 
 
 def write_status(folder: Path, status: Status) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import runpy
+import signal
 import socket
 import sys
 import time
@@ -13,8 +14,11 @@ from typing import Any
 
 from filelock import FileLock
 
-from dln_jax.files import read_json
+from dln_jax.files import is_file
+from dln_jax.interrupts import terminate_as_interrupt
+from dln_jax.sweeps.plan import read_job
 from dln_jax.sweeps.status import OUTPUT, Status, end, status_of, write_status
+from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 REQUEUED = (-1, 144)
@@ -27,6 +31,8 @@ class Work:
 
     def __call__(self, path: str) -> None:
         """Does the job; raises `SystemExit` with the command's exit code unless that is 0."""
+        # A sweep that was started in the background has jobs that would ignore an interrupt.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         if code := perform(Path(path)):
             raise SystemExit(code)
 
@@ -44,8 +50,10 @@ def perform(path: Path) -> int:
     anew in another folder. Two processes never do one job at once: the second waits for the first.
     """
     folder = path.parent
+    if not is_file(path):
+        raise InputError(f"{path}: no such file; give the job.json of a sweep's job")
     with FileLock(folder / LOCK):
-        job = read_json(path, remedy="start the sweep again")
+        job = read_job(path)
         before = status_of(folder)
         if before.state == "done":
             return 0
@@ -121,4 +129,11 @@ def last_line(path: Path, start: int = 0) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(perform(Path(sys.argv[1])))
+    terminate_as_interrupt()
+    try:
+        if len(sys.argv) != 2:
+            raise InputError("expected one argument: the job.json of a sweep's job")
+        raise SystemExit(perform(Path(sys.argv[1])))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None

@@ -34,7 +34,8 @@ from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.trigonometric_kernel import make_trigonometric_kernel
 from dln_jax.nn.activations import Activation, tanh
-from dln_jax.types import InputError, Needs, ResidualTerm, require_network, require_positive
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Needs, ResidualTerm, require_positive
 from dln_jax.zoo.differential_network import make_differential_network
 from dln_jax.zoo.pictures import make_picture_model
 

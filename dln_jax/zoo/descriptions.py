@@ -19,8 +19,9 @@ from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories, needs_from_json
 from dln_jax.files import matches
 from dln_jax.nn.activations import Activation, activation
-from dln_jax.precision import data_type
-from dln_jax.types import InputError, Needs, require_network
+from dln_jax.precision import data_type, require_precision
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import entry_of
 from dln_jax.zoo.parameter_files import REMEDY
 
@@ -44,6 +45,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
     Raises:
         InputError: an unknown name or keyword, one that is missing, or a value that no file can hold.
     """
+    require_precision(precision)
     name = model if isinstance(model, str) else OWN
     factory = factory_of(name, None if isinstance(model, str) else model, trust=True)
     parameters = _parameters(factory)

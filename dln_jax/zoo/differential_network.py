@@ -13,7 +13,8 @@ from dln_jax.mechanics.arguments import vectors
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation
 from dln_jax.nn.differential_mlp import Layers
-from dln_jax.types import MOST_LAYERS, InputError, VectorLike, require_positive
+from dln_jax.sizes import require_network
+from dln_jax.types import VectorLike, require_positive
 
 
 class Derivatives(NamedTuple):
@@ -49,8 +50,7 @@ def make_differential_network(
     """
     require_positive(members=members)
     differential_mlp.layer_shapes(sizes)
-    if len(sizes) > MOST_LAYERS + 2:
-        raise InputError(f"sizes are those of {len(sizes) - 2} hidden layers; expected at most {MOST_LAYERS}")
+    require_network(width=max(sizes), depth=max(len(sizes) - 2, 1))
 
     def derivatives(layers: Layers) -> Callable[[VectorLike], Derivatives]:
         def function(x):

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import safetensors.numpy
 
-from dln_jax.files import is_file, read_json, write_bytes, write_json
+from dln_jax.files import is_file, matches, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 MODEL = "model"
@@ -58,6 +58,20 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
                 old.unlink()
 
 
+def require_fitting(tree: Any, like: Any) -> None:
+    """Raises `InputError` unless a tree has real numbers of the names, shapes and types of another."""
+    given, expected = _flatten(tree), _flatten(like)
+    if different := sorted(set(given) ^ set(expected)):
+        state = "unknown" if different[0] in given else "missing"
+        raise InputError(f"the parameters are those of another model: '{different[0]:.80}' is {state}")
+    for key, array in expected.items():
+        if not isinstance(given[key], np.ndarray | jax.Array | np.generic) or given[key].dtype.kind not in "fiu":
+            raise InputError(f"parameter '{key}' is {reprlib.repr(given[key])}; expected an array of real numbers")
+        shape, dtype = np.shape(given[key]), given[key].dtype
+        if shape != array.shape or dtype != array.dtype:
+            raise InputError(f"parameter '{key}' is {dtype} {shape}; expected {array.dtype} {array.shape}")
+
+
 def load_manifest(directory: Path, name: str) -> dict[str, Any]:
     """The manifest `name.json`, checked for its schema version.
 
@@ -75,6 +89,11 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         )
     if not isinstance(file_name, str) or Path(file_name).name != file_name:
         raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
+    tensors = manifest.get("tensors")
+    for key, each in tensors.items() if isinstance(tensors, dict) else [("tensors", tensors)]:
+        shape = each.get("shape") if isinstance(each, dict) else None
+        if not isinstance(shape, list) or not all(matches(size, int) and size >= 0 for size in shape):
+            raise InputError(f"{path}: {key:.80} is {reprlib.repr(each)}; expected the shape of an array; {REMEDY}")
     return manifest
 
 

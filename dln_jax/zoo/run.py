@@ -8,8 +8,10 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from dln_jax.files import is_file
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.dynamics import Dynamics, Flow, PlainDynamics, PlainFlow
 from dln_jax.mechanics.plain import InverseForward, PhaseRates
@@ -19,9 +21,9 @@ from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo import older
-from dln_jax.zoo.descriptions import Description, build
+from dln_jax.zoo.descriptions import OWN, Description, build
 from dln_jax.zoo.differential_network import Derivatives, FunctionModel
-from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, save_tree
+from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, require_fitting, save_tree
 from dln_jax.zoo.pictures import PictureModel
 from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
 
@@ -127,14 +129,40 @@ class Run:
         return InputError(f"a {self.description['name']} has no {asked}; ask for {given}")
 
 
-def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """Writes `model.safetensors` and `model.json` into an existing folder; what other parameters did not know goes.
+def save_model(
+    directory: str | Path, description: Description, parameters: Parameters, *, overwrite: bool = False
+) -> None:
+    """Writes `model.safetensors` and `model.json` into an existing folder, which `load` reads; `dln_jax.save`.
 
     Args:
         directory: of the run.
         description: as `describe` gives it.
         parameters: of the model that it describes.
+        overwrite: replace the model that the folder has, and forget the uncertainty of its parameters.
+
+    Raises:
+        InputError: no such folder, one that has a model, or parameters of another model.
     """
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such folder; create it first")
+    if is_file(directory / f"{MODEL}.json") and not overwrite:
+        raise InputError(f"{directory} has a model already; choose another folder, or give overwrite=True")
+    save(directory, description, parameters)
+
+
+def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
+    """As `save_model`, into the folder of a run that is being trained, whose model is replaced.
+
+    Raises:
+        InputError: parameters of another model.
+    """
+    name = description.get("name")
+    if name == OWN or ":" in str(name):
+        like = jax.tree.map(np.asarray, parameters)  # of a factory that only the user has
+    else:
+        like = jax.eval_shape(build(description).init, jax.random.key(0))
+    require_fitting(parameters, like)
     discard_uncertainty(Path(directory))
     save_tree(Path(directory), MODEL, parameters, {"model": description})
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from dln_jax.files import PARTIAL
+from dln_jax.files import PARTIAL, is_file
 from dln_jax.types import InputError
 
 CONFIG = "config.json"
@@ -17,7 +17,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Iterator[Path]:
+def run_folder(out: Path | None, default: str, *, resume: bool = False, resumable: bool = False) -> Iterator[Path]:
     """Yields the folder of a run, locked: a new one, `out` or the first free number behind `runs/default`.
 
     What ends in an `InputError` with nothing written but the arguments leaves no folder, so that the same command can
@@ -27,6 +27,7 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Itera
         out: the folder, which may exist if it is free.
         default: name of the folder where `out` is `None`.
         resume: the folder is that of an existing run, which is continued.
+        resumable: whether the command that asks could continue a run in the folder.
 
     Raises:
         InputError: the folder holds something already, cannot be created, or another process is writing there.
@@ -37,9 +38,9 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False) -> Itera
             yield out
         return
     folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
-    _require_free(folder)  # before a lock is put there, and again once nobody else can write
+    _require_free(folder, resumable)  # before a lock is put there, and again once nobody else can write
     with locked(folder):
-        _require_free(folder)
+        _require_free(folder, resumable)
         try:
             with _naming_itself(folder):
                 yield folder
@@ -112,13 +113,14 @@ def _create(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: cannot create the folder ({error.strerror}); choose another --out") from error
 
 
-def _require_free(folder: Path) -> None:
+def _require_free(folder: Path, resumable: bool) -> None:
     try:
         free = holds_only(folder, LOCK)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder ({error.strerror}); choose another --out") from error
     if not free:
-        raise InputError(f"{folder} is not empty; choose another --out, or --resume the run in it")
+        there, remedy = ("a run", ", or continue it with --resume") if is_file(folder / CONFIG) else ("files", "")
+        raise InputError(f"the folder {folder} already contains {there}; choose another --out{remedy * resumable}")
 
 
 def _withdraw(folder: Path, created: list[Path]) -> None:

@@ -53,7 +53,7 @@ def called(monkeypatch, *arguments):
     ("arguments", "complaint"),
     [
         (["--kind", "other"], "invalid choice 'other' for argument '--kind'. Expected one of ('this', 'that')"),
-        (["--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+        (["--steps", "many"], "--steps must be a whole number; got 'many'"),
         (["--steps"], "Missing value for argument '--steps'"),
         (["--stepz", "3"], "Unrecognized options: --stepz, 3"),
         (["--precision", "None"], "invalid choice 'None' for argument '--precision'. Expected one of ('f32', 'f64')"),

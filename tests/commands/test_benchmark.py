@@ -75,7 +75,7 @@ def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, cap
     table = (tmp_path / "out" / "scaling.md").read_text()
     assert table == markdown([row._replace(case=f"scaling/{row.case}") for row in rows])
     assert table.splitlines()[0] == "| case | p50 us, us | ratio |" and table.splitlines()[-1] == "| scaling/c |  | 4 |"
-    assert "is not empty" in refused(capsys, benchmark, "scaling", "--out", str(tmp_path / "out"))
+    assert "already contains" in refused(capsys, benchmark, "scaling", "--out", str(tmp_path / "out"))
 
 
 def test_figures_of_points_and_panels_draw():

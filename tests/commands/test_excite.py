@@ -74,7 +74,7 @@ def test_a_folder_with_motions(arm, tmp_path, capsys):
         (("--harmonics", 40, "--rate", 4), "half the sampling rate"),
         (("--robot", "nowhere.urdf"), "nowhere.urdf"),
         (("--criterion", "best"), "criterion"),
-        (("--velocity", "1,2,3"), "velocity has 3 numbers"),
+        (("--velocity", "1,2,3"), "--velocity is '1,2,3'; expected 1 or 2 positive numbers"),
         (("--torque", "strong"), "--torque is 'strong'"),
         (("--share", 2), "share is 2"),
         (("--payload", -1), "payload is -1"),

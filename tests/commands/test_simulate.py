@@ -220,7 +220,7 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
     assert not (tmp_path / "run").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    assert "is not empty" in refused(capsys, simulate, "--out", tmp_path / "full")
+    assert "already contains" in refused(capsys, simulate, "--out", tmp_path / "full")
 
 
 def test_the_script_refuses_wrong_meshes(tmp_path, capsys):

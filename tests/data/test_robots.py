@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from dln_jax.data.robots import read_robot
+from dln_jax.data.robots import quiet, read_robot
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import pseudo_inertia, tree_system, world_frames
 from dln_jax.types import InputError
@@ -160,7 +160,7 @@ def test_what_is_no_tree_is_refused_in_one_line(case, tmp_path):
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no file"):
+    with pytest.raises(InputError, match="no such file"):
         read_robot(tmp_path / "arm.urdf")
 
 
@@ -223,3 +223,65 @@ def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):
     true = read_robot(written(tmp_path, "arm.urdf", ARM)).tree
     assert np.linalg.eigvalsh(pseudo_inertia(tree.inertias[0]))[0] < 0
     np.testing.assert_allclose(tree.inertias[:, :4], true.inertias[:, :4], rtol=1e-12)
+
+
+def nested(depth):
+    return "<mujoco><worldbody>" + "<body><joint/>" * depth + "</body>" * depth + "</worldbody></mujoco>"
+
+
+def links(count, kind="revolute"):
+    parts = [LINK.format(name=f"l{k}", mass=1.0) for k in range(count)]
+    joints = [
+        JOINT.format(
+            name=f"j{k}", kind=kind, parent=f"l{k - 1}" if k else "base", child=f"l{k}", xyz="0 0 1", axis="0 0 1"
+        )
+        for k in range(count)
+    ]
+    return urdf(*parts, *joints)
+
+
+BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><robot name="&b;"/>'
+HEADED = '<?xml version="1.0" encoding="{}"?>'
+MALFORMED = {
+    "unknown encoding": (HEADED.format("teapot") + ARM, "teapot"),
+    "encoding of more bytes": (HEADED.format("utf-7") + ARM, "encodings"),
+    "entities": (BOMB, "entities"),
+    "entities in UTF-16": ((HEADED.format("utf-16") + BOMB).encode("utf-16"), "entities"),
+    "no XML": (b"\x00\xff" * 50, "no XML"),
+    "nested": (nested(100_000), "nested"),
+    "many joints": (links(3000), "elements|joints"),
+    "300 joints": (links(300), "300 joints"),
+    "many bodies": ('<mujoco><worldbody><replicate count="100000000"/></worldbody></mujoco>', "repeats"),
+    "memory": (BRANCHED.replace("<worldbody>", '<size memory="100000G"/><worldbody>'), "MuJoCo cannot"),
+    "planar joint": (ARM.replace('type="continuous"', 'type="planar"'), "of type 'planar'"),
+    "joint without a type": (ARM.replace('type="continuous"', ""), "of type 'None'"),
+    "two joints of one name": (ARM.replace('joint name="elbow"', 'joint name="shoulder"'), "two joints are named"),
+    "damping in words": (ARM.replace('damping="0.2"', 'damping="much"', 1), "damping in <dynamics> is 'much'"),
+    "damping that is NaN": (ARM.replace('damping="0.2"', 'damping="nan"', 1), "damping of joint"),
+    "damping that drives": (ARM.replace('damping="0.2"', 'damping="-1"', 1), "zero or more"),
+    "mass beyond all": (ARM.replace('mass value="2.0"', 'mass value="1e308"'), "inertia of joint"),
+    "velocity in words": (ARM.replace('velocity="3"', 'velocity="fast"', 1), "velocity in <limit> is 'fast'"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_malformed_file_is_refused_in_one_line(case, tmp_path, monkeypatch):
+    """And MuJoCo leaves no log of its own in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    content, said = MALFORMED[case]
+    path = tmp_path / "robot.xml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError, match=said) as caught:
+        read_robot(path)
+    assert "\n" not in str(caught.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
+
+
+def test_a_diverging_simulation_leaves_no_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = mujoco.MjModel.from_xml_string(BRANCHED)
+    data = mujoco.MjData(model)
+    with quiet(mujoco):
+        data.qvel[:] = 1e12
+        mujoco.mj_step(model, data, 3)
+    assert not list(tmp_path.iterdir()) and mujoco.get_mju_user_warning() is None

@@ -81,6 +81,7 @@ def test_a_resumed_sweep_finds_its_jobs_in_the_queue(cluster, tmp_path):
         assert [job.job_id for _, job in handles] == ["7_0", "7_1", "7"]
         assert (cluster / "scripts").read_text().count("srun") == 1  # the one that is gone
         assert engine.over(handles[0]) is None
+        (paths[0].parent / "run" / "figures").mkdir(parents=True)
         write_status(paths[0].parent, Status("done", run="run"))
         assert engine.over(handles[0]) == ""
         engine.stop(handles[1:])

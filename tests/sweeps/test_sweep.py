@@ -21,6 +21,7 @@ from dln_jax.sweeps import engines, work
 from dln_jax.sweeps import sweep as course
 from dln_jax.sweeps.engines import Engine
 from dln_jax.sweeps.status import Status, status_of, write_status
+from dln_jax.types import InputError
 
 WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
 """Validation errors of pretended trainings; seeds add to them."""
@@ -131,6 +132,49 @@ def test_what_cannot_be_continued_is_begun_anew(tmp_path, engine):
     assert status_of(job).run == "run-2"
 
 
+STATUS = {
+    "a run elsewhere": {"run": "../../X"},
+    "a run at the root": {"run": "/tmp/X"},
+    "a run that is a number": {"run": 5},
+    "attempts in words": {"attempt": "x"},
+    "attempts below zero": {"attempt": -1},
+    "an unknown state": {"state": "happy"},
+    "seconds in words": {"seconds": "few"},
+}
+
+
+@pytest.mark.parametrize("damage", STATUS)
+def test_a_status_that_is_not_a_job_s_own_is_refused(tmp_path, engine, capsys, damage):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=4 seed=0", "--out", out)
+    path = out / "jobs" / "0000" / "status.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **STATUS[damage]}))
+    assert "status.json" in refused(capsys, sweep, "--out", out, "--resume")
+    assert not (tmp_path / "X").exists() and len(engine) == 1
+
+
+def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, engine):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=4 seed=0", "--out", out)
+    for run in (out / "jobs" / "0000" / "run").iterdir():
+        run.unlink()
+    command(sweep, "--out", out, "--resume")
+    assert len(engine) == 2
+
+
+@pytest.mark.parametrize(
+    "change", [{"arguments": "x"}, {"arguments": [1]}, {"command": 3}, {"folder": "/nowhere"}], ids=str
+)
+def test_a_damaged_job_is_refused(tmp_path, engine, capsys, change):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=4 seed=0", "--where", "later", "--out", out)
+    path = out / "jobs" / "0000" / "job.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    assert "job.json" in refused(capsys, sweep, "--out", out, "--resume", "--where", "here")
+    with pytest.raises(InputError, match=r"job\.json"):
+        work.perform(path)
+
+
 def test_the_best_is_of_each_problem(tmp_path, engine):
     for name in "ab":
         (tmp_path / name).touch()
@@ -163,7 +207,7 @@ def test_an_interrupt_ends_the_jobs(tmp_path, engine, monkeypatch, capsys):
 
 
 MISTAKES = [
-    (("--grid", "width=a"), "Error parsing --width"),
+    (("--grid", "width=a"), "--width must be a whole number"),
     ((), "--grid names no option"),
     (("--command", "train_delen", "--grid", "width=8"), "did you mean train_delan?"),
     (("--command", "sweep", "--grid", "width=8"), "there is no 'sweep'"),

@@ -184,7 +184,9 @@ def test_a_loaded_run_is_trained_on(tmp_path):
     before, slope = loss(run.parameters)
     tuned = jax.tree.map(lambda leaf, change: leaf - 1e-4 * change, run.parameters, slope)
     assert loss(tuned)[0] < before
-    dln_jax.save(tmp_path, run.description, tuned)
+    with pytest.raises(InputError, match="has a model already"):
+        dln_jax.save(tmp_path, run.description, tuned)
+    dln_jax.save(tmp_path, run.description, tuned, overwrite=True)
     again = dln_jax.load(tmp_path)
     np.testing.assert_allclose(jnp.sum((again.dynamics.inverse_dynamics(*state) - 5.0) ** 2), loss(tuned)[0])
 

@@ -78,7 +78,7 @@ def test_a_folder_that_is_none_or_holds_something_is_refused():
     Path("file").touch()
     Path("link").symlink_to("nowhere")
     for out, message in (
-        ("full", "not empty"),
+        ("full", "already contains"),
         ("file", "cannot create"),
         ("file/below", "cannot create"),
         ("link", "cannot create"),

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from dln_jax.control.optimal.problem import ControlProblem, features
 from dln_jax.nn import differential_mlp, ensembles
 from dln_jax.nn.activations import Activation, softplus, tanh
-from dln_jax.types import InputError, require_network, require_positive
+from dln_jax.sizes import require_network
+from dln_jax.types import InputError, require_positive
 
 
 class ValueNetwork(NamedTuple):

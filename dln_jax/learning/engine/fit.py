@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
+from dln_jax.interrupts import held_back
 from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.optimisers import Adam, Optimiser
@@ -82,17 +83,18 @@ def fit(
                 dispatch = stage.compile(run.state)
                 compile_seconds += time.perf_counter() - since
             since, before = time.perf_counter(), np.array(run.state.step)
-            state, values = dispatch(run.state)
-            loss, validation, monitor = (plain(each) for each in np.moveaxis(np.asarray(values), -1, 0))
-            train_seconds += time.perf_counter() - since
-            run, dispatched = run._replace(state=state), True
-            ended = stage.ended(state)
-            if ended and ended.reason == "not finite" and np.array_equal(before, state.step):
-                continue  # nothing to report, and what is stored is as good
-            at = Progress(plain(state.step), loss, validation, monitor, train_seconds, stage.name)
-            history.append(at)
-            if checkpoint is not None:
-                store(checkpoint, run, history)
+            with held_back():
+                state, values = dispatch(run.state)
+                loss, validation, monitor = (plain(each) for each in np.moveaxis(np.asarray(values), -1, 0))
+                train_seconds += time.perf_counter() - since
+                run, dispatched = run._replace(state=state), True
+                ended = stage.ended(state)
+                if ended and ended.reason == "not finite" and np.array_equal(before, state.step):
+                    continue  # nothing to report, and what is stored is as good
+                at = Progress(plain(state.step), loss, validation, monitor, train_seconds, stage.name)
+                history.append(at)
+                if checkpoint is not None:
+                    store(checkpoint, run, history)
             report(at)
         if stop.reason == "time":
             break

@@ -14,6 +14,7 @@ from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Best, Dispatch, Problem, Stage, Stop, better_of, no_best
 from dln_jax.learning.engine.sharing import Sharing, by_devices
 from dln_jax.scale.mesh import first, replicate, shard, spread
+from dln_jax.sizes import require_memory
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.solvers.levenberg_marquardt import Arrays, Status
 from dln_jax.types import InputError
@@ -40,6 +41,11 @@ def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[St
     """One stage, or two."""
     if problem.residual is None:
         raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
+    leaves = jax.tree.leaves(problem.parameters)
+    seeds = leaves[0].shape[0] if problem.several else 1
+    count = sum(leaf.size for leaf in leaves) // seeds
+    # The normal equations, their factor and a copy, in float64.
+    require_memory(f"Gauss-Newton's equations for {count:,} parameters", 24.0 * seeds * count**2)
     arrays = jax.tree.map(jnp.asarray, problem.arrays)
     settings = {"improvement": optimiser.improvement, "mesh": shared.samples}
     iterate = functools.partial(levenberg_marquardt.run_on_chunks, problem.residual, **settings)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from dln_jax.learning.kinematics.frames import Frames
 from dln_jax.mechanics.trees.description import dh_frames
-from dln_jax.types import InputError
+from dln_jax.types import InputError, finite_array
 
 FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}
 """Columns of each."""
@@ -46,12 +46,8 @@ def frames_of_axes(
     Raises:
         InputError: arrays of another shape or not finite, or an axis of length zero.
     """
-    axes, points = np.asarray(axes, float), np.asarray(points, float)
     d = len(points)
-    if axes.shape != (d, 3) or points.shape != (d, 3) or not (np.isfinite(axes).all() and np.isfinite(points).all()):
-        raise InputError(
-            f"axes have shape {axes.shape} and points {points.shape}; expected [d, 3] both, and finite numbers"
-        )
+    axes, points = finite_array("axes", axes, (d, 3)), finite_array("points", points, (d, 3))
     lengths = np.linalg.norm(axes, axis=1)
     if not (lengths > 0).all():
         raise InputError(f"joint {int(np.argmin(lengths)) + 1} has an axis of length zero; expected a direction")

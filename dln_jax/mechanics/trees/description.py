@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.mechanics.trees.inertia import Inertia, moved
-from dln_jax.types import InputError, JointKind, Needs
+from dln_jax.types import InputError, JointKind, Needs, finite_array
 
 EARTH = (0.0, 0.0, -9.81)
 """m/s², z up."""
@@ -84,11 +84,7 @@ def make_tree(
         "armature": (np.zeros(d) if armature is None else armature, (d,)),
         "gravity": (gravity, (3,)),
     }
-    checked = {}
-    for name, (array, shape) in arrays.items():
-        checked[name] = np.asarray(array, float)
-        if checked[name].shape != shape or not np.isfinite(checked[name]).all():
-            raise InputError(f"{name} has shape {checked[name].shape}; expected {shape}, and finite numbers")
+    checked = {name: finite_array(name, array, shape) for name, (array, shape) in arrays.items()}
     turned = checked["rotations"]
     if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > 1e-6 or (np.linalg.det(turned) < 0).any():
         raise InputError("rotations has a matrix that is no rotation; expected orthonormal columns, right-handed")

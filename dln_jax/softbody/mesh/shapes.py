@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
+from dln_jax.sizes import require_memory
 from dln_jax.softbody.mesh.mesh import Mesh, make_mesh
 from dln_jax.types import InputError, require_positive
 
@@ -47,6 +48,7 @@ def disc(radius: float, rings: int) -> Mesh:
     """
     _require_sizes(radius=radius)
     require_positive(rings=rings)
+    _require_room(6 * rings**2)
     vertices, elements = [np.zeros((1, 2))], []
     for k in range(1, rings + 1):
         angles = 2 * np.pi * np.arange(6 * k) / (6 * k)
@@ -79,6 +81,7 @@ def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
     names = "xyz"[: len(lengths)]
     _require_sizes(**{f"length along {name}": length for name, length in zip(names, lengths, strict=True)})
     require_positive(**{f"number of cells along {name}": count for name, count in zip(names, cells, strict=True)})
+    _require_room(len(PATTERNS[len(cells)]) * math.prod(cells))
     positions, elements = lattice(list(itertools.product(*(range(count) for count in cells))))
     ticks = [np.linspace(0.0, length, count + 1) for length, count in zip(lengths, cells, strict=True)]
     return make_mesh(np.stack([tick[positions[:, axis]] for axis, tick in enumerate(ticks)], axis=1), elements)
@@ -87,6 +90,11 @@ def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
 def _on_ring(k: int, place: int) -> int:
     """Index of a vertex by its place on ring k, counted on around the ring."""
     return 0 if k == 0 else 1 + 3 * k * (k - 1) + place % (6 * k)
+
+
+def _require_room(elements: int) -> None:
+    # Estimated, not measured: vertices, derivatives, blocks of the Hessian and its factor.
+    require_memory(f"a mesh of {elements:,} elements", 4096.0 * elements)
 
 
 def _require_sizes(**sizes: float) -> None:

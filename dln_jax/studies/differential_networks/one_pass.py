@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.nn import differential_mlp
 from dln_jax.nn.activations import activation
+from dln_jax.sizes import require_network
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
-from dln_jax.types import require_network, require_positive
+from dln_jax.types import require_positive
 
 INPUTS = (1, 2, 4, 7)
 BOUNDS = {2: 4.0, 7: 4.0}

@@ -1,0 +1,95 @@
+"""Upper bounds of what can be asked for, in one place: a typo must not take all memory, or run for years.
+
+The bounds are far above any sensible use. Counts that multiply (cells of a mesh, equations of Gauss-Newton) are
+bounded by an estimate of the memory that they take, before anything is allocated.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from dln_jax.types import InputError
+
+MOST: dict[str, int] = {
+    "batch": 10_000_000,
+    "cells": 10_000,
+    "decimate": 100_000,
+    "degree": 50,
+    "depth": 100,  # more hidden layers take hours to compile, and learn nothing
+    "devices": 256,
+    "dimension": 3,
+    "gpus": 256,
+    "harmonics": 1000,
+    "iterations": 100_000,
+    "jobs": 10_000,
+    "kills": 10_000,
+    "lanes": 1_000_000,
+    "members": 1000,
+    "processes": 4096,
+    "repetitions": 1_000_000,
+    "samples": 100_000_000,
+    "seeds": 1000,
+    "sharing": 256,
+    "split_seeds": 1000,
+    "splits": 1000,
+    "starts": 100_000,
+    "steps": 100_000_000,
+    "timed_seeds": 1000,
+    "trajectories": 1_000_000,
+    "width": 16_384,
+}
+"""Of counts, by the name of the option or argument; `MOST_OF_OTHERS` of those that are not listed."""
+MOST_OF_OTHERS = 100_000_000
+LARGEST, SMALLEST = 1e50, 1e-50
+"""Magnitudes of measured quantities in SI units; the squares of what lies between stay finite."""
+LARGEST_STATED = 1e20
+"""Of a number that is typed as an option."""
+
+
+def require_within(counts: Mapping[str, int]) -> None:
+    """Raises `InputError` that names the first count above its upper bound; names may be those of options."""
+    for name, count in counts.items():
+        if count > (most := MOST.get(name.removeprefix("--").replace("-", "_"), MOST_OF_OTHERS)):
+            raise InputError(f"{name} is {written(count)}; expected at most {most:,}")
+
+
+def require_magnitude(name: str, value: float) -> None:
+    """Raises `InputError` for a number other than zero that no quantity in SI units has."""
+    if value != 0 and not SMALLEST <= abs(value) <= LARGEST_STATED:
+        raise InputError(
+            f"{name} is {value:.3g}; expected 0, or a size between {SMALLEST:.0e} and {LARGEST_STATED:.0e}"
+        )
+
+
+def require_network(*, width: int, depth: int) -> None:
+    """Raises `InputError` unless width and depth are positive whole numbers within bounds, and the weights fit."""
+    for name, value in (("width", width), ("depth", depth)):
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise InputError(f"{name} is {value!r:.40}; expected a positive whole number")
+    require_within({"width": width, "depth": depth})
+    # Parameters, their gradient, and two moments of Adam.
+    require_memory(f"a network with {depth} hidden layers of {width} units", 4 * 8.0 * width**2 * (depth - 1))
+
+
+def require_memory(what: str, bytes_needed: float) -> None:
+    """Raises `InputError` if an estimate exceeds the memory of this machine."""
+    if bytes_needed > (there := memory()):
+        raise InputError(
+            f"{what} would take about {bytes_needed / 2**30:,.3g} GiB of memory, and there are {there / 2**30:.3g} GiB "
+            "here; ask for less"
+        )
+
+
+def memory() -> float:
+    """Bytes of this machine or of the container, whichever is less; infinite where the system does not say."""
+    found = float("inf")
+    try:
+        found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return min(found, float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError, AttributeError):  # no such system, no container, or "max"
+        return found
+
+
+def written(number: int) -> str:
+    """A whole number for a message, however many digits it has."""
+    return f"{number:,}" if abs(number) < 10**18 else f"{'-' * (number < 0)}a number of more than 18 digits"

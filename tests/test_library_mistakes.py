@@ -1,0 +1,180 @@
+"""A library user's mistakes are one clear `InputError`, and nothing is written or overwritten by them."""
+
+import copy
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dln_jax
+from dln_jax.data import schema
+from dln_jax.mechanics.trees import make_tree
+from dln_jax.models.hamiltonian import make_black_box_hamiltonian
+from dln_jax.sizes import memory, require_memory
+from dln_jax.softbody import make_scene, with_parameters
+from dln_jax.softbody.mesh import beam
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.types import InputError, Needs
+
+ARM = Needs(joints=("revolute", "prismatic"))
+DESCRIPTION = dln_jax.describe("structured-delan", needs=ARM, precision="f64", width=3, depth=1)
+GOOD = schema.from_arrays(
+    {
+        "t": np.tile(np.arange(4.0), 2),
+        **{key: np.random.default_rng(0).normal(size=(8, 2)) for key in ("q", "qd", "qdd", "tau")},
+        "trajectory": np.repeat(np.arange(2), 4),
+    }
+)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"joints": "revolute"},
+        {"joints": ("ball",)},
+        {"joints": ()},
+        {"joints": 3},
+        {"joints": ("revolute",), "gravity": 1},
+        {"joints": ("revolute",), "joint_friction": ("sticky",)},
+        {"joints": ("revolute",), "joint_friction": "viscous"},
+    ],
+    ids=str,
+)
+def test_needs_of_unknown_kinds_are_refused(fields):
+    with pytest.raises(InputError, match="expected"):
+        Needs(**fields)
+    with pytest.raises(InputError, match="expected"):
+        ARM._replace(**fields)
+
+
+def test_needs_stay_what_they_were_through_copies():
+    assert Needs(joints=["revolute"]) == Needs(joints=("revolute",))
+    for same in (copy.deepcopy(ARM), pickle.loads(pickle.dumps(ARM)), Needs(**ARM._asdict())):
+        assert same == ARM and hash(same) == hash(ARM) and type(same) is Needs
+
+
+def test_a_model_is_not_saved_over_another_unasked(tmp_path):
+    parameters = dln_jax.build(DESCRIPTION).init(jax.random.key(0))
+    dln_jax.save(tmp_path, DESCRIPTION, parameters)
+    before = (tmp_path / "model.json").read_bytes()
+    with pytest.raises(InputError, match="overwrite=True"):
+        dln_jax.save(tmp_path, DESCRIPTION, parameters)
+    assert (tmp_path / "model.json").read_bytes() == before
+    dln_jax.save(tmp_path, DESCRIPTION, jax.tree.map(lambda leaf: leaf + 1, parameters), overwrite=True)
+    assert (tmp_path / "model.json").read_bytes() != before
+    with pytest.raises(InputError, match="no such folder"):
+        dln_jax.save(tmp_path / "nowhere", DESCRIPTION, parameters)
+
+
+def test_parameters_of_another_model_are_not_saved(tmp_path):
+    parameters = dln_jax.build(DESCRIPTION).init(jax.random.key(0))
+    wider = dln_jax.build({**DESCRIPTION, "width": 4}).init(jax.random.key(0))
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), parameters)
+    words = jax.tree.map(lambda leaf: "many", parameters)
+    for wrong in ({}, {"w": np.zeros(3)}, wider, single, words, {**parameters, "more": np.zeros(3)}, np.zeros(3)):
+        with pytest.raises(InputError, match="parameter"):
+            dln_jax.save(tmp_path, DESCRIPTION, wrong)
+    assert not list(tmp_path.iterdir())
+
+
+WRONG_DATA = {
+    "NaN": {"q": np.full((8, 2), np.nan)},
+    "another shape": {"tau": np.zeros((7, 2))},
+    "objects": {"tau": np.full((8, 2), None)},
+    "words": {"qd": np.full((8, 2), "a")},
+    "times that do not increase": {"t": np.zeros(8)},
+    "names of objects": {"label": np.array([None, None])},
+    "needs of other joints": {"needs": Needs(joints=("revolute",))},
+    "numbers whose squares overflow": {"tau": np.full((8, 2), 1e154)},
+    "numbers whose squares vanish": {"tau": np.full((8, 2), 1e-200)},
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_DATA)
+def test_trajectories_that_load_would_refuse_are_not_saved(tmp_path, mistake):
+    with pytest.raises(InputError, match="is not written"):
+        schema.save(tmp_path / "data.npz", GOOD._replace(**WRONG_DATA[mistake]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_saved_trajectories_come_back_and_are_not_overwritten_unasked(tmp_path):
+    path = tmp_path / "data.npz"
+    schema.save(path, GOOD)
+    np.testing.assert_array_equal(schema.load(path).tau, GOOD.tau)
+    (tmp_path / "link.npz").symlink_to("nowhere.npz")
+    for taken in (path, tmp_path / "link.npz"):
+        with pytest.raises(InputError, match="exists"):
+            schema.save(taken, GOOD)
+
+
+def test_names_of_precisions_and_activations_are_checked():
+    with pytest.raises(InputError, match="f32 or f64"):
+        dln_jax.describe("structured-delan", needs=ARM, precision="f16")
+    by_name = dln_jax.make_delan(ARM, activation="silu", width=3, depth=1)
+    assert by_name.init(jax.random.key(0))
+    for make in (dln_jax.make_delan, make_black_box_hamiltonian):
+        with pytest.raises(InputError, match="choose one of"):
+            make(ARM, activation="tangent")
+        for sizes in ({"width": 10**9}, {"depth": 10**9}, {"width": 0}):
+            with pytest.raises(InputError, match="expected"):
+                make(ARM, **sizes)
+
+
+def two_coordinates(q, qd):
+    return 0.5 * qd[0] ** 2 + 0.5 * qd[1] ** 2 + 0.3 * qd[0] * qd[1] * jnp.cos(q[0] - q[1])
+
+
+def systems():
+    model = dln_jax.make_delan(ARM, width=3, depth=1)
+    yield model.energies(model.init(jax.random.key(0)))
+    yield dln_jax.LagrangianSystem(two_coordinates)
+    yield dln_jax.NaturalSystem(lambda q: jnp.diag(jnp.asarray([1.0, 2.0], q.dtype)))
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_states_of_another_size_than_the_system_are_refused(size):
+    """Also where JAX would read the last element in place of one that is missing."""
+    state = [jnp.ones(size)] * 3
+    for system in systems():
+        functions = dln_jax.dynamics(system)
+        for function in (functions.inverse_dynamics, jax.jit(functions.forward_dynamics)):
+            assert np.isfinite(function(*[jnp.ones(2)] * 3)).all()
+            with pytest.raises(InputError, match=r"size|shape"):
+                function(*state)
+
+
+def test_what_is_wrong_with_an_array_is_said():
+    """And not that a shape is wrong, where it is a number."""
+    one = {
+        "rotations": np.eye(3)[None],
+        "positions": np.zeros((1, 3)),
+        "axes": np.eye(3)[:1],
+        "inertias": np.ones((1, 10)),
+    }
+    for name, value, said in (
+        ("axes", np.full((1, 3), np.nan), "has nan at"),
+        ("axes", np.zeros((2, 3)), "has shape"),
+        ("inertias", "heavy", "expected real numbers"),
+    ):
+        with pytest.raises(InputError, match=f"{name} .*{said}"):
+            make_tree((-1,), ("revolute",), **{**one, name: value})
+
+
+def test_gravity_may_be_a_list_and_must_have_the_scene_s_dimension():
+    mesh = beam(1.0, 1.0, 1, 1)
+    params = make_scene(mesh, [gravity(mesh)]).params
+    changed = with_parameters(params, gravity={"acceleration": [0.0, -1.6]})
+    np.testing.assert_allclose(changed.terms["gravity"].acceleration, [0.0, -1.6])
+    for wrong in ([0.0, 0.0, -9.8], "down", [None, 1.0], [[0.0, -9.8]]):
+        with pytest.raises(InputError, match="acceleration"):
+            with_parameters(params, gravity={"acceleration": wrong})
+
+
+def test_more_memory_than_there_is_is_refused_with_both_numbers():
+    require_memory("little", 1e6)
+    with pytest.raises(InputError, match=r"much would take about .* GiB of memory, and there are .* GiB"):
+        require_memory("much", 2 * min(memory(), 1e18))
+    with pytest.raises(InputError, match="elements"):
+        beam(1.0, 1.0, 100_000, 100_000)
