@@ -20,8 +20,8 @@ multiplied by the `scatter` of the motions: what a model lacks shows more in som
 may be of the former.
 
 A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them:
-its states are outside where the deviation by the parameters exceeds both that on the data and `HARMLESS` of the torque. A
-network is also outside where its inputs leave the range of the data.
+its states are outside where the deviation by the parameters exceeds both that on the data and `HARMLESS` of the torque.
+A network is also outside where its inputs leave the range of the data.
 """
 
 from typing import NamedTuple
