@@ -20,8 +20,8 @@ multiplied by the `scatter` of the motions: what a model lacks shows more in som
 may be of the former.
 
 A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them:
-its states are outside where the deviation by the parameters exceeds that on the data, the noise, and `HARMLESS` of the
-torque. A network is also outside where its inputs leave the range of the data.
+its states are outside where the deviation by the parameters exceeds both that on the data and `HARMLESS` of the torque.
+A network is also outside where its inputs leave the range of the data.
 """
 
 from typing import NamedTuple
@@ -130,7 +130,7 @@ def estimate(
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
     limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), np.finfo(np.float64).tiny)
     if ridge == 0:
-        harmless = np.maximum(chosen.noise, HARMLESS * np.asarray(torque_scale(train), np.float64))
+        harmless = HARMLESS * np.asarray(torque_scale(train), np.float64)
         limit, centre, reach = np.maximum(limit, harmless / np.sqrt(chosen.inflation)), np.zeros(0), np.zeros(0)
     else:
         centre, reach = _reach(train, validation, quantile)

@@ -95,7 +95,7 @@ def test_far_states_are_flagged_and_near_ones_are_not(fitted):
     error = jax.vmap(dynamics(ARM.energies(parameters)).inverse_dynamics)(*away) - TORQUE(*away)
     wrong = np.any(np.abs(error) > 3 * NOISE, axis=1)
     flagged = np.asarray(flag(*away))
-    assert wrong.mean() > 0.5 and flagged[wrong].all() and flagged.mean() > 0.95
+    assert wrong.any() and flagged[wrong].all() and flagged.mean() >= 0.98
     assert flag(np.full((1, 2), np.nan), np.zeros((1, 2)), np.zeros((1, 2))).all()
 
 
