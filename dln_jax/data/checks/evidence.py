@@ -6,8 +6,9 @@ compared by the probability of each block of time given all others, so that a fa
 log before it is one.
 """
 
+import importlib
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -51,16 +52,18 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
     noise = np.tile(np.maximum(sizes, 1e-12 * sizes.max()), n)
     weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
     count, factors = len(prior.parts), len(prior.columns)
-    for last in [False] * iterations + [True]:
+
+    def covariance() -> np.ndarray:
         K = np.diag(weights[count + factors :][joint] * noise)
         for weight, part in zip(weights, prior.parts, strict=False):
             K += weight * part
         for weight, columns in zip(weights[count:], prior.columns, strict=False):
             K += weight * (columns @ columns.T)
-        inverse = _inverse(K)
+        return K
+
+    for _ in range(iterations):
+        inverse = _inverse(covariance())
         pull = inverse @ y
-        if last:
-            break
         slopes = [(pull @ part @ pull, np.sum(inverse * part)) for part in prior.parts]
         for columns in prior.columns:
             slopes.append((np.sum((columns.T @ pull) ** 2), np.sum(columns * (inverse @ columns))))
@@ -68,6 +71,8 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
         slopes += [(own[0][joint == each].sum(), own[1][joint == each].sum()) for each in range(d)]
         weights = weights * np.array([np.sqrt(fit / max(size, 1e-300)) for fit, size in slopes])
         weights[count + factors :] = np.maximum(weights[count + factors :], 1e-7)
+    inverse = _inverse(covariance())
+    pull = inverse @ y
     densities, unexplained = [], []
     for block in blocks_of(n, d):
         block = block.ravel()
@@ -102,8 +107,7 @@ def _start(prior: Prior, size: float, noise: np.ndarray) -> np.ndarray:
 
 
 def _inverse(K: np.ndarray) -> np.ndarray:
-    from scipy.linalg import lapack
-
+    lapack: Any = importlib.import_module("scipy.linalg.lapack")
     factor, _ = lapack.dpotrf(K, lower=True)
     inverse, failed = lapack.dpotri(factor, lower=True)
     if failed:
