@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +16,17 @@ AUTO = "auto"
 
 
 @dataclass(frozen=True)
-class Filtered:
+class Logged:
+    """What a log does not say of itself."""
+
+    rate: Unstated[float] = None
+    """Hz, at which a file without t was sampled."""
+    units: Unstated[Literal["si", "degrees"]] = None
+    """CSV: units of titles that state none; degrees: of angles, and SI for the rest."""
+
+
+@dataclass(frozen=True)
+class Filtered(Logged):
     """How rates come about where a log has none that can be trusted."""
 
     cutoff: Unstated[str] = None

@@ -52,7 +52,7 @@ def read(given: Options) -> Recorded:
     scene = scene_named(given.scene) if given.scene else None
     labels = tuple(given.test.split(",")) if given.test else None
     if given.data is not None:
-        data, name = schema.load(given.data), str(given.data)
+        data, name = schema.load(given.data, rate=given.rate, units=given.units), str(given.data)
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"

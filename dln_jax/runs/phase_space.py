@@ -17,7 +17,7 @@ from dln_jax.command_line.arguments import (
     require_positive_if_given,
     resolved,
 )
-from dln_jax.command_line.encoders import checked
+from dln_jax.command_line.encoders import Logged, checked
 from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.command_line.progress import progress
@@ -61,7 +61,7 @@ LOSSES = {
 
 
 @dataclass(frozen=True)
-class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
+class Options(Logged, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go. What is not given is the task's own choice."""
 
     task: Annotated[str, choice(TASKS)] = "spring"
@@ -80,7 +80,7 @@ class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
     ] = "auto"
     """What is learned; auto: what suits the task. The last three are for measured."""
     data: Unstated[Path] = None
-    """Trajectories in the npz schema, for measured and real-pendulum."""
+    """Trajectories as npz or CSV, for measured and real-pendulum."""
     trajectories: Unstated[int] = None
     """Generated trajectories, for the other tasks."""
     needs: Unstated[str] = None
@@ -124,6 +124,7 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     if given.task != MEASURED:
         refuse_given(given, ["test", "noise"], "for measured")
     stated = Stated(needs, given.test, None if given.noise is None else positive_numbers("--noise", given.noise))
+    stated = stated._replace(rate=given.rate, units=given.units)
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
     names = ("width", "depth", "activation", "degree", "coordinates")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}

@@ -79,6 +79,10 @@ class Stated(NamedTuple):
     """Labels of the test trajectories, separated by commas, or another file of them."""
     noise: tuple[float, ...] | None = None
     """Standard deviation of q, one for all or one each (default: estimated)."""
+    rate: float | None = None
+    """Hz, of a file without t."""
+    units: str | None = None
+    """Of a CSV file's titles without a unit."""
 
 
 NOTHING = Stated()
@@ -106,7 +110,7 @@ def problem_of(
         return generated(name, trajectories)
     if data is None:
         raise InputError(f"task '{name}' needs its data, which are not part of this project: give their file")
-    loaded = schema.load(data)
+    loaded = schema.load(data, rate=stated.rate, units=stated.units)
     if name == REAL:
         if loaded.degrees_of_freedom != 1:
             raise InputError(f"{data} has {loaded.degrees_of_freedom} coordinates; the task is that of one pendulum")
