@@ -49,8 +49,7 @@ def load(
         raise InputError(f"{path!s:.200}: no such file; give the path of {kinds}")
     unread: list[str] = []
     try:
-        of_text = table is not None and path.suffix.lower() == ".csv"
-        arrays, unread = table(path) if of_text else _read(path, keys)
+        arrays, unread = table(path) if table and path.suffix.lower() == ".csv" else _read(path, keys)
         return from_arrays(arrays)
     except InputError as error:
         beside = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""

@@ -205,7 +205,7 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
         warnings.simplefilter("ignore")  # about files without samples
         lines = itertools.dropwhile(lambda line: not line.strip(), file)
         next(csv.reader(lines))
-        converters: dict[int, Callable] = unread
+        converters: dict[int | str, Callable] = {**unread}
         try:
             table = np.loadtxt(lines, delimiter=",", comments=None, quotechar='"', converters=converters, ndmin=2)
         except (ValueError, OverflowError):
