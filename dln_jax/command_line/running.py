@@ -18,6 +18,7 @@ from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
 from dln_jax.data.schema import needs_from_text
 from dln_jax.files import is_file, matches, read_json, write_json
+from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits
 from dln_jax.scenes.registry import SCENES
@@ -46,7 +47,8 @@ def run(
     from_shell: bool = False,
     limits: Limits = USUAL,
 ) -> None:
-    """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, an interrupt 130.
+    """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, a refused fit 1,
+    an interrupt 130.
 
     `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs;
     `limits` are those of several processes, of which each works in a child.
@@ -81,9 +83,12 @@ def run(
 
 @contextlib.contextmanager
 def in_words(prog: str, given: Any) -> Iterator[None]:
-    """Turns a user's mistake into one line and exit status 2, and an interrupt into 130."""
+    """Turns a user's mistake into one line and exit status 2, a refused fit into 1, and an interrupt into 130."""
     try:
         yield
+    except FitRefused as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -18,22 +18,28 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_times,
 )
 from dln_jax.metrics.soft_body_energies import motion_energies
+from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge
 
 __all__ = [
     "Coverage",
     "Definiteness",
+    "FitRefused",
+    "HeldOut",
     "Injection",
     "Latency",
     "Misfit",
     "Motion",
     "Motions",
+    "Verdict",
     "coverage",
     "definiteness",
     "energy_error",
     "errors",
     "field_errors",
     "follow",
+    "held_out",
     "inject_energy",
+    "judge",
     "mean_square",
     "medians_in_turns",
     "motion_energies",

@@ -19,6 +19,7 @@ from dln_jax.__main__ import command, command_names, main
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import interrupted, run
+from dln_jax.metrics.verdict import FitRefused, Verdict
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
@@ -252,6 +253,17 @@ def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, argume
         run(main, arguments, prog="command")
     assert ended.value.code == 130
     assert capsys.readouterr().err == said.format(folder=folder) + "\n"
+
+
+def test_refused_fit_ends_with_its_own_status(monkeypatch, capsys):
+    def main(given):
+        raise FitRefused(Verdict("refused", "nMSE 22.7", "check the sign of tau"))
+
+    monkeypatch.setattr(sys, "argv", ["command"])
+    with pytest.raises(SystemExit) as ended:
+        run(main, Arguments, prog="command")
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == "error: the fit is refused: nMSE 22.7; check the sign of tau\n"
 
 
 def test_every_command_has_a_script():

@@ -5,7 +5,7 @@
 
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff
 from dln_jax.data.encoders.filters import derivatives, low_pass
-from dln_jax.data.encoders.noise import noise_of, step_of
+from dln_jax.data.encoders.noise import noise_of, step_of, torque_noise
 from dln_jax.data.encoders.smoothing import Smoothed, labels_of_parts, smooth
 
 __all__ = [
@@ -18,4 +18,5 @@ __all__ = [
     "noise_of",
     "smooth",
     "step_of",
+    "torque_noise",
 ]

@@ -10,9 +10,15 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
+from dln_jax.data.schema import Trajectories
+
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
 """Median size of a normal variable, in standard deviations."""
+
+SLOW = 5e-3
+"""Share of the positions' standard deviation that differences of a log take for noise, above which it is sampled so
+slowly that they are differences of the motion."""
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
@@ -29,6 +35,18 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
         changes = np.abs(np.concatenate([np.diff(part, n=order, axis=0) for part in parts]))
         of_orders.append(np.median(changes, axis=0) / (NORMAL * math.sqrt(math.comb(2 * order, order))))
     return np.maximum(np.min(of_orders, axis=0), step_of(values) / math.sqrt(12))
+
+
+def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
+    """Standard deviation of the white noise of each torque, N m or N; `None` if the samples are too far apart to tell.
+
+    Differences of positions, which are measured far better than torques, show whether they are.
+    """
+    spread = data.q.std(axis=0)
+    moving = spread > 0
+    if not moving.any() or not (noise_of(data.q, data.trajectory)[moving] <= SLOW * spread[moving]).all():
+        return None
+    return noise_of(data.tau, data.trajectory)
 
 
 def step_of(values: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:

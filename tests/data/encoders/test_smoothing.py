@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.encoders import derivatives, labels_of_parts, low_pass, noise_of, sampling, smooth, step_of
+from dln_jax.data.encoders import (
+    derivatives,
+    labels_of_parts,
+    low_pass,
+    noise_of,
+    sampling,
+    smooth,
+    step_of,
+    torque_noise,
+)
 from dln_jax.data.encoders.filters import gain
+from dln_jax.data.splits import every
 from dln_jax.types import InputError
 
 RATE, SECONDS = 125.0, 10.0
@@ -214,3 +224,15 @@ def test_motions_within_noise_have_no_cut_off():
     noise = np.random.default_rng(0).normal(size=arrays["q"].shape)
     with pytest.raises(InputError, match="moves by more than its noise"):
         smooth(schema.from_arrays({**arrays, "q": 1e-4 * noise}))
+
+
+def test_noise_of_torques_is_told_only_from_samples_close_together():
+    t = np.arange(0, 20, 0.01)
+    motion = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    tau = 5 * motion + 0.1 * np.random.default_rng(0).normal(size=motion.shape)
+    data = schema.from_arrays(
+        {"t": t, "q": motion, "qd": motion, "qdd": motion, "tau": tau, "trajectory": np.zeros(len(t), int)}
+    )
+    np.testing.assert_allclose(torque_noise(data), 0.1, rtol=0.1)
+    assert torque_noise(every(data, 60)) is None
+    assert torque_noise(data._replace(trajectory=np.arange(len(t)))) is None

@@ -1,0 +1,186 @@
+"""Whether a fitted robot may be used: good, doubtful or refused, judged by its torques on held-out motions.
+
+Each joint's mean squared error e is compared with four numbers from the same samples: the variance v of its torque (the
+error of a guess of the mean), its mean square z (a guess of zero), the variance n of its noise, and the error of the
+robot's own file. A joint is
+
+    explained     e <= UNEXPLAINED v + NOISE n
+    unexplained   e >= v: a constant would have done as well
+    doubtful      in between
+    unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: nothing is said of it
+
+A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.types import InputError
+
+Level = Literal["good", "doubtful", "refused"]
+LEVELS: tuple[Level, ...] = ("good", "doubtful", "refused")
+"""In the order of the numbers that metrics.json holds: 0, 1 and 2."""
+UNEXPLAINED = 0.05
+"""Share of a torque's variance that a good model may leave unexplained: an rms error of 22 %."""
+NOISE = 2.0
+"""Errors up to this multiple of the noise's variance count as noise, which is itself an estimate."""
+WORSE, MUCH_WORSE = 0.01, 2.0
+"""A fit is worse than the robot's file if its mean nMSE is larger by the first; it is refused if it is larger by this
+factor as well."""
+CONSTANT = 1e-12
+"""A torque whose variance is a smaller share of the mean square of all torques does not vary."""
+
+
+class Verdict(NamedTuple):
+    """What to think of a fit, in words."""
+
+    level: Level
+    reason: str
+    """The numbers that it rests on."""
+    remedy: str = ""
+    """What to do; empty if the fit is good."""
+
+    @property
+    def number(self) -> int:
+        """0 good, 1 doubtful, 2 refused: the entry `verdict` of metrics.json."""
+        return LEVELS.index(self.level)
+
+    @property
+    def line(self) -> str:
+        """One line for the user."""
+        return f"verdict: {self.level}: {self.reason}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+class HeldOut(NamedTuple):
+    """Mean squares of each joint [d] over held-out samples, (N m)² or N²."""
+
+    error: Float[np.ndarray, " d"]
+    """Of the model's torques."""
+    mean: Float[np.ndarray, " d"]
+    """Of a guess of the mean: the torque's variance."""
+    zero: Float[np.ndarray, " d"]
+    """Of a guess of zero."""
+    noise: Float[np.ndarray, " d"] | None = None
+    """Variance of the measured torque's noise, where an estimate is at hand."""
+    file: Float[np.ndarray, " d"] | None = None
+    """Of the torques of the robot's own file, where there is one."""
+
+    @property
+    def unit(self) -> Float[np.ndarray, " d"]:
+        """What errors are divided by: the variance, or for a torque that does not vary the mean square of all."""
+        return np.where(self.mean > CONSTANT * self.zero.mean(), self.mean, self.zero.mean())
+
+
+class FitRefused(Exception):
+    """A fit that must not be used. Its run folder is complete but for files for a robot; commands end with status 1."""
+
+    def __init__(self, verdict: Verdict):
+        super().__init__(f"the fit is refused: {verdict.reason}; {verdict.remedy}")
+        self.verdict = verdict
+
+
+def held_out(
+    predicted: Float[np.ndarray, "N d"],
+    measured: Float[np.ndarray, "N d"],
+    *,
+    noise: Float[np.ndarray, " d"] | None = None,
+    file: Float[np.ndarray, "N d"] | None = None,
+) -> HeldOut:
+    """The numbers that a verdict rests on.
+
+    Args:
+        predicted: torques of the model.
+        measured: torques of motions that the model has not seen.
+        noise: standard deviation of each measured torque, such as `data.encoders.noise.noise_of`; not finite where it
+            is not known.
+        file: torques of the robot's own file.
+
+    Raises:
+        InputError: no samples.
+    """
+    if not len(measured):
+        raise InputError("there are no held-out samples to judge a fit by; hold out some motions")
+    variance = None if noise is None else np.where(np.isfinite(noise), noise, 0.0) ** 2
+    return HeldOut(
+        error=np.mean((predicted - measured) ** 2, axis=0),
+        mean=np.var(measured, axis=0),
+        zero=np.mean(measured**2, axis=0),
+        noise=variance,
+        file=None if file is None else np.mean((file - measured) ** 2, axis=0),
+    )
+
+
+def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
+    """The verdict of held-out torques.
+
+    Args:
+        found: the numbers.
+        names: of the joints; by default joint 1, joint 2, ...
+    """
+    names = [f"joint {k + 1}" for k in range(len(found.error))] if names is None else names
+    if not found.zero.any():
+        return Verdict("refused", "every held-out torque is zero", "record driven motions with measured torques")
+    share = found.error / found.unit
+    if not np.isfinite(share).all():
+        which = _listed(names, ~np.isfinite(share))
+        return Verdict("refused", f"the torque of {which} is not finite on held-out motions", "check the data")
+    noise = np.zeros_like(share) if found.noise is None else found.noise / found.unit
+    unseen = (noise >= 0.5) & (share > UNEXPLAINED) & (share <= NOISE * noise)
+    numbers = _numbers(found, share, noise, names)
+    unexplained = (share >= 1) & ~unseen
+    if share.mean() >= 1 or unexplained.any():
+        which = _listed(names, unexplained) if unexplained.any() else "the robot as a whole"
+        remedy = "check the sign, order and unit of tau, and the times of the log (check_data), or record more motions"
+        return Verdict("refused", f"the torque of {which} is predicted no better than by a constant: {numbers}", remedy)
+    worse = 0.0 if found.file is None else share.mean() - np.mean(found.file / found.unit)
+    if found.file is not None and worse > WORSE:
+        level = "refused" if share.mean() > MUCH_WORSE * np.mean(found.file / found.unit) else "doubtful"
+        remedy = "keep the file's values, or record more and different motions"
+        return Verdict(level, f"the robot's file predicts held-out torques better: {numbers}", remedy)
+    doubtful = (share > UNEXPLAINED + NOISE * noise) & ~unseen
+    if doubtful.any():
+        which = _listed(names, doubtful)
+        reason = f"more than {UNEXPLAINED:.0%} of the torque of {which} is unexplained: {numbers}"
+        remedy = "add what the model lacks (friction, a load), remove outliers, or record more motions; see check_data"
+        return Verdict("doubtful", reason, remedy)
+    if unseen.all():
+        reason = f"no torque rises above its noise: {numbers}"
+        return Verdict("doubtful", reason, "record faster motions, or sample them more often")
+    if unseen.any():
+        numbers += f"; the torque of {_listed(names, unseen)} does not rise above its noise"
+    return Verdict("good", numbers)
+
+
+def worst(first: Verdict, *others: Verdict) -> Verdict:
+    """The gravest of several verdicts; of equal ones that are not good, all reasons and remedies."""
+    every = [first, *others]
+    level = LEVELS[max(each.number for each in every)]
+    if level == "good":
+        return first
+    those = [each for each in every if each.level == level]
+    remedies = dict.fromkeys(each.remedy for each in those if each.remedy)
+    return Verdict(level, "; ".join(each.reason for each in those), "; ".join(remedies))
+
+
+def verdict_metrics(found: HeldOut, verdict: Verdict) -> dict[str, float | int]:
+    """Entries of metrics.json: the verdict as a number, and mean nMSE of what the model was compared with."""
+    compared = {"zero": found.zero, "noise": found.noise, "file": found.file}
+    means = {f"{name}_nmse": float(np.mean(each / found.unit)) for name, each in compared.items() if each is not None}
+    return {"verdict": verdict.number, **means}
+
+
+def _numbers(found: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
+    """All of the numbers as a phrase."""
+    worst = int(np.argmax(share))
+    compared = [f"a guess of zero {np.mean(found.zero / found.unit):.3g}"]
+    compared += [] if found.file is None else [f"the robot's file {np.mean(found.file / found.unit):.3g}"]
+    compared += [f"noise {noise.mean():.2g}"] if noise.any() else []
+    single = "" if len(share) == 1 else f", worst {names[worst]} {share[worst]:.3g}"
+    return f"held-out nMSE {share.mean():.3g}{single} ({', '.join(compared)})"
+
+
+def _listed(names: Sequence[str], chosen: np.ndarray) -> str:
+    return ", ".join(name for name, each in zip(names, chosen, strict=True) if each)
