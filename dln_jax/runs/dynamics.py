@@ -17,11 +17,12 @@ from dln_jax.runs.direct_fits import fit_directly
 from dln_jax.runs.dynamics_data import Recorded, read
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_ladder import climb_ladder
-from dln_jax.runs.dynamics_options import AUTO, Options, check_options
+from dln_jax.runs.dynamics_options import AUTO, Options, check_options, with_model
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
 from dln_jax.runs.dynamics_task import Task, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
+from dln_jax.runs.dynamics_verdict import refuse, say
 from dln_jax.runs.results import settings_of
 from dln_jax.scale.devices import device_lines
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
@@ -35,7 +36,9 @@ def run(given: Options, command: str) -> None:
 
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
+        FitRefused: held-out torques are predicted no better than by a constant, with a budget that was not limited.
     """
+    given, chosen_for = with_model(given)
     mesh, recorded = mesh_of(given), read(given)
     chosen = None
     if given.model == AUTO:
@@ -43,7 +46,7 @@ def run(given: Options, command: str) -> None:
     else:
         chosen = task_of(given, recorded)
     with command_folder(given, command) as folder:
-        announce(recorded)
+        announce(recorded, chosen_for)
         if chosen is None:
             task, training = climb_ladder(given, recorded, folder, mesh)
         else:
@@ -58,7 +61,7 @@ def run(given: Options, command: str) -> None:
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
         unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        metrics = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
+        metrics, judged = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
@@ -71,9 +74,11 @@ def run(given: Options, command: str) -> None:
             print(f"the run keeps seed {given.seed + best}, the best in validation")
         print(f"run folder: {folder}")
         warn(task, training, folder)
+        say(judged)
+        refuse(judged, given)
 
 
-def announce(recorded: Recorded) -> None:
+def announce(recorded: Recorded, chosen_for: str) -> None:
     """Says what is trained on, and what was assumed."""
     counts = ", ".join(f"{len(part.t)} {role}" for role, part in recorded.sets._asdict().items())
     needs = recorded.needs
@@ -82,7 +87,7 @@ def announce(recorded: Recorded) -> None:
     print(f"{'-'.join(needs.joints)} with {' and '.join(terms)} ({recorded.needs_origin})")
     if needs.joint_friction:
         print(f"friction of joints: {', '.join(needs.joint_friction)}")
-    for line in recorded.said:
+    for line in (*recorded.said, *([chosen_for] if chosen_for else [])):
         print(line)
 
 

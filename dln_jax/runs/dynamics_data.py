@@ -12,7 +12,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, Split, in_blocks, split
+from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.sketch import Sketch, sketch_from_json
@@ -22,10 +22,10 @@ from dln_jax.scenes.registry import scene_named
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.catalogue import entry_of
 
-SETTLED = ("split", "friction")
-"""Checks of a log that the ladder answers itself."""
+USES = ("training", "validation", "the test")
+"""Of the parts of a split, in their order."""
 
 
 class Recorded(NamedTuple):
@@ -58,6 +58,11 @@ def read(given: Options) -> Recorded:
         data, name = default_data(scene), f"default data of {scene.name}"
         if labels is None and scene.name == "two-link-arm":
             labels = CHARACTERS_TEST
+    if "tau" in data.estimated:
+        raise InputError(
+            f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+        )
     robot = robot_of(given)
     if robot is not None:
         data = with_joints(data, robot.tree.names)
@@ -71,19 +76,27 @@ def read(given: Options) -> Recorded:
             f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
         )
     data = data._replace(needs=needs)
-    found = checked(data, without=SETTLED if given.model == AUTO else ()) if given.data is not None else []
+    rubbing = bool(needs.friction or needs.joint_friction)
+    cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
+    settled = (*["split"] * cut, *["friction"] * rubbing)
+    found = checked(data, without=settled) if given.data is not None else []
     filtered = smoothed(given, data)
     said = [*preparation(data, filtered), *found]
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
-    if given.model == AUTO and labels is None and len(np.unique(data.trajectory)) == 1:
+    recordings = len(np.unique(data.trajectory))
+    if cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
-        said.append(f"one trajectory: taken as {BLOCKS} blocks of time, some for validation and for the test")
     parents = parents_of(given, needs.degrees_of_freedom)
+    sets = split(data, test=labels, seed=given.seed)
+    if len(np.unique(data.trajectory)) > recordings:
+        counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
+        which = "one recording" if recordings == 1 else f"{recordings} recordings"
+        said.append(f"{which}: cut into blocks of time, {', '.join(counts)}")
     return Recorded(
         name=name,
-        sets=split(data, test=labels, seed=given.seed),
+        sets=sets,
         scene=scene,
         needs=needs,
         needs_origin=origin,
@@ -101,7 +114,7 @@ def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot:
     scale = given.velocity_scale if isinstance(given, ArmOptions) else None
     if scale is None:
         return needs, origin
-    trees = given.model == AUTO or CATALOGUE[given.model].properties.searched
+    trees = given.model == AUTO or entry_of(str(given.model)).properties.searched
     if not (needs.joint_friction or (trees and needs.friction)):
         raise InputError(
             "--velocity-scale is for dry friction of joints, which the needs do not state; "
@@ -121,8 +134,8 @@ def _needs_and_origin(
         return data.needs, "the data file"
     if robot is not None:
         return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
-    needs, origin = Needs(joints=("revolute",) * data.degrees_of_freedom), "assumed: nothing states the needs"
-    return (needs._replace(joint_friction=USUAL) if given.model == AUTO else needs), origin
+    needs = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
+    return needs, "assumed: neither the file nor --needs says"
 
 
 def robot_of(given: Options) -> Robot | None:

@@ -22,6 +22,7 @@ from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_task import Task
 from dln_jax.runs.dynamics_uncertainty import uncertainty_metrics
+from dln_jax.runs.dynamics_verdict import Judged, judge_torques
 from dln_jax.runs.results import cost_metrics, print_numbers, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -39,6 +40,10 @@ CEILINGS = {
 """Metrics of a rollout, and the names of what the true plant gets."""
 MEANINGS = {
     "torque_mse": "torque, mean square error",
+    "test_nmse": "torque, error over variance, mean of joints",
+    "validation_nmse": "the same, on validation motions",
+    "zero_nmse": "the same, of a guess of zero",
+    "noise_nmse": "the same, of the noise of the torques",
     "forward_mse": "acceleration, mean square error",
     "validation_error": "validation error, sum over joints",
     "power_mse": "power, mean square error",
@@ -66,8 +71,8 @@ MEANINGS = {
 
 def evaluate(
     folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
-) -> dict[str, float | int]:
-    """Loads the stored model as a user would, measures it on the test trajectories, and draws it."""
+) -> tuple[dict[str, float | int], Judged]:
+    """Loads the stored model as a user would, measures it on the test trajectories, judges it, and draws it."""
     dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
     functions, model = run.dynamics, build(task.description)
     predicted = predictions(run.energies, test, dtype, mesh=mesh)
@@ -79,8 +84,10 @@ def evaluate(
         models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
         of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
+    judged = judge_torques(run.energies, task, predicted["tau"], mesh=mesh)
     return {
         **errors(predicted, test),
+        **judged.metrics,
         **spread,
         **definiteness_metrics(functions, task),
         **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
@@ -92,7 +99,7 @@ def evaluate(
             parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
         ),
-    }
+    }, judged
 
 
 def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
@@ -179,12 +186,13 @@ def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
     """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
+    units |= {key: "1" for key in metrics if key.endswith("_nmse")}
     units |= {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
     units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
     rows = []
     for key, value in metrics.items():
-        if key not in CEILINGS.values():
+        if key not in CEILINGS.values() and key != "verdict":
             ceiling = metrics.get(CEILINGS.get(key, ""))
             beside = ["" if ceiling is None else number(key, ceiling)] * known
             rows.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
@@ -198,7 +206,7 @@ def number(metric: str, value: int | float) -> str:
     """As a user wants to see it."""
     if isinstance(value, int):
         return f"{value:,}"
-    tiny = any(word in metric for word in ("_mse", "error", "eigenvalue", "condition"))
+    tiny = any(word in metric for word in ("_mse", "_nmse", "error", "eigenvalue", "condition"))
     return (
         f"{value:.2e}"
         if tiny

@@ -81,10 +81,10 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Tas
     Raises:
         InputError: options that it does not read, or data that it cannot be fitted to.
     """
-    sets, kind = recorded.sets, given.model
+    sets, kind = recorded.sets, str(given.model)
     if not checked:
         check_options(given, kind)
-    objective = objective_of(kind, sets.train)
+    objective = objective_of(kind, sets.train, given.objective)
     if objective is TORQUE and given.target is None:
         objective = SCALED_TORQUE
     description, optimiser, samples, reason = model_and_optimiser(given, kind, recorded, objective)
