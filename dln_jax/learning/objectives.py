@@ -51,6 +51,13 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     return _scale("tau", data.tau, message)
 
 
+def require_scales(data: Trajectories) -> None:
+    """Raises `InputError` where no model can be fitted to torques: they do not vary, or numbers are far too large."""
+    for key in ("q", "qd", "qdd"):
+        spread(key, getattr(data, key))
+    torque_scale(data)
+
+
 TORQUE = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=torque_scale,

@@ -12,7 +12,7 @@ from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
+from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, torque_scale
 from dln_jax.runs.direct_fits import fit_directly
 from dln_jax.runs.dynamics_data import Recorded, read
 from dln_jax.runs.dynamics_growth import grow_to_target
@@ -43,6 +43,7 @@ def run(given: Options, command: str) -> None:
     chosen = None
     if given.model == AUTO:
         check_options(given, AUTO)
+        require_scales(recorded.sets.train)
     else:
         chosen = task_of(given, recorded)
     with command_folder(given, command) as folder:

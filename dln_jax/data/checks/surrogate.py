@@ -83,7 +83,7 @@ def surrogate(data: Trajectories, joints: Sequence[str], *, farthest: int) -> Su
         centred = np.maximum(np.sum((shifted - shifted.mean(axis=0)) ** 2, axis=0), np.finfo(float).tiny)
         late = np.maximum(np.sum(shifted**2, axis=0) - np.sum((basis.T @ shifted) ** 2, axis=0), 0.0) / centred
         left = tau - basis @ (basis.T @ tau)
-        error = max(float(left @ left), 1e-20 * variance)
+        error = max(float(left @ left), 1e-20 * variance, np.finfo(float).tiny)
         out["explained"].append(1 - error / variance)
         out["late"].append(late)
         without = _basis(common)
