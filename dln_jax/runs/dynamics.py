@@ -20,7 +20,7 @@ from dln_jax.runs.dynamics_ladder import climb_ladder
 from dln_jax.runs.dynamics_options import AUTO, Options, check_options, with_model
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
 from dln_jax.runs.dynamics_task import Task, task_of
-from dln_jax.runs.dynamics_training import train
+from dln_jax.runs.dynamics_training import cross_validated, train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
 from dln_jax.runs.dynamics_verdict import refuse, say
 from dln_jax.runs.results import settings_of
@@ -57,7 +57,7 @@ def run(given: Options, command: str) -> None:
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
             )
-        parameters, best = best_seed(training, given.seeds)
+        parameters, best = best_seed(training, given.seeds, task.best)
         save(folder, task.description, parameters)
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
@@ -72,7 +72,8 @@ def run(given: Options, command: str) -> None:
         write_config(folder, given, **task.description, **optimiser, **more, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
-            print(f"the run keeps seed {given.seed + best}, the best in validation")
+            by = "validation" if task.best is None else "cross-validation"
+            print(f"the run keeps seed {given.seed + best}, the best in {by}")
         print(f"run folder: {folder}")
         warn(task, training, folder)
         say(judged)
@@ -109,7 +110,10 @@ def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tupl
         return fit_directly(task, given)
     if given.target is not None:
         return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
-    return task, train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    if given.seeds > 1 and given.folds > 1:
+        task = cross_validated(task, task.solver, folder, folds=given.folds, resume=given.resume, mesh=mesh)
+    return task, training
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:

@@ -74,7 +74,10 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     seed: int = 0
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
-    """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+    """Train so many seeds, --seed and those after it, in one program; kept is the best in cross-validation."""
+    folds: int = 3
+    """With --seeds: parts of the training and validation motions that each seed is also trained without, one after the
+    other; the seed that predicts them best is kept (1: by the validation motions, without these trainings)."""
     uncertainty: bool = True
     """Store how uncertain the torque is at any state and whether a state is outside the data, and test both."""
 
@@ -120,7 +123,7 @@ def check_options(given: Options, kind: str) -> None:
     """Refuses options that the model does not read."""
     if given.data is None:
         refuse_given(given, ["rate", "units"], "for a file: add --data")
-    require_positive(seeds=given.seeds)
+    require_positive(seeds=given.seeds, folds=given.folds)
     require_seed(given.seed, given.seeds)
     if isinstance(given, ArmOptions):
         check_arm_options(given, kind)
@@ -129,7 +132,7 @@ def check_options(given: Options, kind: str) -> None:
             given,
             ("degree", "precision", "samples", "objective"),
             "the ladder",
-            "chooses by the torques of validation motions",
+            "chooses by validation",
         )
         return
     properties = CATALOGUE[kind].properties

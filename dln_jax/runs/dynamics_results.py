@@ -92,22 +92,29 @@ def evaluate(
         **definiteness_metrics(functions, task),
         **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
         **rollouts(functions, task),
-        **({"validation_error": float(np.min(training.validation))} if training.history else {}),
+        **validation_metrics(training, seeds, task.best),
         **cost_metrics(
             training,
             latency,
             parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
-            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
+            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
     }, judged
 
 
-def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
-    """Parameters and index of the seed with the lowest validation error."""
+def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
+    """Parameters and index of the chosen seed, by default the one with the lowest validation error."""
     if seeds == 1:
         return training.parameters, 0
-    best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
+    if best is None or not np.isfinite(training.validation[best]):
+        best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
     return parameters_of(training, best), best
+
+
+def validation_metrics(training: Training, seeds: int, best: int | None) -> dict[str, float]:
+    """The validation error of the model that is kept."""
+    errors = np.ravel(training.validation)
+    return {"validation_error": float(errors[best_seed(training, seeds, best)[1]])} if training.history else {}
 
 
 def parameters_of(training: Training, index: int) -> Any:
