@@ -9,7 +9,7 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau` | [N, d] | N m or N | zero if absent |
 | `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
-| `trajectory` | [N] int | | index of the trajectory that a sample belongs to; any number >= 0 without `label`; one recording if absent |
+| `trajectory` | [N] int | | index of a sample's trajectory; any number >= 0 without `label`; one recording if absent |
 | `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
 | `joint_names` | [d] str | | optional, the joint of each column |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
