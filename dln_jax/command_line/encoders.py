@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,25 @@ FILTERED = (
 
 
 @dataclass(frozen=True)
-class Filtered:
+class Logged:
+    """What a log does not say of itself."""
+
+    rate: Unstated[float] = None
+    """Hz, at which a file without t was sampled."""
+    units: Unstated[Literal["si", "degrees"]] = None
+    """CSV: units of titles that state none; degrees: of angles, and SI for the rest."""
+
+
+@dataclass(frozen=True)
+class Checked(Logged):
+    """What becomes of a log with errors."""
+
+    accept_log: bool = False
+    """Go on although the check of the log found errors, which then are warnings."""
+
+
+@dataclass(frozen=True)
+class Filtered(Checked):
     """How rates come about where a log has none that can be trusted."""
 
     cutoff: Unstated[str] = None
@@ -30,8 +48,6 @@ class Filtered:
     (default: the rates of the file, by finite differences where it has none)."""
     decimate: Unstated[int] = None
     """With --cutoff: keep every so manyth sample, of filtered torques too (default: 1, and torques as they are)."""
-    accept_log: bool = False
-    """Go on although the check of the log found errors, which then are warnings."""
 
 
 def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
@@ -83,7 +99,7 @@ def fitted_torque(found: Smoothed | None) -> str:
     return f"torques low-passed at {found.cutoff:.3g} Hz (measured ones scatter more)"
 
 
-def checked(given: Filtered, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
+def checked(given: Checked, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
     """What the quick part of `check_data` finds, a line each; none where nothing is found.
 
     Args:
@@ -95,7 +111,8 @@ def checked(given: Filtered, data: Trajectories, path: Path, *, without: Collect
     Raises:
         InputError: an error was found, and --accept-log was not given.
     """
-    settled = {*without, *(FILTERED if given.cutoff is not None else ())}
+    filtered = isinstance(given, Filtered) and given.cutoff is not None
+    settled = {*without, *(FILTERED if filtered else ())}
     found = [finding for finding in quick(data) if finding.check not in settled]
     if not found:
         return []

@@ -92,7 +92,7 @@ def run(
 
 @contextlib.contextmanager
 def as_one_line(prog: str, given: Any) -> Iterator[None]:
-    """Turns mistakes and what the machine lacks into one line and status 2, a refused fit into 1, interrupts into 130."""
+    """Turns mistakes into one line and status 2, as what the machine lacks; a refused fit is 1, an interrupt 130."""
     try:
         yield
     except FitRefused as error:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dln_jax.command_line.arguments import Unstated, names_listed, refuse_given
+from dln_jax.command_line.encoders import Logged
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
 from dln_jax.data.checks import Examination, examine, page, read
@@ -22,11 +23,11 @@ from dln_jax.files import write_bytes, write_figure, write_json
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments(Folder, Drawn):
+class Arguments(Folder, Drawn, Logged):
     """What to examine."""
 
     data: Path
-    """Log in the npz schema: t, q and trajectory, and tau, qd and qdd where there are any."""
+    """Log as npz or CSV: t and q, and tau, qd, qdd and trajectory where there are any."""
     robot: Unstated[Path] = None
     """URDF or MJCF of the robot (needs MuJoCo)."""
     hold: Unstated[str] = None
@@ -36,7 +37,7 @@ class Arguments(Folder, Drawn):
 
 def main(given: Arguments) -> None:
     """Examines, prints and writes."""
-    recording = read(given.data)
+    recording = read(given.data, rate=given.rate, units=given.units)
     if given.robot is None:
         refuse_given(given, ["hold"], "for joints of --robot")
     robot = None if given.robot is None else read_robot(given.robot, hold=names_listed(given.hold))

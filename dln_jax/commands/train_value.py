@@ -40,7 +40,7 @@ from dln_jax.runs.values import (
     usual,
 )
 from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
-from dln_jax.types import require_positive, require_seed
+from dln_jax.types import InputError, require_positive, require_seed
 
 
 @dataclass(frozen=True)

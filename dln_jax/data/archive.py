@@ -25,19 +25,32 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 """Of the versions in which NumPy writes numbers and strings."""
 
 
-def load(path: str | Path, from_arrays: Callable[[dict[str, Any]], Data], keys: Sequence[str]) -> Data:
+def load(
+    path: str | Path,
+    from_arrays: Callable[[dict[str, Any]], Data],
+    keys: Sequence[str],
+    *,
+    table: Callable[[Path], tuple[dict[str, Any], list[str]]] | None = None,
+) -> Data:
     """Reads the arrays of these keys, where the file has them, and hands them to `from_arrays`, which checks them.
+
+    Args:
+        path: of an npz file.
+        from_arrays: arrays by key -> what they are.
+        keys: those that are read.
+        table: reads a file whose name ends in .csv: the arrays by key, and what it does not read.
 
     Raises:
         InputError: the file is missing, is no npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
-            `from_arrays` refuses its arrays (the message then starts with the path).
+            `from_arrays` or `table` refuses what it holds (the message then starts with the path).
     """
     path = Path(path)
     if not is_file(path):
-        raise InputError(f"{path!s:.200}: no such file; give the path of an npz file")
+        kinds = "an npz file" if table is None else "an npz or CSV file"
+        raise InputError(f"{path!s:.200}: no such file; give the path of {kinds}")
     unread: list[str] = []
     try:
-        arrays, unread = _read(path, keys)
+        arrays, unread = table(path) if table and path.suffix.lower() == ".csv" else _read(path, keys)
         return from_arrays(arrays)
     except InputError as error:
         beside = f" (keys that are not read: {', '.join(unread)[:200]})" if unread else ""

@@ -1,4 +1,4 @@
-"""The one schema of trajectory files: what is in an npz, how it is read, checked and written.
+"""The one schema of trajectory files: what is in an npz or a CSV file, how it is read, checked and written.
 
 Samples of all trajectories are concatenated on axis 0.
 
@@ -9,7 +9,7 @@ Samples of all trajectories are concatenated on axis 0.
 | `tau` | [N, d] | N m or N | zero if absent |
 | `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
-| `trajectory` | [N] int | | index of the trajectory that a sample belongs to; any number >= 0 without `label` |
+| `trajectory` | [N] int | | index of a sample's trajectory; any number >= 0 without `label`; one recording if absent |
 | `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
 | `joint_names` | [d] str | | optional, the joint of each column |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
@@ -17,17 +17,19 @@ Samples of all trajectories are concatenated on axis 0.
 
 import json
 import reprlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 
-from dln_jax.data import archive
+from dln_jax.data import archive, csv_tables
 from dln_jax.data.archive import numeric
 from dln_jax.files import is_file, matches, writing
 from dln_jax.mechanics.friction import require_laws
-from dln_jax.types import InputError, JointKind, Needs
+from dln_jax.types import InputError, JointKind, Needs, require_positive
 
+Data = TypeVar("Data")
 JOINTS = get_args(JointKind)
 RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
@@ -62,13 +64,53 @@ class Trajectories(NamedTuple):
         return self.q.shape[1]
 
 
-def load(path: str | Path) -> Trajectories:
-    """Reads and checks a file; never unpickles.
+def load(path: str | Path, *, rate: float | int | None = None, units: str | None = None) -> Trajectories:
+    """Reads and checks an npz or CSV file; never unpickles.
+
+    Args:
+        path: of the file; CSV if its name ends in .csv (see `data.csv_tables`).
+        rate: Hz, at which every trajectory was sampled, for a file without t.
+        units: of a CSV file's titles without a unit, "si" or "degrees".
 
     Raises:
-        InputError: the file is missing, is no npz, holds pickled objects, or breaks the schema.
+        InputError: the file is missing, is no npz, holds pickled objects, is malformed CSV, or breaks the schema.
     """
-    return archive.load(path, from_arrays, KEYS)
+    return load_arrays(path, from_arrays, rate=rate, units=units)
+
+
+def load_arrays(
+    path: str | Path, from_arrays: Callable[[dict[str, Any]], Data], *, rate: float | int | None, units: str | None
+) -> Data:
+    """What `from_arrays` makes of a file's arrays, which have t and trajectory; arguments and errors as `load`."""
+    if units is not None and Path(path).suffix.lower() != ".csv":
+        raise InputError(f"{path!s:.200}: units are for CSV; the arrays of an npz file are in SI units")
+    return archive.load(
+        path,
+        lambda arrays: from_arrays(with_times(arrays, rate)),
+        KEYS,
+        table=lambda path: csv_tables.read(path, units=units),
+    )
+
+
+def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
+    """The arrays with t, by the rate where it is absent, and with trajectory, one recording where that is.
+
+    Raises:
+        InputError: neither t nor a rate, both, or a rate that is not positive.
+    """
+    if "q" not in arrays:
+        return arrays  # which `from_arrays` refuses
+    samples = len(np.atleast_1d(np.asarray(arrays["q"])))
+    if rate is None and "t" not in arrays:
+        raise InputError("key 't' is missing; add the time of each sample in seconds, or say --rate HZ")
+    arrays = {"trajectory": np.zeros(samples, int), **arrays}
+    if rate is None:
+        return arrays
+    require_positive(rate=rate)
+    if "t" in arrays:
+        raise InputError("the file has t, so its rate is known; leave --rate out")
+    starts = np.flatnonzero(np.diff(np.asarray(arrays["trajectory"]), prepend=np.nan))
+    return {**arrays, "t": (np.arange(samples) - np.repeat(starts, np.diff(starts, append=samples))) / rate}
 
 
 def column(data: Trajectories, key: str) -> np.ndarray:
@@ -251,7 +293,10 @@ def _require_increasing_time(t: np.ndarray, trajectory: np.ndarray, label: np.nd
     if backward.any():
         sample = int(np.flatnonzero(backward)[0]) + 1
         name = label[trajectory[sample]]
-        raise InputError(f"t does not increase at sample {sample} of trajectory '{name}'; sort the samples by time")
+        raise InputError(
+            f"t does not increase at sample {sample} of trajectory '{name}'; sort the samples by time, and number "
+            "recordings that follow one another in a column 'trajectory'"
+        )
 
 
 def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *, name: str) -> np.ndarray:

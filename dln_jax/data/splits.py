@@ -12,8 +12,10 @@ from dln_jax.types import InputError, require_positive, require_seed
 PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 
 
+LEAST_TRAJECTORIES = 3
+"""That can be split: one to train on, one to validate by and one for the test."""
 BLOCKS = 10
-"""Of one trajectory, where there is no other to be judged by."""
+"""Of time, into which each trajectory is cut where there are fewer."""
 
 
 class Split(NamedTuple):

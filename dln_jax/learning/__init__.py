@@ -24,12 +24,13 @@ from dln_jax.learning.friction import fit_friction
 from dln_jax.learning.growth import grow
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
-from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, TORQUE, Objective, objective_of
+from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, FORWARD, TORQUE, Objective, objective_of
 from dln_jax.learning.rates import match_linear
 
 __all__ = [
     "BOTH_WAYS",
     "CANONICAL",
+    "FORWARD",
     "TORQUE",
     "Adam",
     "Checkpoint",

@@ -51,6 +51,13 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
     return _scale("tau", data.tau, message)
 
 
+def require_scales(data: Trajectories) -> None:
+    """Raises `InputError` where no model can be fitted to torques: they do not vary, or numbers are far too large."""
+    for key in ("q", "qd", "qdd"):
+        spread(key, getattr(data, key))
+    torque_scale(data)
+
+
 TORQUE = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=torque_scale,
@@ -90,6 +97,14 @@ def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
     return jnp.concatenate([torque_scale(data), _scale("qdd", data.qdd, still)])
 
 
+FORWARD = Objective(
+    keys=("q", "qd", "qdd", "tau"),
+    scale=lambda data: _both_scales(data)[data.degrees_of_freedom :],
+    residual=lambda system, q, qd, qdd, tau: dynamics(system).forward_dynamics(q, qd, tau) - qdd,
+    selects_by="scaled",
+)
+"""qdd_hat(q, qd, tau) - qdd."""
+
 BOTH_WAYS = Objective(
     keys=("q", "qd", "qdd", "tau"),
     scale=_both_scales,
@@ -98,12 +113,29 @@ BOTH_WAYS = Objective(
     ),
     selects_by="scaled",
 )
-"""[tau_hat - tau, qdd_hat - qdd], for models whose inverse and forward sides are different networks."""
+"""[tau_hat - tau, qdd_hat - qdd], each in units of its standard deviation in the training samples: the loss of Lutter
+and Peters (2021, arXiv:2110.01894); also for models whose inverse and forward sides are different networks."""
+
+STATED = {"inverse": TORQUE, "forward": FORWARD, "both": BOTH_WAYS}
+"""The objectives that a user may ask for by name."""
 
 
-def objective_of(name: str, data: Trajectories) -> Objective:
-    """What a model of the catalogue is fitted to: without momenta in the data, a Hamiltonian is fitted to torques."""
+def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Objective:
+    """What a model of the catalogue is fitted to: without momenta in the data, a Hamiltonian is fitted to torques.
+
+    Args:
+        name: of the model.
+        data: for training.
+        stated: from `STATED`, in place of the model's own.
+
+    Raises:
+        InputError: one of two sides is asked for of a model that is no energy, whose other side would not be trained.
+    """
     properties = CATALOGUE[name].properties
+    if stated is not None:
+        if not properties.energy and stated != "both":
+            raise InputError(f"a {name} model has no energy, so both of its sides are trained; leave --objective out")
+        return STATED[stated]
     objective = CANONICAL if properties.canonical else TORQUE if properties.energy else BOTH_WAYS
     complete = all(getattr(data, key) is not None for key in objective.keys)
     return objective if complete else TORQUE

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dln_jax.learning import dynamics
-from dln_jax.learning.engine.problem import Progress, Stop, Training
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Progress, Stop, Training, one_after_the_other
 from dln_jax.learning.kernel import choose_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import choose_degrees, fit_linear
@@ -15,12 +17,43 @@ from dln_jax.models.model import Parameters
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_options import Options
 from dln_jax.runs.dynamics_task import Task, needs_of_tree
+from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 
+REFINEMENTS = 50
+"""Steps of Gauss-Newton from a linear fit, at most: it starts near the minimum."""
+
 
 def fit_directly(task: Task, given: Options) -> tuple[Task, Training]:
-    """The fit of the task's model, and the task with whatever of the model it has chosen."""
+    """The fit of the task's model, and the task with whatever of the model it has chosen.
+
+    Such fits are to torques; for another objective they are where Gauss-Newton starts.
+    """
+    task, training = _fitted_to_torques(task, given)
+    return task, training if task.objective.of_torques else refined(task, training)
+
+
+def refined(task: Task, start: Training) -> Training:
+    """The fit of the task's objective from the parameters of another; those are kept if validation prefers them.
+
+    Raises:
+        InputError: the model has too many parameters for Gauss-Newton, or a type in which that does not work.
+    """
+    model = build(task.description)
+    suited, reason = dynamics.suited_optimiser(model, task.sets, task.objective)
+    if suited is not GaussNewton or task.precision != "f64":
+        why = reason if task.precision == "f64" else "the precision is f32"
+        raise InputError(f"--objective refines a {task.kind} model by Gauss-Newton in f64, but {why}; leave it out")
+    problem = dynamics.problem(model, task.sets, task.objective)._replace(parameters=start.parameters)
+    found = fit(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=task.seconds, must_start=False)
+    history = one_after_the_other([start.history, found.history])
+    print(f"refined by both sides' errors: validation {start.validation:.2e}, after it {found.validation:.2e}")
+    better = np.isfinite(found.validation) and found.validation < start.validation
+    return (found if better else start)._replace(history=history, compile_seconds=found.compile_seconds)
+
+
+def _fitted_to_torques(task: Task, given: Options) -> tuple[Task, Training]:
     properties = CATALOGUE[task.kind].properties
     if properties.searched:
         return fit_learned_tree(task, given)

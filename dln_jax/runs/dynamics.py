@@ -12,17 +12,17 @@ from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.objectives import SCALED_TORQUE, torque_scale
-from dln_jax.metrics.verdict import FitRefused
+from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, torque_scale
 from dln_jax.runs.direct_fits import fit_directly
 from dln_jax.runs.dynamics_data import Recorded, read
 from dln_jax.runs.dynamics_growth import grow_to_target
 from dln_jax.runs.dynamics_ladder import climb_ladder
-from dln_jax.runs.dynamics_options import AUTO, Options, check_options
+from dln_jax.runs.dynamics_options import AUTO, Options, check_options, with_model
 from dln_jax.runs.dynamics_results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
 from dln_jax.runs.dynamics_task import Task, task_of
-from dln_jax.runs.dynamics_training import train
+from dln_jax.runs.dynamics_training import cross_validated, train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
+from dln_jax.runs.dynamics_verdict import refuse, say
 from dln_jax.runs.results import settings_of
 from dln_jax.scale.devices import device_lines
 from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
@@ -36,17 +36,19 @@ def run(given: Options, command: str) -> None:
 
     Raises:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
-        FitRefused: the model predicts held-out torques no better than a guess, and neither --steps nor --seconds cut
-            its training short; the run folder is complete.
+        FitRefused: the model predicts held-out torques no better than a constant, and neither --steps nor --seconds
+            cut its training short; the run folder is complete.
     """
+    given, chosen_for = with_model(given)
     mesh, recorded = mesh_of(given), read(given)
     chosen = None
     if given.model == AUTO:
         check_options(given, AUTO)
+        require_scales(recorded.sets.train)
     else:
         chosen = task_of(given, recorded)
     with command_folder(given, command) as folder:
-        announce(recorded)
+        announce(recorded, chosen_for)
         if chosen is None:
             task, training = climb_ladder(given, recorded, folder, mesh)
         else:
@@ -56,35 +58,31 @@ def run(given: Options, command: str) -> None:
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
             )
-        parameters, best = best_seed(training, given.seeds)
+        parameters, best = best_seed(training, given.seeds, task.best)
         save(folder, task.description, parameters)
         if given.uncertainty:
             store_uncertainty(folder, task, parameters)
         unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        metrics, verdict = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
+        metrics, judged = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
         if given.low_latency:
             metrics |= low_latency_metrics(folder, latency_states(task), print)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
         more = {"cutoff_hz": recorded.cutoff, "validation_units": unit}
         more = {name: value for name, value in more.items() if value is not None}
-        more |= {} if verdict is None else {"verdict": verdict._asdict()}
+        more |= {} if judged.verdict is None else {"verdict": judged.verdict._asdict()}
         write_config(folder, given, **task.description, **optimiser, **more, seeds=task.seeds)
         print_metrics(metrics, task)
         if given.seeds > 1:
-            print(f"the run keeps seed {given.seed + best}, the best in validation")
-        if verdict is not None:
-            print(verdict.line)
+            by = "validation" if task.best is None else "cross-validation"
+            print(f"the run keeps seed {given.seed + best}, the best in {by}")
         print(f"run folder: {folder}")
         warn(task, training, folder)
-        if verdict is not None and verdict.level == "refused":
-            # A network that the user's own limit left unfinished is no failure of the command.
-            if task.solver is None or (given.steps is None and given.seconds is None):
-                raise FitRefused(verdict)
-            print("warning: training ended at the limit that you set; give it more --steps or --seconds")
+        say(judged)
+        refuse(judged, task, given)
 
 
-def announce(recorded: Recorded) -> None:
+def announce(recorded: Recorded, chosen_for: str) -> None:
     """Says what is trained on, and what was assumed."""
     counts = ", ".join(f"{len(part.t)} {role}" for role, part in recorded.sets._asdict().items())
     needs = recorded.needs
@@ -93,7 +91,7 @@ def announce(recorded: Recorded) -> None:
     print(f"{'-'.join(needs.joints)} with {' and '.join(terms)} ({recorded.needs_origin})")
     if needs.joint_friction:
         print(f"friction of joints: {', '.join(needs.joint_friction)}")
-    for line in recorded.said:
+    for line in (*recorded.said, *([chosen_for] if chosen_for else [])):
         print(line)
 
 
@@ -114,7 +112,10 @@ def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tupl
         return fit_directly(task, given)
     if given.target is not None:
         return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
-    return task, train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    if given.seeds > 1 and given.folds > 1:
+        task = cross_validated(task, task.solver, folder, folds=given.folds, resume=given.resume, mesh=mesh)
+    return task, training
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:

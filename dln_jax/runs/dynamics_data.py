@@ -12,7 +12,7 @@ from dln_jax.data.encoders import labels_of_parts
 from dln_jax.data.joints import with_joints
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.splits import BLOCKS, Split, in_blocks, split
+from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
 from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.files import read_json
 from dln_jax.learning.kinematics.sketch import Sketch, sketch_from_json
@@ -22,10 +22,10 @@ from dln_jax.scenes.registry import scene_named
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
-from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.catalogue import entry_of
 
-SETTLED = ("split", "friction")
-"""Checks of a log that the ladder answers itself."""
+USES = ("training", "validation", "the test")
+"""Of the parts of a split, in their order."""
 
 
 class Recorded(NamedTuple):
@@ -54,7 +54,7 @@ def read(given: Options) -> Recorded:
     scene = scene_named(given.scene) if given.scene else None
     labels = tuple(given.test.split(",")) if given.test else None
     if given.data is not None:
-        data, name = schema.load(given.data), str(given.data)
+        data, name = schema.load(given.data, rate=given.rate, units=given.units), str(given.data)
     else:
         scene = scene or two_link_arm()
         data, name = default_data(scene), f"default data of {scene.name}"
@@ -64,6 +64,11 @@ def read(given: Options) -> Recorded:
     if robot is not None:
         data = with_joints(data, robot.tree.names)
     needs, origin = stated_needs(given, scene, data, robot)
+    if "tau" in data.estimated:
+        raise InputError(
+            f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+        )
     if needs.degrees_of_freedom != data.degrees_of_freedom:
         raise InputError(
             f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
@@ -73,21 +78,27 @@ def read(given: Options) -> Recorded:
             f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
         )
     data = data._replace(needs=needs)
-    found = (
-        [] if given.data is None else checked(given, data, given.data, without=SETTLED if given.model == AUTO else ())
-    )
+    rubbing = bool(needs.friction or needs.joint_friction)
+    cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
+    settled = (*["split"] * cut, *["friction"] * rubbing)
+    found = [] if given.data is None else checked(given, data, given.data, without=settled)
     filtered = smoothed(given, data)
     said = [*preparation(data, filtered), *found]
     if filtered is not None:
         data = filtered.data
         labels = None if labels is None else labels_of_parts(data, labels)
-    if given.model == AUTO and labels is None and len(np.unique(data.trajectory)) == 1:
+    recordings = len(np.unique(data.trajectory))
+    if cut and recordings < LEAST_TRAJECTORIES:
         data = in_blocks(data, BLOCKS)
-        said.append(f"one trajectory: taken as {BLOCKS} blocks of time, some for validation and for the test")
     parents = parents_of(given, needs.degrees_of_freedom)
+    sets = split(data, test=labels, seed=given.seed)
+    if len(np.unique(data.trajectory)) > recordings:
+        counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
+        which = "one recording" if recordings == 1 else f"{recordings} recordings"
+        said.append(f"{which}: cut into blocks of time, {', '.join(counts)}")
     return Recorded(
         name=name,
-        sets=split(data, test=labels, seed=given.seed),
+        sets=sets,
         scene=scene,
         needs=needs,
         needs_origin=origin,
@@ -106,7 +117,7 @@ def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot:
     scale = given.velocity_scale if isinstance(given, ArmOptions) else None
     if scale is None:
         return needs, origin
-    trees = given.model == AUTO or CATALOGUE[given.model].properties.searched
+    trees = given.model == AUTO or entry_of(str(given.model)).properties.searched
     if not (needs.joint_friction or (trees and needs.friction)):
         raise InputError(
             "--velocity-scale is for dry friction of joints, which the needs do not state; "
@@ -126,8 +137,8 @@ def _needs_and_origin(
         return data.needs, "the data file"
     if robot is not None:
         return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
-    needs, origin = Needs(joints=("revolute",) * data.degrees_of_freedom), "assumed: nothing states the needs"
-    return (needs._replace(joint_friction=USUAL) if given.model == AUTO else needs), origin
+    needs = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
+    return needs, "assumed: neither the file nor --needs says"
 
 
 def robot_of(given: Options) -> Robot | None:

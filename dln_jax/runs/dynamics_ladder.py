@@ -28,18 +28,18 @@ from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.runs.direct_fits import fit_directly, training_of
 from dln_jax.runs.dynamics_data import Recorded
-from dln_jax.runs.dynamics_options import ArmOptions, Options
+from dln_jax.runs.dynamics_options import NETWORK, ArmOptions, Options
 from dln_jax.runs.dynamics_task import Task, needs_of_tree, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.identification_additions import with_network
 from dln_jax.runs.identification_task import Case, Sets, with_description, with_shapes
 from dln_jax.zoo.descriptions import Description, build, describe
 
-RUNG_SECONDS = 120.0
-"""Of a search or of the training of a network, where --seconds says nothing."""
+LADDER_SECONDS, RUNG_SECONDS = 300.0, 120.0
+"""Of the whole ladder, and of one search or training of a network in it, where --seconds says nothing."""
 MOST_SAMPLES = 4_000
 """That networks beside other models are fitted to."""
-NETWORK, EXPLICIT, KERNEL = "structured-delan", "trigonometric", "trigonometric-kernel"
+EXPLICIT, KERNEL = "trigonometric", "trigonometric-kernel"
 BESIDE = "-residual"
 """Behind the name of a model to which a network is added."""
 
@@ -65,7 +65,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | 
         train_set,
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
-        seconds=math.inf if given.seconds is None else given.seconds,
+        seconds=LADDER_SECONDS if given.seconds is None else given.seconds,
         report=report,
     )
     print_ladder(found)

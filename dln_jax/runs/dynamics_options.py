@@ -1,5 +1,6 @@
 """Options of commands that train dynamics, and which of them a model reads."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,27 +13,29 @@ from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.catalogue import CATALOGUE
 
 SAMPLES_OF_KERNEL = 600
-AUTO = "auto"
-"""The model that the ladder chooses."""
+NETWORK, AUTO = "structured-delan", "auto"
+"""The model that embedded data train by default, and that which the ladder chooses, the default for files."""
 OF_NETWORKS = ("width", "depth", "activation")
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
+OF_TRAININGS = ("steps", "target", "samples", "precision", "processes", "objective")
 
 
 @dataclass(frozen=True)
 class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go."""
 
-    model: str = "structured-delan"
+    model: str | None = None
     """What is learned."""
     data: Unstated[Path] = None
-    """Trajectories in the npz schema (default: the embedded characters, or random states of --scene)."""
+    """Trajectories as npz or CSV (default: the embedded characters, or random states of --scene)."""
     test: Unstated[str] = None
-    """Labels of the test trajectories, comma separated (default: e,q,v of the embedded set, else every sixth)."""
+    """Labels of the test trajectories, comma separated (default: e,q,v of the embedded set, else every sixth; one or
+    two recordings are cut into blocks of time)."""
     scene: Annotated[str | None, choice(SCENES, unstated=True)] = None
     """Textbook scene whose needs the data have; without --data, the scene to sample."""
     needs: Unstated[str] = None
     """What the plant needs, as JSON, for example '{"joints": ["revolute", "prismatic"], "friction": true}'
-    (default: what the scene or the file states, else revolute joints with gravity)."""
+    (default: what the scene or the file states, else revolute joints with gravity and friction)."""
     optimizer: Literal["auto", "adam", "gauss-newton"] = "auto"
     """adam, gauss-newton (Levenberg-Marquardt, f64: orders of magnitude more accurate with small networks), or auto:
     gauss-newton while its equations are small and, for structured models of four joints or more, while the data show no
@@ -62,13 +65,19 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """adam: steps without a better validation error after which training stops (default: 10000)."""
     precision: Unstated[Literal["f32", "f64"]] = None
     """Floating-point type of the model and its training (default: f64; f32 for adam)."""
+    objective: Unstated[Literal["inverse", "forward", "both"]] = None
+    """Errors that are made small: inverse (torques), forward (accelerations), or both, each over its variance in the
+    training samples (default: inverse; of Hamiltonians with momenta, Hamilton's equations; of feed-forward, both)."""
     target: Unstated[float] = None
     """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
     from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
     seed: int = 0
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
-    """Train so many seeds, --seed and those after it, in one program; the model kept is the best in validation."""
+    """Train so many seeds, --seed and those after it, in one program; kept is the best in cross-validation."""
+    folds: int = 3
+    """With --seeds: parts of the training and validation motions that each seed is also trained without, one after the
+    other; the seed that predicts them best is kept (1: by the validation motions, without these trainings)."""
     uncertainty: bool = True
     """Store how uncertain the torque is at any state and whether a state is outside the data, and test both."""
 
@@ -92,18 +101,43 @@ class ArmOptions(Options):
     --robot)."""
 
 
+def with_model(given: Options) -> tuple[Options, str]:
+    """The options with the model that is learned, and a sentence for the user where that needs one.
+
+    By default a file is given to the ladder. Options that only networks read choose a network, as do the embedded data.
+    """
+    if given.model is not None:
+        return given, ""
+    if given.data is None:
+        return dataclasses.replace(given, model=NETWORK), ""
+    asked = [name for name in (*OF_NETWORKS, *OF_ADAM, *OF_TRAININGS) if getattr(given, name) is not None]
+    asked += [name for name in ("optimizer", "seeds") if getattr(given, name) != getattr(type(given), name)]
+    if not asked:
+        return dataclasses.replace(given, model=AUTO), ""
+    option = f"--{asked[0].replace('_', '-')}"
+    said = f"{option} is for networks, so the model is {NETWORK}; without it several models are tried (--model auto)"
+    return dataclasses.replace(given, model=NETWORK), said
+
+
 def check_options(given: Options, kind: str) -> None:
     """Refuses options that the model does not read."""
-    require_positive(seeds=given.seeds)
+    if given.data is None:
+        refuse_given(given, ["rate", "units"], "for a file: add --data")
+    require_positive(seeds=given.seeds, folds=given.folds)
     require_seed(given.seed, given.seeds)
     if isinstance(given, ArmOptions):
         check_arm_options(given, kind)
     if kind == AUTO:
-        check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
+        check_direct_options(
+            given,
+            ("degree", "precision", "samples", "objective"),
+            "the ladder",
+            "chooses by validation",
+        )
         return
     properties = CATALOGUE[kind].properties
     if properties.kernel:
-        others = ("degree", "seconds")
+        others = ("degree", "seconds", "objective")
         check_direct_options(given, others, "the trigonometric kernel", "is one linear problem")
         require_positive_if_given(given, ["samples"])
         return

@@ -19,11 +19,10 @@ from dln_jax.metrics.definiteness import Definiteness, definiteness
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
-from dln_jax.metrics.verdict import Verdict
 from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_task import Task
 from dln_jax.runs.dynamics_uncertainty import uncertainty_metrics
-from dln_jax.runs.dynamics_verdict import judged
+from dln_jax.runs.dynamics_verdict import Judged, judge_torques
 from dln_jax.runs.results import cost_metrics, print_numbers, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -41,6 +40,11 @@ CEILINGS = {
 """Metrics of a rollout, and the names of what the true plant gets."""
 MEANINGS = {
     "torque_mse": "torque, mean square error",
+    "test_nmse": "torque, error over variance, mean of joints",
+    "validation_nmse": "the same, on validation motions",
+    "zero_nmse": "the same, of a guess of zero",
+    "noise_nmse": "the same, of the noise of the torques",
+    "file_nmse": "the same, of the robot's file",
     "forward_mse": "acceleration, mean square error",
     "validation_error": "validation error, sum over joints",
     "power_mse": "power, mean square error",
@@ -51,9 +55,6 @@ MEANINGS = {
     "share_not_definite": "states where the mass matrix is not definite",
     "largest_condition_number": "largest condition number of the mass matrix",
     "verdict": "verdict: 0 good, 1 doubtful, 2 refused",
-    "zero_nmse": "nMSE of a guess of zero",
-    "noise_nmse": "nMSE of the true torques, from their noise",
-    "file_nmse": "nMSE of the robot's file",
     "coverage_95_share": "torques within the 95 % band",
     "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
     "outside_share": "states outside the training data",
@@ -72,8 +73,8 @@ MEANINGS = {
 
 def evaluate(
     folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
-) -> tuple[dict[str, float | int], Verdict | None]:
-    """Loads the stored model as a user would, measures and judges it on the test trajectories, and draws it."""
+) -> tuple[dict[str, float | int], Judged]:
+    """Loads the stored model as a user would, measures it on the test trajectories, judges it, and draws it."""
     dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
     functions, model = run.dynamics, build(task.description)
     predicted = predictions(run.energies, test, dtype, mesh=mesh)
@@ -85,31 +86,37 @@ def evaluate(
         models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
         of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
-    verdict, of_verdict = judged(task, predicted["tau"])
-    metrics = {
+    judged = judge_torques(run.energies, task, predicted["tau"], mesh=mesh)
+    return {
         **errors(predicted, test),
-        **of_verdict,
+        **judged.metrics,
         **spread,
         **definiteness_metrics(functions, task),
         **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
         **rollouts(functions, task),
-        **({"validation_error": float(np.min(training.validation))} if training.history else {}),
+        **validation_metrics(training, seeds, task.best),
         **cost_metrics(
             training,
             latency,
             parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
-            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds)[1]]),
+            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
-    }
-    return metrics, verdict
+    }, judged
 
 
-def best_seed(training: Training, seeds: int) -> tuple[Any, int]:
-    """Parameters and index of the seed with the lowest validation error."""
+def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
+    """Parameters and index of the chosen seed, by default the one with the lowest validation error."""
     if seeds == 1:
         return training.parameters, 0
-    best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
+    if best is None or not np.isfinite(training.validation[best]):
+        best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
     return parameters_of(training, best), best
+
+
+def validation_metrics(training: Training, seeds: int, best: int | None) -> dict[str, float]:
+    """The validation error of the model that is kept."""
+    errors = np.ravel(training.validation)
+    return {"validation_error": float(errors[best_seed(training, seeds, best)[1]])} if training.history else {}
 
 
 def parameters_of(training: Training, index: int) -> Any:
@@ -188,12 +195,13 @@ def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
     """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
+    units |= {key: "1" for key in metrics if key.endswith("_nmse")}
     units |= {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
     units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
     known = any(ceiling in metrics for ceiling in CEILINGS.values())
     rows = []
     for key, value in metrics.items():
-        if key not in CEILINGS.values():
+        if key not in CEILINGS.values() and key != "verdict":
             ceiling = metrics.get(CEILINGS.get(key, ""))
             beside = ["" if ceiling is None else number(key, ceiling)] * known
             rows.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
@@ -207,7 +215,7 @@ def number(metric: str, value: int | float) -> str:
     """As a user wants to see it."""
     if isinstance(value, int):
         return f"{value:,}"
-    tiny = any(word in metric for word in ("_mse", "error", "eigenvalue", "condition"))
+    tiny = any(word in metric for word in ("_mse", "_nmse", "error", "eigenvalue", "condition"))
     return (
         f"{value:.2e}"
         if tiny

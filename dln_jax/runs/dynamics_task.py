@@ -29,6 +29,8 @@ class Solver(NamedTuple):
     reason: str
     """Why it is that one; empty where the user chose."""
     problem: Problem
+    samples: int | None
+    """Of training that are drawn for it; `None` for all."""
 
 
 class Task(NamedTuple):
@@ -47,6 +49,8 @@ class Task(NamedTuple):
     """Of training, after which to stop."""
     search: TreeFit | None = None
     """How the joint frames of a learned tree were found."""
+    best: int | None = None
+    """Index of the seed that cross-validation prefers; `None` where that was not asked."""
 
     @property
     def name(self) -> str:
@@ -85,10 +89,10 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Tas
     Raises:
         InputError: options that it does not read, or data that it cannot be fitted to.
     """
-    sets, kind = recorded.sets, given.model
+    sets, kind = recorded.sets, str(given.model)
     if not checked:
         check_options(given, kind)
-    objective = objective_of(kind, sets.train)
+    objective = objective_of(kind, sets.train, given.objective)
     if objective is TORQUE and given.target is None:
         objective = SCALED_TORQUE
     description, optimiser, samples, reason = model_and_optimiser(given, kind, recorded, objective)
@@ -100,12 +104,18 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Tas
         require_finite_start(
             dynamics.problem(model, sets, objective, seeds=seeds), dynamics.samples(model, sets, objective)
         )
-        scale, some = objective.scale(sets.train), sets
-        if samples is not None:
-            some = sets._replace(train=drawn(sets.train, samples, given.seed))
-        problem = dynamics.problem(model, some, objective._replace(scale=lambda data: scale), seeds=seeds)
-        solver = Solver(optimiser, reason, problem)
+        solver = Solver(optimiser, reason, posed(description, sets, objective, samples, seeds), samples)
     return Task(recorded, kind, description, objective, solver, seeds, **limit)
+
+
+def posed(
+    description: dict[str, Any], sets: Split, objective: Objective, samples: int | None, seeds: int | tuple[int, ...]
+) -> Problem:
+    """The fit of a model to training samples, so many of which are drawn, in units of all of them."""
+    scale, some = objective.scale(sets.train), sets
+    if samples is not None:
+        some = sets._replace(train=drawn(sets.train, samples, seeds if isinstance(seeds, int) else seeds[0]))
+    return dynamics.problem(build(description), some, objective._replace(scale=lambda data: scale), seeds=seeds)
 
 
 def needs_of_tree(needs: Needs) -> Needs:

@@ -1,16 +1,22 @@
-"""Whether a model of dynamics may be used: held-out torques, and what its fit says of itself."""
+"""Whether a trained model of dynamics may be used: its torques in motions that it was not fitted to, and its search."""
+
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.equations import Driven, dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.verdict import HeldOut, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.metrics.errors import predictions
+from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.precision import data_type
+from dln_jax.runs.dynamics_options import Options
 from dln_jax.runs.dynamics_task import Task
 
 AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
@@ -18,23 +24,70 @@ AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
 above the second they may be wrong."""
 
 
-def judged(task: Task, predicted: np.ndarray) -> tuple[Verdict | None, dict[str, float | int]]:
-    """The verdict on a task's model by its torques on the test motions [N, d], and its entries of metrics.json.
+class Judged(NamedTuple):
+    """A verdict, and the numbers that it rests on."""
 
-    `None` for a model that is not fitted to torques alone.
+    verdict: Verdict | None
+    """`None` for a model that is not fitted to torques alone."""
+    metrics: dict[str, float | int]
+    """Entries of metrics.json."""
+    validation_nmse: float
+    """Mean over joints of the squared error over the torque's variance."""
+
+
+def judge_torques(energies: Driven, task: Task, predicted: np.ndarray, *, mesh: Mesh | None) -> Judged:
+    """The graver verdict of the test and the validation motions, and of what a search for joint frames says of itself.
+
+    Args:
+        energies: the trained model.
+        task: its data.
+        predicted: its torques in the test motions [N, d].
+        mesh: devices that share the samples.
     """
     if not task.objective.of_torques:
-        return None, {}
-    test, robot = task.sets.test, task.recorded.robot
-    file = None if robot is None else torques_of(robot, test)
+        return Judged(None, {}, float("nan"))
+    test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
+    of_validation = predictions(energies, validation, data_type(task.precision), mesh=mesh)["tau"]
+    noise = torque_noise(task.sets.train)
+    on_test, on_validation = (
+        held_out(tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data))
+        for tau, data in ((predicted, test), (of_validation, validation))
+    )
     names = None if robot is None else robot.tree.names
-    found = held_out(predicted, test.tau, noise=torque_noise(task.sets.train), file=file)
-    verdict = judge(found, names)
-    own, numbers, search = None, {}, task.search
-    if search is not None:
-        own, numbers = searched(search.losses, search.agreeing, search.agreement, found)
-    verdict = verdict if own is None else worst(verdict, own)
-    return verdict, verdict_metrics(found, verdict) | numbers
+    verdict, numbers = worst(judge(on_test, names), judge(on_validation, names)), {}
+    if task.search is not None:
+        of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, on_test)
+        verdict = verdict if of_search is None else worst(verdict, of_search)
+    nmse = {"test_nmse": _nmse(on_test), "validation_nmse": _nmse(on_validation)}
+    return Judged(verdict, {**nmse, **verdict_metrics(on_test, verdict), **numbers}, nmse["validation_nmse"])
+
+
+def say(judged: Judged) -> None:
+    """Prints the verdict, and in words an error that is no better than that of a constant torque."""
+    if judged.verdict is None:
+        return
+    if not judged.validation_nmse <= 1:
+        print(
+            f"warning: on validation motions the torque's mean square error is {judged.validation_nmse:.3g} times its "
+            "variance: a constant torque would be closer than this model"
+        )
+    print(judged.verdict.line)
+
+
+def refuse(judged: Judged, task: Task, given: Options) -> None:
+    """Raises `FitRefused` for a model that must not be used.
+
+    A network whose training the user's own limit cut short is no failure of the command.
+    """
+    if judged.verdict is None or judged.verdict.level != "refused":
+        return
+    if task.solver is None or (given.steps is None and given.seconds is None):
+        raise FitRefused(judged.verdict)
+    print("warning: training ended at the limit that you set; give it more --steps or --seconds")
+
+
+def _nmse(found: HeldOut) -> float:
+    return float(np.mean(found.error / found.unit))
 
 
 def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:

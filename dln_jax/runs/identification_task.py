@@ -51,7 +51,7 @@ class Options(Folder, Drawn, Filtered):
     robot: Path
     """URDF or MJCF file: the kinematics, and values to start from. It stays as it is."""
     data: Path
-    """Trajectories in the npz schema, with tau; joint_names are matched with the robot's where they are there."""
+    """Trajectories as npz or CSV, with tau; joint_names are matched with the robot's where they are there."""
     test: Unstated[str] = None
     """Labels of the held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
     blocks of time)."""
@@ -119,7 +119,7 @@ def prepare(given: Options) -> Case:
     require_laws(laws, "--friction")
     require_positive_if_given(given, ["velocity_scale"])
     try:
-        data = with_joints(schema.load(given.data), robot.tree.names)
+        data = with_joints(schema.load(given.data, rate=given.rate, units=given.units), robot.tree.names)
     except InputError as error:
         raise InputError(str(error) if str(given.data) in str(error) else f"{given.data}: {error}") from None
     if "tau" in data.estimated:

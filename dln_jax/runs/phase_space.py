@@ -19,7 +19,7 @@ from dln_jax.command_line.arguments import (
     require_positive_if_given,
     resolved,
 )
-from dln_jax.command_line.encoders import checked
+from dln_jax.command_line.encoders import Checked, checked
 from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.command_line.progress import progress
@@ -58,7 +58,7 @@ LOSSES = {
 
 
 @dataclass(frozen=True)
-class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
+class Options(Checked, Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What to train on, how, and where the results go. What is not given is the task's own choice."""
 
     task: Annotated[str, choice(TASKS)] = "spring"
@@ -79,7 +79,7 @@ class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
     """What is learned; auto: what suits the task, which for measured is the smallest model whose validation error no
     other's betters. The last three are for measured."""
     data: Unstated[Path] = None
-    """Trajectories in the npz schema, for measured and real-pendulum."""
+    """Trajectories as npz or CSV, for measured and real-pendulum."""
     trajectories: Unstated[int] = None
     """Generated trajectories, for the other tasks."""
     needs: Unstated[str] = None
@@ -115,8 +115,11 @@ class Options(Limited, Resumable, Drawn, SingleCalls, Scaled):
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
 
 
-def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
-    """The problem, the model's description, and the keywords of `train`: all is checked before anything is written."""
+def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any], list[str]]:
+    """The problem, the model's description, the keywords of `train`, and what is to be said of the log.
+
+    All is checked before anything is written.
+    """
     require_seed(given.seed)
     require_positive_if_given(given, ["width", "depth", "degree", "steps", "trajectories", "seconds"])
     if given.optimizer != "adam":
@@ -134,7 +137,9 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
         refuse_given(given, ["order"], "for pairwise-hnn")
     noise = None if given.noise is None else numbers_of("--noise", given.noise, positive=True)
     stated = Stated(needs, given.test, noise)
+    stated = stated._replace(rate=given.rate, units=given.units)
     problem = problem_of(given.task, trajectories=given.trajectories, data=given.data, stated=stated)
+    said = [] if given.data is None else checked(given, problem.fitted, given.data)
     names = ("width", "depth", "activation", "degree", "coordinates", "order", "field")
     size: dict[str, Any] = {name: getattr(given, name) for name in names}
     if given.model == "auto" and given.task == MEASURED:
@@ -148,7 +153,7 @@ def prepare(given: Options) -> tuple[Problem, dict[str, Any], dict[str, Any]]:
     optimiser = optimiser_named(name, precision=description["precision"], learning_rate=given.learning_rate)
     check(problem, description, seed=given.seed)
     training = {"seed": given.seed, "optimiser": optimiser, "steps": given.steps}
-    return problem, description, training | resolved(given, {"seconds": math.inf})
+    return problem, description, training | resolved(given, {"seconds": math.inf}), said
 
 
 def check_suited(given: Options, problem: Problem, description: dict[str, Any]) -> None:
@@ -178,11 +183,11 @@ def run(given: Options, command: str) -> None:
         InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
     """
     began = time.perf_counter()
-    problem, description, training = prepare(given)
+    problem, description, training, said = prepare(given)
     mesh = mesh_of(given)
     truth = problem.truth[0]
     with command_folder(given, command, **description) as folder:
-        announce(problem, description)
+        announce(problem, description, said)
         with stage_progress(stages_of(problem, description, training["steps"])) as report:
             kept = {"directory": folder, "resume": given.resume}
             # The limit is of all that a user waits for until there is a model: data, choice of the model, fits.
@@ -235,7 +240,7 @@ def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None
         yield report
 
 
-def announce(problem: Problem, description: dict[str, Any]) -> None:
+def announce(problem: Problem, description: dict[str, Any], said: list[str]) -> None:
     """Says what is trained on what, and what was assumed."""
     data = problem.fitted
     trajectories = len(np.unique(data.trajectory))
@@ -248,8 +253,7 @@ def announce(problem: Problem, description: dict[str, Any]) -> None:
     if missing:
         of = "finite differences" if problem.noise is None else "local polynomials, not finite differences,"
         print(f"not in the data: {', '.join(missing)}; {of} start the fit to motions")
-    if problem.name in (REAL, MEASURED):
-        print("".join(f"{line}\n" for line in checked(data)), end="")
+    print("".join(f"{line}\n" for line in said), end="")
     if in_velocities(problem, description):
         q = ", ".join(f"{each:.3g}" for each in gauge_of(problem).q)
         print(f"p = dL/dqd; without torques an energy is one up to a factor: here the mean inertia at q = ({q}) is 1")

@@ -1,7 +1,6 @@
 """What `simulate` shows of a motion: numbers, warnings, figures and the GIF."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,7 +53,7 @@ def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
         ("steps", float(len(info.converged)), "1", None),
         ("steps_not_converged", float((~info.converged).sum()), "1", 0.0),
         ("smallest_volume_ratio", float(ratios.min()), "1", None),
-        ("energy_created_J", float(info.energy_growth.sum()), "J", None),
+        ("energy_created_J", float(np.sum(np.asarray(info.energy_growth))), "J", None),
     )
     if info.overlaps is not None:
         numbers += (("overlapping_components_max", float(info.overlaps.max()), "1", None),)
@@ -78,9 +77,10 @@ def line(row: Row) -> tuple[str, str, str]:
 def warn(motion: Motion) -> None:
     """Says what is not as it should be."""
     info, steps = motion.info, len(motion.t) - 1
-    diverged = _flags(info.energy_growth, lambda growth: ~(growth <= LARGEST_GROWTH * info.energy_at_hand))
-    inverted = _flags(info.least_J, lambda least: ~(least > 0))
-    unbalanced = ~info.converged & ~diverged & ~inverted
+    growth, at_hand = np.asarray(info.energy_growth), np.asarray(info.energy_at_hand)
+    diverged = ~(growth <= LARGEST_GROWTH * at_hand)
+    inverted = np.zeros_like(diverged) if info.least_J is None else ~(np.asarray(info.least_J) > 0)
+    unbalanced = ~np.asarray(info.converged) & ~diverged & ~inverted
     reasons = (
         (unbalanced, "did not converge", "try a shorter --dt"),
         (diverged, "diverged: they created energy", "try a shorter --dt or --integrator backward-euler"),
@@ -101,10 +101,6 @@ def warn(motion: Motion) -> None:
         )
     if (finite := finite_moments(motion)) < len(motion.t):
         print(f"warning: the motion is not finite from t = {motion.t[finite]:.4g} s on; pictures end before")
-
-
-def _flags(values: np.ndarray | None, wrong: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | bool:
-    return False if values is None else wrong(values)
 
 
 def finite_moments(motion: Motion) -> int:

@@ -206,8 +206,8 @@ def static_solve(
     """
     x = params.rest if x is None else x
     data = prepare(scene, params, x, control=control)
-    energies, shape = element_energies(scene), scene.mesh.vertices.shape
-    at = pattern(energies, *shape, scene.free)
+    energies, (count, dimension) = element_energies(scene), scene.mesh.vertices.shape
+    at = pattern(energies, count, dimension, scene.free)
     known = _known((params, x, control), lambda: data)
     chosen = _linear_solver(linear_solver, energies, at, x, known)
     options: dict[str, Any] = {"tolerance": tolerance, "iterations": iterations, "linear_solver": chosen, "at": at}

@@ -84,7 +84,8 @@ def energy_balance(
     moved = motion.x[1] - motion.x[0]
     work = _work(scene.held, energies, data, motion.balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
     # Forces left over do work, and rounding hides some of the energy.
-    unclear = found.energy_noise + found.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
+    noise = 0.0 if found.energy_noise is None else found.energy_noise
+    unclear = noise + found.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
     growth = after - kinetic + (stored_after - stored) - work
     return growth, kinetic + jnp.maximum(stored - stored_after, 0) + jnp.abs(work) + unclear
 

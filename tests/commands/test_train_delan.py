@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from calls import command, refused
 from dln_jax.commands import make_data, train_delan
 from dln_jax.data import schema
 from dln_jax.datasets import generators
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.zoo.run import load
 
@@ -24,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 NETWORK = ("--width", "4", "--depth", "1", "--precision", "f64")
 TINY = ("--optimizer", "adam", "--steps", "40", "--batch", "64", "--no-low-latency", *NETWORK)
 BRIEF = ("--no-figures", "--no-low-latency", "--no-uncertainty")
+KINDS = {"q": "deg", "qd": "deg/s", "qdd": "rad/s2", "tau": "mN m"}
 FILES = {
     ".lock",
     "config.json",
@@ -212,10 +215,35 @@ MISTAKES = {
     "activation of adam": (arrays(), ["--activation", "sigmoidal", "--optimizer", "adam"], "tanh"),
     "mark for a missing torque": (arrays(tau=marked(1e308)), [], "tau has numbers of up to 1.0e+308"),
     "mark beyond single precision": (arrays(tau=marked(1e28, 1e10)), ["--optimizer", "adam"], "overflow in float32"),
-    "mark for a missing rate": (arrays(qd=marked(1e120)), [], "the loss is not finite before training"),
+    "mark for a missing rate": (arrays(qd=marked(1e120)), [], "qd has numbers of up to 1.0e+120 where half are below"),
+    "mark for a missing rate of a network": (
+        arrays(qd=marked(1e120)),
+        ["--width", "4"],
+        "the loss is not finite before training",
+    ),
     "mark that has a square": (arrays(tau=marked(9.96921e36)), [], "up to 1.0e+37 where half are below"),
     "tiny torque": (arrays(tau=np.full((20, 2), 1e-170)), [], "squares vanish"),
-    "degree": (arrays(), ["--degree", "2"], "--degree is for the trigonometric model"),
+    "degree": (arrays(), ["--degree", "2"], "the ladder chooses by validation"),
+    "degree of a network": (
+        arrays(),
+        ["--model", "structured-delan", "--degree", "2"],
+        "--degree is for the trigonometric model",
+    ),
+    "no torques": (arrays(tau=None), [], "python -m scripts.train_hnn_task --task measured --data"),
+    "no times": (arrays(t=None), [], "say --rate HZ"),
+    "rate beside times": (arrays(), ["--rate", "100"], "leave --rate out"),
+    "units of an npz file": (arrays(), ["--units", "degrees"], "units are for CSV"),
+    "one side of no energy": (
+        arrays(),
+        ["--model", "feed-forward", "--objective", "forward"],
+        "feed-forward model has no energy",
+    ),
+    "objective of the ladder": (arrays(), ["--model", "auto", "--objective", "both"], "the ladder chooses"),
+    "objective of a kernel": (
+        arrays(),
+        ["--model", "trigonometric-kernel", "--objective", "both"],
+        "--objective is for networks",
+    ),
     "batch": (arrays(), ["--batch", "64"], "--batch is for adam, but auto chose gauss-newton"),
     "patience": (arrays(), ["--patience", "3", "--optimizer", "gauss-newton"], "--patience is for adam"),
     "batch of adam": (arrays(), ["--batch", "-1", "--optimizer", "adam"], "batch is -1"),
@@ -238,6 +266,69 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(workplace, capsys, mist
         np.savez(path, **given)
     assert message in refused(capsys, train_delan, "--data", path, "--out", workplace / "refused", *arguments)
     assert not (workplace / "refused").exists()
+
+
+def test_a_bare_recording_of_an_arm_with_friction_is_fitted_exactly_by_default(workplace, capsys):
+    """One CSV file without t, trajectory and needs: two coupled joints, viscous and dry friction, springs."""
+    random, T = np.random.default_rng(0), 400
+    rate = random.uniform(1, 4, (2, 4))
+    phase = rate * (0.02 * np.arange(T))[:, None, None] + random.uniform(0, 6, (2, 4))
+    q, qd, qdd = np.sin(phase).sum(2), (rate * np.cos(phase)).sum(2), -(rate**2 * np.sin(phase)).sum(2)
+    inertia = 0.3 * np.cos(q[:, 0] - q[:, 1])
+    torque = np.stack([2 * qdd[:, 0] + inertia * qdd[:, 1], inertia * qdd[:, 0] + qdd[:, 1]], axis=1)
+    # d/dt of the off-diagonal term of M, and its part in dT/dq.
+    slope = -0.3 * np.sin(q[:, 0] - q[:, 1])
+    torque += np.stack([-slope * qd[:, 1] ** 2, slope * qd[:, 0] ** 2], axis=1)
+    torque += 3 * np.sin(q) + 0.4 * qd + 0.2 * np.tanh(qd / 0.01)
+    titles = [f"{key}{joint} [{unit}]" for key, unit in KINDS.items() for joint in (1, 2)]
+    rows = np.hstack([np.degrees(q), np.degrees(qd), qdd, 1e3 * torque])
+    np.savetxt("bare.csv", rows, delimiter=",", header=",".join(titles), comments="")
+    command(train_delan, "--data", "bare.csv", "--rate", "50", *BRIEF, "--out", "bare")
+    said = capsys.readouterr().out
+    assert "one recording: cut into blocks of time" in said and "friction of joints: viscous, coulomb, offset" in said
+    assert "verdict: good" in said and "trigonometric is exact" in said
+    metrics = json.loads((workplace / "bare" / "metrics.json").read_text())
+    assert metrics["torque_mse"] < 1e-18 and metrics["verdict"] == 0 and metrics["validation_nmse"] < 1e-18
+    config = json.loads((workplace / "bare" / "config.json").read_text())
+    assert (config["model"], config["rate"]) == ("auto", 50)
+
+
+def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(workplace, capsys):
+    random = np.random.default_rng(0)
+    noise = {key: random.normal(size=(60, 1)) for key in ("q", "qd", "qdd", "tau")}
+    np.savez("noise.npz", t=np.tile(np.arange(10.0), 6), trajectory=np.repeat(np.arange(6), 10), **noise)
+    options = ("--data", "noise.npz", "--model", "trigonometric", "--degree", "2", *BRIEF)
+    with pytest.raises(SystemExit) as stop:
+        command(train_delan, *options, "--out", "noise")
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: ")
+    assert re.search(r"warning: on validation motions the torque's mean square error is [\d.e+]+ times", said.out)
+    assert json.loads((workplace / "noise" / "metrics.json").read_text())["verdict"] == 2
+
+
+def test_a_cart_that_is_driven_alone_is_trained(workplace, capsys):
+    """The torque of its pole is zero in every sample."""
+    data = generators.uniform(cart_pole(), samples=80, rate_bound=2.0, acceleration_bound=5.0)
+    tau = data.tau * [1.0, 0.0]
+    qdd = np.asarray(jax.vmap(dynamics(cart_pole().energies).forward_dynamics)(data.q, data.qd, tau))
+    np.savez("cart.npz", t=np.arange(80.0), q=data.q, qd=data.qd, qdd=qdd, tau=tau, trajectory=np.arange(80) // 10)
+    # Times are not those of a motion, so that the file's rates contradict q: this is only said.
+    needs = '{"joints": ["prismatic", "revolute"]}'
+    command(train_delan, "--data", "cart.npz", "--needs", needs, "--model", "trigonometric", *BRIEF, "--out", "cart")
+    assert json.loads((workplace / "cart" / "metrics.json").read_text())["torque_mse"] < 1e-16
+
+
+@pytest.mark.parametrize("options", [("structured-delan", *TINY[:7]), ("trigonometric", "--degree", "1")])
+def test_both_errors_are_fitted_together_on_request(workplace, capsys, options):
+    data = generators.uniform(cart_pole(friction=0.2), samples=60, rate_bound=2.0, acceleration_bound=5.0)
+    noisy = data._replace(tau=data.tau + [0.1, 0.0] * np.random.default_rng(0).normal(size=data.tau.shape))
+    schema.save("noisy.npz", noisy, overwrite=True)
+    out = workplace / f"both-{options[0]}"
+    command(train_delan, "--data", "noisy.npz", "--model", *options, *BRIEF, "--objective", "both", "--out", out)
+    said = capsys.readouterr().out
+    assert ("refined by both sides' errors" in said) == (options[0] == "trigonometric")
+    assert json.loads((out / "config.json").read_text())["objective"] == "both"
+    assert np.isfinite(json.loads((out / "metrics.json").read_text())["forward_mse"])
 
 
 def test_data_are_made_read_back_and_never_overwritten_unasked(workplace, capsys):

@@ -118,7 +118,7 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert metrics["parameters"] == 2 * (2 * 3 + 3 + 3 + 1) + 1
     out = capsys.readouterr().out
     assert "gauss-newton (27 parameters: the normal equations take" in out
-    assert "the best in validation" in out
+    assert "cross-validated errors by seed, 3 folds: 0: " in out and "the best in cross-validation" in out
     assert "gauss-newton needs f64" in refused(
         capsys, train_delan, *QUICK, "--optimizer", "gauss-newton", "--precision", "f32", "--out", "no"
     )

@@ -40,7 +40,7 @@ def with_value(key, value):
 REFUSED = [
     (changed(q=None), "key 'q' is missing"),
     (changed(t=None), "key 't' is missing"),
-    (changed(trajectory=None), "key 'trajectory' is missing"),
+    (changed(trajectory=None), "t does not increase at sample 4 .* in a column 'trajectory'"),
     (with_value("q", np.nan), "q has 1 NaN"),
     (with_value("tau", np.inf), "tau has 1 NaN or infinite"),
     (changed(q=np.zeros(12)), r"q has shape \(12,\)"),

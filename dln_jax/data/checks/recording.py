@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dln_jax.data import archive, schema
+from dln_jax.data import schema
 from dln_jax.data.checks.findings import Finding
 from dln_jax.data.schema import Trajectories
 
@@ -24,13 +24,13 @@ def as_recording(data: Trajectories) -> Recording:
     return Recording(data)
 
 
-def read(path: str | Path) -> Recording:
-    """The recording of a file in the npz schema, whose samples may be out of order or double.
+def read(path: str | Path, *, rate: float | int | None = None, units: str | None = None) -> Recording:
+    """The recording of a file in the schema, whose samples may be out of order or double; arguments as `schema.load`.
 
     Raises:
         InputError: as `schema.load` for anything else.
     """
-    return archive.load(path, _from_arrays, (*schema.KEYS, "joint_names"))
+    return schema.load_arrays(path, _from_arrays, rate=rate, units=units)
 
 
 def _from_arrays(arrays: dict[str, Any]) -> Recording:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse.linalg import cg
 
 from dln_jax.solvers.elements.assembly import Pattern
 from dln_jax.solvers.elements.energies import Blocks, ElementEnergy
@@ -33,13 +33,13 @@ def search_takes_at_most(
         residual: relative.
     """
     hessian, inverse = _hessian(energies, at, x, data)
-    right = np.stack([np.ones(hessian.shape[0]), np.random.default_rng(0).normal(size=hessian.shape[0])])
+    unknowns = int(at.free.sum())
+    right = np.stack([np.ones(unknowns), np.random.default_rng(0).normal(size=unknowns)])
     return all(_solved(hessian, inverse, b, products, residual) for b in right)
 
 
 def _solved(hessian: csr_array, inverse: csr_array, b: np.ndarray, products: int, residual: float) -> bool:
-    precondition = LinearOperator(hessian.shape, matvec=lambda r: inverse @ r, dtype=float)
-    x, status = cg(hessian, b, rtol=residual, maxiter=products, M=precondition)
+    x, status = cg(hessian, b, rtol=residual, maxiter=products, M=inverse)
     return status == 0 and bool(np.isfinite(x).all())
 
 

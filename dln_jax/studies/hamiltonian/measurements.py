@@ -52,6 +52,10 @@ class Stated(NamedTuple):
     noise: tuple[float, ...] | None = None
     """Standard deviation of q, one for all or one each; or, where the file has p, of q and then p (default:
     estimated)."""
+    rate: float | None = None
+    """Hz, of a file without t."""
+    units: str | None = None
+    """Of a CSV file's titles without a unit."""
 
 
 class Trust(NamedTuple):

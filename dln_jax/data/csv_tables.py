@@ -1,0 +1,243 @@
+"""Logs as CSV: one row a sample, and a header that names every column and its unit.
+
+    t [s],q1 [deg],q2 [deg],tau1 [N m],tau2 [N m]        or        t_s,q_elbow_rad,tau_elbow_Nm
+
+A title is a key of the schema, the joint (a number or a name; none where there is one joint) and a unit, which is
+converted to SI. Units are never guessed: a title without one is refused unless the caller states `units`. Columns may
+come in any order, and others stand beside them unread.
+"""
+
+import csv
+import itertools
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.types import InputError
+
+MOST_BYTES = 2**30
+"""Size of a file that is read; larger ones are quicker and smaller as npz."""
+STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
+"""Units that a caller may state for titles without one: by key, SI for the rest."""
+TURN = math.pi / 180
+POSITIONS = {"rad": 1.0, "deg": TURN, "m": 1.0, "cm": 1e-2, "mm": 1e-3}
+FORCES = {"nm": 1.0, "n": 1.0, "mnm": 1e-3, "mn": 1e-3, "knm": 1e3, "kn": 1e3}
+UNITS = {
+    "t": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "q": POSITIONS,
+    "qd": {"rpm": math.pi / 30, **{f"{unit}/s": factor for unit, factor in POSITIONS.items()}},
+    "qdd": {f"{unit}/s2": factor for unit, factor in POSITIONS.items()},
+    **dict.fromkeys(("tau", "tau_inertial", "tau_coriolis", "tau_gravity", "pd"), FORCES),
+    "p": {"nms": 1.0, "ns": 1.0, "kgm2/s": 1.0, "kgm/s": 1.0},
+    "trajectory": {},
+}
+"""Factor to SI of each unit that a column may have, by key."""
+EXAMPLES = {"t": "t [s]", "qd": "qd1 [rad/s]", "qdd": "qdd1 [rad/s^2]", "tau": "tau1 [N m]", "p": "p1 [N m s]"}
+_SPELLINGS = {"degrees": "deg", "degree": "deg", "°": "deg", "²": "2", "µ": "u", "μ": "u", "sec": "s"}
+_TITLE = re.compile(rf"({'|'.join(sorted(UNITS, key=len, reverse=True))}|time)(?=$|[\d_ .\[(/])(.*)", re.DOTALL)
+_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]*)[\])]\s*", re.DOTALL)
+
+
+class Column(NamedTuple):
+    """A column that is read."""
+
+    title: str
+    key: str
+    """Of the schema."""
+    joint: str
+    """Empty where the title names none."""
+    unit: str | None
+    """Spelled as in `UNITS`; `None` where the title states none."""
+
+
+def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[str]]:
+    """The arrays of a CSV file by the keys of the schema, in SI units, and the titles of columns that are not read.
+
+    Args:
+        path: of the file.
+        units: what titles without a unit have: "si", or "degrees" for angles in degrees and all else in SI.
+
+    Raises:
+        InputError: no header, a title that is there twice, a unit that is unknown or not stated, joints that differ
+            between q and another key, rows of different lengths, cells without a number, or more than `MOST_BYTES`.
+    """
+    if units is not None and units not in STATED:
+        raise InputError(f"units is {units!r:.40}; expected one of {', '.join(STATED)}")
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise InputError(f"holds {size / 2**30:.1f} GiB; at most 1 GiB is read as CSV: store it as npz, or split it")
+    try:
+        titles = _header(path)
+        columns = {place: column for place, title in enumerate(titles) if (column := _column(title)) is not None}
+        factors = {place: _factor(column, units) for place, column in columns.items()}
+        places = _by_key(columns)
+        table = _numbers(path, titles, set(columns))
+    except UnicodeDecodeError:
+        raise InputError("not a text file in UTF-8; export the log as CSV again") from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})") from None
+    arrays: dict[str, Any] = {
+        key: np.stack([factors[place] * table[:, place] for place in own], axis=1) for key, own in places.items()
+    }
+    arrays |= {key: arrays[key][:, 0] for key in ("t", "trajectory") if key in arrays}
+    joints = [columns[place].joint for place in places.get("q", [])]
+    if not all(joint.isdecimal() or not joint for joint in joints):
+        arrays["joint_names"] = np.array(joints)
+    return arrays, [title for place, title in enumerate(titles) if place not in columns]
+
+
+def _header(path: Path) -> list[str]:
+    """The titles of all columns, which are different and not empty."""
+    rows = _rows(path)
+    titles = [title.strip() for title in next(rows, (0, []))[1]]
+    if not titles:
+        raise InputError("the file is empty; expected a header such as 't [s],q1 [rad],tau1 [N m]', then numbers")
+    if len(titles) == 1:
+        for separator, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+            if separator in titles[0]:
+                raise InputError(f"columns are separated by {name}; export it with commas, and decimals with points")
+    if all(_number(title) is not None for title in titles):
+        raise InputError("the first line holds numbers; expected a header such as 't [s],q1 [rad],tau1 [N m]'")
+    for place, title in enumerate(titles):
+        if not title:
+            raise InputError(f"column {place + 1} has no title; name it, or remove the comma")
+        if title in titles[:place]:
+            raise InputError(f"two columns have the title '{title:.60}'; remove or rename one")
+    return titles
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Number of the line and its cells, blank lines apart."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file)
+        try:
+            for cells in reader:
+                if cells:
+                    yield reader.line_num, cells
+        except csv.Error as error:
+            raise InputError(f"line {reader.line_num} is not CSV ({error})") from None
+
+
+def _column(title: str) -> Column | None:
+    """What a title names; `None` where that is no key of the schema."""
+    match = _TITLE.fullmatch(title)
+    if match is None:
+        return None
+    key, rest = match[1].replace("time", "t"), match[2]
+    if key in ("t", "trajectory"):
+        rest = rest.strip(" _")
+        inside = _BRACKETS.fullmatch(rest)
+        unit = inside[2] if inside and not inside[1] else rest
+        return Column(title, key, "", _spelled(unit) if unit else None)
+    unit = None
+    while inside := _BRACKETS.fullmatch(rest):
+        # q[2] is a joint, q2 [rad] a unit.
+        rest = f"{inside[1]} {inside[2]}" if inside[2].strip().isdecimal() else inside[1]
+        unit = unit if inside[2].strip().isdecimal() else _spelled(inside[2])
+    words = [word for word in re.split(r"[_ ]+", rest.strip("_ ./")) if word]
+    for first in range(len(words) if unit is None else 0):
+        if (suffix := _spelled("/".join(words[first:]))) in UNITS[key]:
+            words, unit = words[:first], suffix
+            break
+    joint = "_".join(words)
+    return Column(title, key, str(int(joint)) if joint.isdecimal() else joint, unit)
+
+
+def _spelled(unit: str) -> str:
+    """A unit as `UNITS` spells it."""
+    found = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
+    found = re.sub(r"[\s*·.^]", "", found)
+    for spelling, ours in _SPELLINGS.items():
+        found = found.replace(spelling, ours)
+    return found
+
+
+def _factor(column: Column, stated: str | None) -> float:
+    """To SI."""
+    known = UNITS[column.key]
+    if not known:
+        return 1.0
+    if column.unit is None:
+        if stated is None:
+            example = EXAMPLES.get(column.key, "q1 [rad] or q1 [deg]")
+            raise InputError(
+                f"'{column.title:.60}' has no unit; write it into the header, as in '{example}', or say --units si "
+                "(or degrees) for all titles without one"
+            )
+        return known[STATED[stated][column.key]] if column.key in STATED[stated] else 1.0
+    if column.unit not in known:
+        raise InputError(f"the unit of '{column.title:.60}' is not known; expected one of {', '.join(known)}")
+    return known[column.unit]
+
+
+def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
+    """Places of each key's columns in the order of joints, which are those of q: by number, or as they come."""
+    found: dict[str, dict[str, int]] = {}
+    for place, column in columns.items():
+        own = found.setdefault(column.key, {})
+        if column.joint in own:
+            raise InputError(f"'{columns[own[column.joint]].title:.60}' and '{column.title:.60}' are the same column")
+        own[column.joint] = place
+    joints = list(found.get("q", {}))
+    if all(joint.isdecimal() for joint in joints):
+        joints.sort(key=int)
+    for key, own in found.items():
+        if key in ("t", "trajectory") or not joints:
+            continue
+        for name, there, absent in ((key, own, joints), ("q", joints, own)):
+            if missing := [joint for joint in absent if joint not in there]:
+                raise InputError(f"there is no column '{name}{missing[0]:.40}'; q and {key} must name the same joints")
+    return {
+        key: [own[joint] for joint in joints] if key not in ("t", "trajectory") and joints else list(own.values())
+        for key, own in found.items()
+    }
+
+
+def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:
+    """All rows below the header [N, columns], with zeros where columns are not read."""
+    unread = {place: _zero for place in range(len(titles)) if place not in read_places}
+    with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about files without samples
+        lines = itertools.dropwhile(lambda line: not line.strip(), file)
+        next(csv.reader(lines))
+        converters: dict[int | str, Callable] = {**unread}
+        try:
+            table = np.loadtxt(lines, delimiter=",", comments=None, quotechar='"', converters=converters, ndmin=2)
+        except (ValueError, OverflowError):
+            table = None
+    if table is None or (len(table) and table.shape[1] != len(titles)):
+        raise InputError(_complaint(path, titles, read_places))
+    if not len(table):
+        raise InputError("there are no samples below the header; add them")
+    return table
+
+
+def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
+    """The first line that is wrong, and how."""
+    rows = _rows(path)
+    next(rows)
+    for line, cells in rows:
+        if len(cells) != len(titles):
+            decimal = "; decimals take a point, not a comma" if len(cells) > len(titles) else ""
+            return f"line {line} has {len(cells)} values, the header {len(titles)} titles{decimal}"
+        for place in sorted(read_places):
+            if _number(cells[place]) is None:
+                shown = f"'{cells[place].strip():.40}'" if cells[place].strip() else "empty"
+                return f"line {line}: '{titles[place]:.60}' is {shown}; expected a number with a decimal point"
+    return "the rows below the header are no table of numbers; export the log again"
+
+
+def _number(text: str) -> float | None:
+    try:
+        return None if "_" in text else float(text)
+    except ValueError:
+        return None
+
+
+def _zero(text: str) -> float:
+    return 0.0

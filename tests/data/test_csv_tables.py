@@ -1,0 +1,147 @@
+"""CSV logs: columns in any order, units that are stated and converted, and one clear line for what is malformed."""
+
+import numpy as np
+import pytest
+
+from dln_jax.data import checks, csv_tables, schema
+from dln_jax.data.motion_tables import write_motion
+from dln_jax.types import InputError
+
+ROWS = "0,1,2,3,4\n0.1,5,6,7,8\n0.2,9,10,11,12\n"
+HEADER = "t [s],q1 [rad],q2 [rad],tau1 [N m],tau2 [N m]\n"
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Text of a file -> the trajectories in it."""
+
+    def loaded(text, **stated):
+        path = tmp_path / "log.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return schema.load(path, **stated)
+
+    return loaded
+
+
+def test_a_log_is_read_as_the_same_arrays_in_an_npz_file(load, tmp_path):
+    arrays = {"t": [0, 0.1, 0.2], "q": [[1, 2], [5, 6], [9, 10]], "tau": [[3, 4], [7, 8], [11, 12]]}
+    np.savez(tmp_path / "log.npz", **arrays)
+    for one, other in zip(load(HEADER + ROWS), schema.load(tmp_path / "log.npz"), strict=True):
+        np.testing.assert_array_equal(one, other)
+    of_checks = checks.read(tmp_path / "log.csv").data
+    np.testing.assert_array_equal(of_checks.tau, arrays["tau"])
+
+
+def test_columns_come_in_any_order_with_others_beside_them(load):
+    text = "tau2_Nm,note,q2_rad,q1_rad,t_s,tau1_Nm\n4,fine,2,1,0,3\n8,,6,5,0.1,7\n12,a b,10,9,0.2,11\n"
+    data, plain = load(text), load(HEADER + ROWS)
+    for key in ("t", "q", "qd", "tau", "trajectory"):
+        np.testing.assert_array_equal(getattr(data, key), getattr(plain, key))
+
+
+@pytest.mark.parametrize(
+    ("titles", "factors"),
+    [
+        ("t [ms],q1 [deg],qd1 [deg/s],qdd1 [deg/s^2],tau1 [mN m]", (1e-3, *[np.pi / 180] * 3, 1e-3)),
+        ("t_ms,q_1_deg,qd_1_deg_s,qdd_1_deg_s2,tau_1_mNm", (1e-3, *[np.pi / 180] * 3, 1e-3)),
+        ("time (s),q (mm),qd (mm/s),qdd (mm/s²),tau (N)", (1, *[1e-3] * 3, 1)),
+        ("t [us],q[1] [°],qd[1] [rpm],qdd[1] [rad/s**2],tau[1] [kN·m]", (1e-6, np.pi / 180, np.pi / 30, 1, 1e3)),
+        ('"t [s]","q1 [cm]",qd1 [m per s],qdd1 [m/s2],tau1 [N]', (1, 1e-2, 1, 1, 1)),
+    ],
+)
+def test_units_in_titles_are_converted_to_si(load, titles, factors):
+    data = load("\ufeff" + titles + "\r\n1,2,3,4,5\r\n\r\n2,4,6,8,10\r\n")
+    found = [data.t, *(getattr(data, key)[:, 0] for key in ("q", "qd", "qdd", "tau"))]
+    np.testing.assert_allclose(found, np.outer(factors, [1, 2]) * np.arange(1, 6)[:, None], rtol=1e-15)
+
+
+def test_units_that_no_title_states_are_asked_for(load):
+    text = "t,q1,tau1\n0,90,1\n1,180,1\n2,180,1\n"
+    with pytest.raises(InputError, match=r"'t' has no unit; .* 't \[s\]', or say --units si"):
+        load(text)
+    assert load(text, units="si").q[0, 0] == 90
+    data = load(text, units="degrees")
+    np.testing.assert_allclose(data.q[:, 0], [np.pi / 2, np.pi, np.pi])
+    np.testing.assert_array_equal(data.tau, 1)
+
+
+def test_joints_may_have_names_whose_order_is_that_of_q(load):
+    data = load("t [s],qd elbow [rad/s],q base [rad],q elbow [rad],qd base [rad/s]\n0,4,1,2,3\n1,8,5,6,7\n2,4,1,2,3\n")
+    assert data.joint_names.tolist() == ["base", "elbow"]
+    np.testing.assert_array_equal(data.q[0], [1, 2])
+    np.testing.assert_array_equal(data.qd[0], [3, 4])
+
+
+def test_planned_motions_are_read_back_as_they_were_written(tmp_path):
+    t, q, qd = np.arange(5.0), *np.random.default_rng(0).normal(size=(2, 5, 2))
+    write_motion(tmp_path / "m.csv", t, q, qd, names=("left arm", "lift"), joints=("revolute", "prismatic"))
+    data = schema.load(tmp_path / "m.csv")
+    np.testing.assert_allclose(data.q, q, rtol=1e-8)
+    np.testing.assert_allclose(data.qd, qd, rtol=1e-8)
+    assert data.joint_names.tolist() == ["left_arm", "lift"]
+
+
+def test_times_come_from_a_rate_and_recordings_from_their_column(load):
+    data = load("q1 [rad],trajectory\n" + "0,4\n1,4\n2,4\n3,7\n4,7\n5,7\n", rate=10)
+    np.testing.assert_allclose(data.t, [0, 0.1, 0.2] * 2)
+    assert data.label.tolist() == ["4", "7"]
+
+
+MALFORMED = {
+    "empty": ("", "the file is empty"),
+    "no samples": (HEADER, "no samples below the header"),
+    "no header": (ROWS, "the first line holds numbers"),
+    "ragged": (HEADER + ROWS + "0.3,1,2,3\n", "line 5 has 4 values, the header 5 titles"),
+    "decimal comma": (HEADER + "0,1,1,2,5,3,4\n", "line 2 has 7 values, the header 5 titles; decimals take a point"),
+    "quoted decimal comma": (HEADER + '0,"1,5",2,3,4\n', "line 2: 'q1 \\[rad\\]' is '1,5'; expected a number"),
+    "semicolons": ((HEADER + ROWS).replace(",", ";"), "separated by semicolons"),
+    "tabs": ((HEADER + ROWS).replace(",", "\t"), "separated by tabs"),
+    "text": (HEADER + ROWS.replace("7", "seven"), "line 3: 'tau1 \\[N m\\]' is 'seven'"),
+    "hole": (HEADER + ROWS.replace("7", ""), "line 3: 'tau1 \\[N m\\]' is empty"),
+    "digits with a bar": (HEADER + ROWS.replace("7", "7_0"), "'tau1 \\[N m\\]' is '7_0'"),
+    "not a number": (HEADER + ROWS.replace("7", "nan"), "tau has 1 NaN or infinite value"),
+    "infinite": (HEADER + ROWS.replace("7", "1e999"), "tau has 1 NaN or infinite value"),
+    "no q": ("t [s],x [rad]\n0,1\n", "key 'q' is missing.*keys that are not read: x \\[rad\\]"),
+    "no t": ("q1 [rad]\n0\n1\n2\n", "key 't' is missing; add the time of each sample in seconds, or say --rate HZ"),
+    "twice": ("t [s],q1 [rad],q1 [rad]\n0,1,2\n", "two columns have the title 'q1 \\[rad\\]'"),
+    "twice by other units": (
+        "t [s],q1 [rad],q1 [deg]\n0,1,2\n",
+        "'q1 \\[rad\\]' and 'q1 \\[deg\\]' are the same column",
+    ),
+    "no title": ("t [s],,q1 [rad]\n0,1,2\n", "column 2 has no title"),
+    "joint that is missing": ("t [s],q1 [rad],q2 [rad],tau1 [N m]\n0,1,2,3\n", "no column 'tau2'"),
+    "joint too many": ("t [s],q1 [rad],tau1 [N m],tau2 [N m]\n0,1,2,3\n", "no column 'q2'"),
+    "strange unit": ("t [s],q1 [furlong]\n0,1\n", "the unit of 'q1 \\[furlong\\]' is not known; expected one of rad"),
+    "unit of another quantity": ("t [s],q1 [rad],qd1 [rad]\n0,1,2\n", "the unit of 'qd1 \\[rad\\]' is not known"),
+    "not text": (b"\xff\xfe\x00t\x00,", "not a text file in UTF-8"),
+    "zero bytes": (HEADER.encode() + b"\x00\x00,1,2,3,4\n", "line"),
+    "endless cell": (HEADER + f'"{"x" * 200_000}",1,2,3,4\n', "line 2 is not CSV"),
+    "time that runs back": (HEADER + ROWS + "0.1,1,2,3,4\n", "t does not increase at sample 3.*column 'trajectory'"),
+    "half a trajectory": ("t [s],q1 [rad],trajectory\n0,1,0.5\n1,1,0.5\n", "no whole numbers"),
+}
+
+
+@pytest.mark.parametrize("mistake", MALFORMED)
+def test_what_is_malformed_is_one_line(load, mistake):
+    text, message = MALFORMED[mistake]
+    with pytest.raises(InputError, match=message) as error:
+        load(text)
+    assert "log.csv: " in str(error.value) and "\n" not in str(error.value) and len(str(error.value)) < 400
+
+
+def test_what_contradicts_the_file_is_refused(load, tmp_path):
+    with pytest.raises(InputError, match="the file has t, so its rate is known"):
+        load(HEADER + ROWS, rate=100)
+    with pytest.raises(InputError, match="rate is -1"):
+        load("q1 [rad]\n0\n1\n2\n", rate=-1)
+    with pytest.raises(InputError, match="units is 'inches'"):
+        load(HEADER + ROWS, units="inches")
+    np.savez(tmp_path / "log.npz", q=np.zeros((3, 1)), t=np.arange(3))
+    with pytest.raises(InputError, match="units are for CSV"):
+        schema.load(tmp_path / "log.npz", units="si")
+
+
+def test_a_huge_file_is_refused_before_it_is_read(load, monkeypatch):
+    monkeypatch.setattr(csv_tables, "MOST_BYTES", 40)
+    with pytest.raises(InputError, match="store it as npz"):
+        load(HEADER + ROWS)

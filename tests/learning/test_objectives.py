@@ -1,0 +1,117 @@
+"""Inverse and forward errors together, as Lutter and Peters (2021) fit them, for every model that has an energy."""
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.data.splits import Split, split
+from dln_jax.datasets.generators import uniform
+from dln_jax.learning import BOTH_WAYS, FORWARD, TORQUE, objective_of
+from dln_jax.learning.dynamics import problem
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Adam, GaussNewton
+from dln_jax.learning.engine.problem import loss_of
+from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.objectives import STATED, arrays, residuals
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
+from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build, describe_for
+
+NETWORKS = ("structured-delan", "black-box-delan", "structured-hnn", "black-box-hnn")
+ENERGIES = (*NETWORKS, "trigonometric")
+SMALL = {"width": 3, "depth": 1, "activation": "tanh"}
+
+
+@pytest.fixture(scope="module")
+def data():
+    """States of a cart-pole, whose mass matrix couples two joints with friction."""
+    return uniform(cart_pole(friction=0.3), samples=60, rate_bound=2.0, acceleration_bound=5.0)
+
+
+def model_of(name, data):
+    size = {"degree": 1} if name == "trigonometric" else SMALL
+    return build(describe_for(name, data, data.needs, precision="f64", **size))
+
+
+@pytest.mark.parametrize("objective", STATED)
+def test_residuals_vanish_for_the_true_plant_as_lagrangian_and_as_hamiltonian(data, objective):
+    scene = cart_pole(friction=0.3)
+    for plant in (scene.energies, HamiltonianSystem(legendre(scene.lagrangian), scene.dissipation)):
+        found = residuals(STATED[objective], plant, arrays(STATED[objective], data, jnp.float64))
+        assert found.shape == (60, 4 if objective == "both" else 2)
+        assert float(jnp.abs(found).max()) < 1e-10
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_each_side_is_measured_in_its_standard_deviation(data, name):
+    model, sets = model_of(name, data), split(data)
+    posed = problem(model, sets, BOTH_WAYS)
+    plant, train = dynamics(model.energies(posed.parameters)), sets.train
+    sides = jax.jit(
+        jax.vmap(lambda q, qd, qdd, tau: (plant.inverse_dynamics(q, qd, qdd), plant.forward_dynamics(q, qd, tau)))
+    )
+    torque, acceleration = sides(train.q, train.qd, train.qdd, train.tau)
+    # Only the cart is driven: the pole's torque, which is zero, counts in units of the cart's.
+    expected = np.sum(((torque - train.tau) / train.tau[:, 0].std()) ** 2, axis=1).mean()
+    expected += np.sum(((acceleration - train.qdd) / train.qdd.std(axis=0)) ** 2, axis=1).mean()
+    np.testing.assert_allclose(loss_of(posed)(posed.parameters, posed.arrays), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_gradients_of_both_errors_agree_with_finite_differences(data, name):
+    posed = problem(model_of(name, data), split(data), BOTH_WAYS)
+    flat, unravel = jax.flatten_util.ravel_pytree(posed.parameters)
+    flat = flat + 0.1 * np.random.default_rng(0).normal(size=flat.shape)
+    loss = jax.jit(lambda vector: loss_of(posed)(unravel(vector), posed.arrays))
+    gradient = jax.grad(loss)(flat)
+    along = gradient / jnp.linalg.norm(gradient)
+    step = 1e-6
+    difference = (loss(flat + step * along) - loss(flat - step * along)) / (2 * step)
+    np.testing.assert_allclose(difference, gradient @ along, rtol=1e-5)
+
+
+@pytest.mark.parametrize("objective", STATED)
+def test_exact_data_have_the_same_optimum_by_every_objective(objective):
+    scene = pendulum(friction=0.2)
+    data = uniform(scene, samples=60, rate_bound=2.0, acceleration_bound=5.0)
+    model = model_of("trigonometric", data)
+    posed = problem(model, split(data), STATED[objective])
+    away = jax.tree.map(lambda leaf: leaf + 0.05, posed.parameters)
+    found = fit(posed._replace(parameters=away), GaussNewton(steps=40)).parameters
+    ours, plant = dynamics(model.energies(found)), dynamics(scene.energies)
+    for state in np.random.default_rng(1).normal(size=(5, 3, 1)):
+        np.testing.assert_allclose(ours.inverse_dynamics(*state), plant.inverse_dynamics(*state), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "optimiser", [GaussNewton(steps=10), Adam(steps=200, batch=64, learning_rate=1e-3, steps_per_dispatch=20)]
+)
+def test_forward_errors_fall_where_they_are_asked_for(data, optimiser):
+    """From the best torques of a model without friction, which the plant has: both errors cannot vanish."""
+    data = data._replace(needs=data.needs._replace(friction=False))
+    sets = Split(data, data, data)  # what is kept is the best of these samples
+    model = model_of("trigonometric", data)
+    start = fit_linear(model, data).parameters
+
+    def errors(parameters):
+        plant = model.energies(parameters)
+        found = [
+            residuals(side, plant, arrays(side, data, jnp.float64)) / side.scale(data) for side in (TORQUE, FORWARD)
+        ]
+        return [float(jnp.mean(each**2)) for each in found]
+
+    found = fit(problem(model, sets, FORWARD)._replace(parameters=start), optimiser).parameters
+    (inverse_before, forward_before), (inverse, forward) = errors(start), errors(found)
+    assert forward < 0.99 * forward_before and inverse > inverse_before
+
+
+def test_only_an_energy_can_be_fitted_by_one_of_two_sides(data):
+    assert objective_of("structured-hnn", data, "both") is BOTH_WAYS
+    assert objective_of("feed-forward", data, "both") is objective_of("feed-forward", data) is BOTH_WAYS
+    with pytest.raises(InputError, match="feed-forward model has no energy"):
+        objective_of("feed-forward", data, "inverse")
