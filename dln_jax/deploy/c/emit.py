@@ -160,8 +160,8 @@ def expression(body: Body, node: Node, args: list[str], *, looped: bool = False)
     if looped and node.dtype == "real" and node.op in _CHOICES:
         body.source.functions.add("choice")
         return _CHOICES[node.op].format(*args)
-    if node.op == "rounded":
-        body.source.functions.add("rounded")
+    if node.op in ("rounded", "lt_to", "le_to"):
+        body.source.functions.add("rounded" if node.op == "rounded" else "ordered")
     if name := _checked(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"
@@ -171,6 +171,8 @@ def expression(body: Body, node: Node, args: list[str], *, looped: bool = False)
 
 def _checked(node: Node) -> str | None:
     """The function of whole numbers that an operation needs, so that it cannot trap."""
+    if node.op.startswith("shift_"):
+        return f"{node.op}_{node.dtype}"
     if node.op in ("integer_div", "integer_rem"):
         divisor = node.args[1]
         if is_constant(divisor) and not np.isin(values(divisor), (0, ~NUMPY_TYPES[node.dtype](0))).any():

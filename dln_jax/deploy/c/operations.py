@@ -53,6 +53,7 @@ OPERATIONS = {
     "sqrt": _function("sqrt", np.sqrt),
     "pow": _function("pow", np.power, arguments=2),
     "atan2": _function("atan2", np.arctan2, arguments=2),
+    "nextafter": _function("nextafter", np.nextafter, arguments=2),
     **{
         name: _function(name, fold)
         for name, fold in {
@@ -88,6 +89,9 @@ OPERATIONS = {
     "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
     # To so many bits of exponent and mantissa.
     "rounded": Operation("elementary_rounded({0}, {1}, {2})", None),
+    # In the total order of IEEE 754: -0 before 0, NaN outside the infinities.
+    "lt_to": Operation("(elementary_ordered({0}) < elementary_ordered({1}))", None, 0, "bool"),
+    "le_to": Operation("(elementary_ordered({0}) <= elementary_ordered({1}))", None, 0, "bool"),
     "eq": _comparison("==", np.equal),
     "ne": _comparison("!=", np.not_equal),
     "lt": _comparison("<", np.less),
@@ -99,6 +103,10 @@ OPERATIONS = {
     "xor": Operation("({0} ^ {1})", np.bitwise_xor, 0),
     "not": Operation("(!{0})", np.logical_not, 0),
     "integer_not": Operation("(~{0})", np.invert, 0),
+    **{
+        f"shift_{name}": Operation(f"elementary_shift_{name}({{0}}, {{1}})", fold, 0)
+        for name, fold in integers.SHIFTS.items()
+    },
     "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
     **{
         f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(integers.converted, kind=kind), 0, kind)

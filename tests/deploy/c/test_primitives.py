@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from comparison import BOUND, in_c, in_jax
 from jax import lax
+from jax.extend.core import primitives as of_jax
 from jax.scipy import linalg as scipy_linalg
 from jax.scipy import special
 
@@ -35,6 +36,13 @@ WIDE = {n: normal(5, n) / n**0.5 for n in SIZES}
 def of(x, w):
     """Constants at the precision of the arguments."""
     return jnp.asarray(w, x.dtype)
+
+
+def total_order(name, a, b):
+    """NaN has the sign that is written in the program: that of a computed one depends on the processor."""
+    bind = getattr(of_jax, f"{name}_p").bind
+    number = jnp.where(a == a, a, 0)
+    return bind(number, jnp.where(b == b, b, 1)), bind(a, a), bind(number, of(a, [np.nan] * a.size))
 
 
 def definite(a):
@@ -173,6 +181,30 @@ ON_INTEGERS = {
     ),
     "filled": lambda a, b: (a.at[b].get(mode="fill"), a.astype(jnp.uint32).at[b].get(mode="fill")),
     "mixed": lambda a, b: (a.astype(jnp.int32), a.astype(jnp.uint32), (a > 0) & (b > 0)),
+}
+ON_TWO_MORE = {
+    "nextafter": lambda a, b: (lax.nextafter(a, b), lax.nextafter(a, a), lax.nextafter(a, 0 * a)),
+    **{name: lambda a, b, name=name: total_order(name, a, b) for name in ("lt_to", "le_to")},
+}
+ON_INTEGERS_MORE = {
+    **{
+        f"shift_{name}": lambda a, b, name=name: [
+            getattr(lax, f"shift_{name}")(a.astype(kind), by.astype(kind))
+            for kind in (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
+            for by in (b, b + 25, b - 7, b % 3 + 30, jnp.full_like(b, 31), jnp.full_like(b, -1))
+        ]
+        for name in ("left", "right_logical", "right_arithmetic")
+    },
+    "shift_of_constants": lambda a, b: [
+        a.astype(jnp.int32) + getattr(lax, f"shift_{name}")(jnp.int32(-(2**30) - 5), jnp.int32(by)) * (b > 0)
+        for name in ("left", "right_logical", "right_arithmetic")
+        for by in (0, 1, 30, 31, 32, -1)
+    ],
+    "total_order": lambda a, b: [
+        primitive.bind(*pair)
+        for primitive in (of_jax.lt_to_p, of_jax.le_to_p)
+        for pair in ((a, b), (a, a), (a.astype(jnp.uint32), b.astype(jnp.uint32)), (a > 0, b > 0))
+    ],
 }
 MOVES = {
     "broadcast": lambda x: x[:, None] + x[None, 0] + jnp.ones((2, 1, 1, 1)),
@@ -447,6 +479,11 @@ CASES = {
     **ROUNDED,
     **TYPES,
     **INTERFACES,
+    **{f"of_two_{name}": (function, (SPECIAL, RANDOM.permutation(SPECIAL))) for name, function in ON_TWO_MORE.items()},
+    **{
+        f"of_integers_{name}": (function, (INTEGERS, INTEGERS[::-1].copy()))
+        for name, function in ON_INTEGERS_MORE.items()
+    },
 }
 """Function and first example of each of its arguments."""
 
@@ -492,7 +529,9 @@ def states_of(name, examples):
 STATES = {name: states_of(name, examples) for name, (_, examples) in CASES.items()}
 
 
-SINGLE = {*(f"of_{name}" for name in UNARY), *INTERFACES, *list(CASES)[::4]}
+SINGLE = {
+    *(f"of_{name}" for name in UNARY), *(f"of_two_{name}" for name in ON_TWO_MORE), *INTERFACES, *list(CASES)[::4]
+}  # fmt: skip
 """Tried in single precision too by default: elementary functions, of which there are two sorts, types, some others."""
 
 
