@@ -17,7 +17,7 @@ WRITTEN_OUT = 64
 """Elements of a result, or products of a sum, up to which they may be written out one by one."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
-PLAIN_MEMORY = ("take", "cholesky", "triangular_solve", "lu", "call")
+PLAIN_MEMORY = ("take", "order", "cholesky", "triangular_solve", "lu", "call")
 """What reads arguments through a pointer."""
 
 

@@ -12,6 +12,7 @@ source it is. Arranges of arranges are one arrange.
 | `contract` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
 | `reduce_*`, `arg*` | over the last axis of an argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
+| `order` | flat indices that sort rows by keys [o, n], each row by the first key, then the next |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
 | `call` | a function of its own |

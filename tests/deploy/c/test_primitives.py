@@ -466,6 +466,33 @@ INTERFACES = {
     "of_constants": (lambda x: (jnp.ones(3), jnp.zeros(()), jnp.arange(4.0)), (normal(2),)),
     "unchanged": (lambda x, y: (y, x, x), (normal(3), normal(3))),
 }  # fmt: skip
+SORTED = {
+    "sort_along_axes": lambda x: (
+        *(jnp.sort(x, 0), jnp.sort(x, 1), jnp.sort(x, None), jnp.argsort(x, 0), jnp.argsort(x, 1), jnp.median(x, 1)),
+        *(jnp.sort(x, 0, descending=True), jnp.argsort(-x, 1, stable=False), jnp.sort(x.reshape(3, 4, 3), 1)),
+    ),
+    "sort_by_several": lambda x: (
+        lax.sort((jnp.round(x), x, lax.broadcasted_iota(int, x.shape, 0)), 0, num_keys=2),
+        lax.sort((jnp.round(x), x, x[::-1]), 1, num_keys=1),
+        lax.sort((x > 0, jnp.isfinite(x), jnp.sign(x), jnp.arange(36).reshape(6, 6) % 5, x), 0, num_keys=4),
+        jnp.lexsort((x[0], jnp.sign(x[0]))),
+    ),
+    "sort_of_integers": lambda x: [
+        (jnp.sort(k, 0), jnp.argsort(k, 1), jnp.sort(k, None), jnp.argsort(k[:, 0] > 0))
+        for whole in [(jnp.nan_to_num(x, posinf=9, neginf=-9) * 3).astype(int)]
+        for k in (whole, whole.astype(jnp.int32), whole.astype(jnp.uint32), whole.astype(jnp.uint64))
+    ],
+    "sort_of_known": lambda x: (jnp.sort(jnp.sin(jnp.arange(9.0) ** 2)), x[jnp.argsort(jnp.array([3, 1, 5, 1, 2, 0]))]),
+    "sort_and_search": lambda x: (
+        *(jnp.unique(x, size=20, fill_value=0), jnp.searchsorted(jnp.sort(x[0]), x)),
+        *(jnp.searchsorted(jnp.sort(x[1]), x, side="right"), jnp.ravel(x)[jnp.argsort(x, None)][:3]),
+        *(jnp.sort(x[:, :1], 1), jnp.sort(x[:0], 0), jnp.sort(x[0, :2])),
+    ),
+    "sort_in_a_loop": lambda x: lax.scan(
+        lambda c, row: (jnp.sort(c + row), (jnp.argsort(row), jnp.sort(x, 0))), x[0], x
+    ),
+    "sort_of_many": lambda x: jnp.sort((x[:, :, None] * jnp.cos(jnp.arange(80.0) ** 2)).reshape(6, 480), 1),
+}
 CASES = {
     **{f"of_{name}": (function, (SPECIAL,)) for name, function in UNARY.items()},
     **{f"of_two_{name}": (function, (SPECIAL, RANDOM.permutation(SPECIAL))) for name, function in BINARY.items()},
@@ -484,6 +511,14 @@ CASES = {
         f"of_integers_{name}": (function, (INTEGERS, INTEGERS[::-1].copy()))
         for name, function in ON_INTEGERS_MORE.items()
     },
+    **{
+        name: (function, (np.concatenate([SPECIAL, RANDOM.permutation(SPECIAL)]).reshape(6, 6),))
+        for name, function in SORTED.items()
+    },
+    "gradient_of_sort": (
+        jax.grad(lambda x: jnp.sort(x, 1)[:, 0] @ jnp.sort(x, 0)[2, :5] + jnp.median(x)),
+        (normal(5, 7),),
+    ),
 }
 """Function and first example of each of its arguments."""
 
