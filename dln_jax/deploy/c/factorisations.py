@@ -68,6 +68,18 @@ FUNCTIONS = {
         }
     }
     """,
+    "permutation": """
+    /* Order of n rows after row k is exchanged with row pivots[k], for each k in turn */
+    static void permutation(int n, int exchanges, const int32_t *pivots, int32_t *order)
+    {
+        for (int i = 0; i < n; ++i) order[i] = i;
+        for (int k = 0; k < exchanges; ++k) {
+            const int32_t moved = order[k], pivot = pivots[k] < 0 ? 0 : pivots[k] < n ? pivots[k] : n - 1;
+            order[k] = order[pivot];
+            order[pivot] = moved;
+        }
+    }
+    """,
 }
 """C functions that are put into a source that needs them."""
 
@@ -109,9 +121,17 @@ def _lu(body: Body, node: Node) -> None:
     body.spend(2 * n * n * m // 3)
 
 
+def _permutation(body: Body, node: Node) -> None:
+    (pivots,) = node.args
+    body.source.kernels.add("permutation")
+    target = body.kept(node)
+    body.line(f"permutation({node.size}, {pivots.size}, {body.pointer(pivots)}, {target});")
+
+
 WRITERS = {
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
     "lu": _lu,
+    "permutation": _permutation,
 }
 """By the name of the node."""

@@ -53,5 +53,17 @@ def _lu(program: Program, _, a: Node) -> list[Node]:
     ]
 
 
-RULES = {"cholesky": _cholesky, "triangular_solve": _triangular_solve, "lu": _lu}
+def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> Node:
+    size = parameters["permutation_size"]
+    index = np.arange(pivots.size).reshape(-1, pivots.shape[-1])
+    each = [program.make("permutation", (size,), "int", [program.arrange([pivots], row)]) for row in index]
+    return _stacked(program, each, (*pivots.shape[:-1], size))
+
+
+RULES = {
+    "cholesky": _cholesky,
+    "triangular_solve": _triangular_solve,
+    "lu": _lu,
+    "lu_pivots_to_permutation": _permutation,
+}
 """By the primitive's name."""

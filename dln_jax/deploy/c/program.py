@@ -15,6 +15,7 @@ source it is. Arranges of arranges are one arrange.
 | `order` | flat indices that sort rows by keys [o, n], each row by the first key, then the next |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
+| `permutation` | the order of rows after exchanges, as `lu` has them |
 | `call` | a function of its own |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
 
