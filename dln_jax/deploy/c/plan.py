@@ -17,7 +17,7 @@ WRITTEN_OUT = 64
 """Elements of a result, or products of a sum, up to which they may be written out one by one."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
-_FACTORED = ("cholesky", "triangular_solve", "permutation")
+_FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """What reads arguments through a pointer."""
 

@@ -16,6 +16,8 @@ source it is. Arranges of arranges are one arrange.
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
 | `permutation` | the order of rows after exchanges, as `lu` has them |
+| `geqrf`, `householder_product` | R, the reflectors and their factors [m n + min(m, n)] of a matrix; their product |
+| `eigh` | eigenvectors and eigenvalues [n n + n] of a symmetric matrix |
 | `call` | a function of its own |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
 

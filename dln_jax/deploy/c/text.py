@@ -30,8 +30,7 @@ _RESERVED = frozenset(
         using virtual void volatile while xor
         abort abs assert atol bufsiz clock complex ctype div eof errno exit fenv free gamma index infinity inttypes
         iso646 j0 j1 jn limits locale main malloc math null printf rand real setjmp signal stdarg stdbool stddef stdint
-        stdio stdlib string tgmath time wchar wctype y0 y1 yn all clean demo install test cholesky lu permutation
-        triangular_solve
+        stdio stdlib string tgmath time wchar wctype y0 y1 yn all clean demo install test cholesky lu triangular_solve
         """
         + _FUNCTIONS
         + re.sub(r"\b(\w+)\b", r"\1f", _FUNCTIONS),

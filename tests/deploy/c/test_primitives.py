@@ -366,6 +366,37 @@ FACTORED = {
     "batched_solve": lambda a, b: jnp.linalg.solve(jnp.stack([a, a.T]), jnp.stack([b, 2 * b])),
     "batched_cholesky": lambda a, b: jnp.linalg.cholesky(jnp.stack([definite(a), 2 * definite(a)])),
 }  # fmt: skip
+
+
+def spectral(a, function):
+    """A function of a symmetric matrix, which does not depend on the signs of eigenvectors."""
+    values, vectors = jnp.linalg.eigh(a)
+    return (vectors * function(values)) @ vectors.T
+
+
+ORTHOGONAL = {
+    "qr": lambda a, b: (jnp.linalg.qr(a), jnp.linalg.qr(a, mode="r")),
+    "qr_of_tall": lambda a, b: (jnp.linalg.qr(jnp.vstack([a, b.T])), jnp.linalg.qr(b), jnp.linalg.qr(b, "complete")),
+    "qr_of_wide": lambda a, b: (jnp.linalg.qr(b.T), jnp.linalg.qr(jnp.hstack([a, b]), mode="complete")),
+    "qr_of_several": lambda a, b: jnp.linalg.qr(jnp.stack([a, 2 * a.T, upper(a)])),
+    "reflectors": lambda a, b: (
+        *lax.linalg.householder_product(a, jnp.tanh(a[0])),
+        lax.linalg.householder_product(a, jnp.tanh(a[0, :1])),
+    ),
+    "gradient_of_qr": lambda a, b: jax.grad(lambda x: jnp.sum(jnp.sin(jnp.vstack(jnp.linalg.qr(x)))))(definite(a)),
+    "eigh": lambda a, b: (spectral(a + a.T, jnp.sin), jnp.linalg.eigvalsh(a), jnp.linalg.eigh(definite(a))[0]),
+    "eigh_of_a_triangle": lambda a, b: [
+        (values, (vectors * values) @ vectors.T, vectors.T @ vectors)
+        for lower in (True, False)
+        for vectors, values in [lax.linalg.eigh(a, lower=lower, symmetrize_input=False)]
+    ],
+    "eigh_of_several": lambda a, b: jax.vmap(lambda x: spectral(x, jnp.tanh))(jnp.stack([a + a.T, definite(a)])),
+    "eigh_of_equal_values": lambda a, b: (
+        jnp.linalg.eigvalsh(jnp.outer(b[:, 0], b[:, 0])),
+        spectral(2 * jnp.eye(a.shape[0], dtype=a.dtype) + jnp.outer(b[:, 0], b[:, 0]), jnp.cos),
+    ),
+    "gradient_of_eigh": lambda a, b: jax.grad(lambda x: jnp.sum(spectral(x + x.T, jnp.sin) * x))(a),
+}
 PRODUCTS = {
     "contraction": (
         lambda a, b: (jnp.einsum("bij,bjk->bik", a, b), jnp.einsum("bij,bjk->i", a, b), jnp.tensordot(a, b, 0)),
@@ -515,6 +546,12 @@ CASES = {
         name: (function, (np.concatenate([SPECIAL, RANDOM.permutation(SPECIAL)]).reshape(6, 6),))
         for name, function in SORTED.items()
     },
+    **{
+        f"{name}_{n}": (function, (normal(n, n), normal(n, 2)))
+        for n in (1, 2, 3, 9)
+        for name, function in ORTHOGONAL.items()
+        if n in (3, 9) or name in ("qr", "qr_of_tall", "eigh")
+    },
     "gradient_of_sort": (
         jax.grad(lambda x: jnp.sort(x, 1)[:, 0] @ jnp.sort(x, 0)[2, :5] + jnp.median(x)),
         (normal(5, 7),),
@@ -533,6 +570,7 @@ def drawn(leaf, random):
 
 NOT_FINITE = {
     **{f"{name}_{n}": (np.nan,) * ("cholesky" in name) for name in FACTORED for n in (1, 2, 3, 7, 9)},
+    **{f"{name}_{n}": () for name in ORTHOGONAL for n in (1, 2, 3, 9)},
     "gradient_of_max": (),
 }
 """What some cases are tried on; others on NaN and infinities. LAPACK makes finite numbers of infinities, and of
