@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from dln_jax.deploy.c import integers
 from dln_jax.deploy.c.elementary import OPERATIONS as COSTS
 from dln_jax.deploy.c.elementary import VECTORISED as _VECTORISED
-from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES
+from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES, UNSIGNED
 
 
 class Operation(NamedTuple):
@@ -125,8 +125,20 @@ def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
         return str(int(op in ("eq", "le", "ge")))
     if alike and op in ("max", "min"):
         return args[0]
+    if dtype in UNSIGNED and (known := _beside_zero(op, args)):
+        return known
     text = integers.pattern(op, dtype) if dtype != "real" else None
     return (text or OPERATIONS[op].c).format(*args, f=suffix)
+
+
+def _beside_zero(op: str, args: Sequence[str]) -> str | None:
+    """A comparison of an unsigned number with a literal 0 whose result is known: compilers warn of the plain one."""
+    if op not in ("lt", "ge", "gt", "le"):
+        return None
+    other, zero = args if op in ("lt", "ge") else args[::-1]
+    if zero not in ("0U", "0ULL"):
+        return None
+    return f"(({other} == {zero}) {'|' if op in ('ge', 'le') else '&'} ({other} > {zero}))"
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))

@@ -200,6 +200,14 @@ ON_INTEGERS_MORE = {
         for name in ("left", "right_logical", "right_arithmetic")
         for by in (0, 1, 30, 31, 32, -1)
     ],
+    "unsigned_beside_some_zeros": lambda a, b: [
+        compared(x, known)
+        for kind in (jnp.uint32, jnp.uint64)
+        for x in (a[:3].astype(kind), a.astype(kind))
+        for known in (jnp.array([0, 7, 1] + [0] * (len(x) - 3), kind),)
+        for compare in (jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
+        for compared in (compare, lambda x, y, compare=compare: compare(y, x))
+    ],
     "total_order": lambda a, b: [
         primitive.bind(*pair)
         for primitive in (of_jax.lt_to_p, of_jax.le_to_p)
