@@ -132,13 +132,15 @@ def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
 
 
 def _beside_zero(op: str, args: Sequence[str]) -> str | None:
-    """A comparison of an unsigned number with a literal 0 whose result is known: compilers warn of the plain one."""
-    if op not in ("lt", "ge", "gt", "le"):
-        return None
-    other, zero = args if op in ("lt", "ge") else args[::-1]
-    if zero not in ("0U", "0ULL"):
-        return None
-    return f"(({other} == {zero}) {'|' if op in ('ge', 'le') else '&'} ({other} > {zero}))"
+    """An operation on an unsigned number and a literal 0 that is known: compilers warn of the plain comparison."""
+    zeros = ("0U", "0ULL")
+    if op in ("max", "min") and not {*zeros}.isdisjoint(args):
+        other = args[0] if args[1] in zeros else args[1]
+        return other if op == "max" else f"({other} & 0U)"
+    if op in ("lt", "ge", "gt", "le"):
+        other, zero = args if op in ("lt", "ge") else args[::-1]
+        return f"(({other} == 0U) {'|' if op in ('ge', 'le') else '&'} ({other} > 0U))" if zero in zeros else None
+    return None
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))

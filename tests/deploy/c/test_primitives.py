@@ -205,7 +205,7 @@ ON_INTEGERS_MORE = {
         for kind in (jnp.uint32, jnp.uint64)
         for x in (a[:3].astype(kind), a.astype(kind))
         for known in (jnp.array([0, 7, 1] + [0] * (len(x) - 3), kind),)
-        for compare in (jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
+        for compare in (jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal, jnp.maximum, jnp.minimum)
         for compared in (compare, lambda x, y, compare=compare: compare(y, x))
     ],
     "total_order": lambda a, b: [
