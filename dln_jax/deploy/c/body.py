@@ -44,6 +44,8 @@ class Source:
     integers: set[str] = field(default_factory=set)
     """Functions of whole numbers that are called."""
     kernels: set[str] = field(default_factory=set)
+    orders: set[tuple[str, ...]] = field(default_factory=set)
+    """Kinds of the keys that something is sorted by."""
     parts: dict[bytes, "Called"] = field(default_factory=dict)
     """Functions that others call, by the identity of their program."""
     names: dict[str, str] = field(default_factory=dict)

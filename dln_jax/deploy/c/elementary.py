@@ -101,6 +101,13 @@ _ROUNDED = """static inline real elementary_rounded(real x, int exponent_bits, i
     return elementary_number_of(sign | kept);
 }
 """
+# Whole numbers in the total order of the real ones: -0 before 0, NaN of either sign outside the infinities.
+_ORDERED = """static inline elementary_word elementary_ordered(real x)
+{
+    const elementary_word bits = elementary_word_of(x);
+    return bits & $sign ? ~bits : bits | $sign;
+}
+"""
 _BOUNDED = """static inline real elementary_$name(real x)
 {
     return fabs${f}(x) <= $bound ? elementary_${name}_within(x) : $name${f}(x);
@@ -198,8 +205,8 @@ VECTORISED: tuple[str, ...] = tuple(_BODIES)
 def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
     """C text of `elementary_NAME(x)` for the names, `elementary_NAME_each(n, x, y)` for arrays, and what they need.
 
-    The name `choice` stands for the choice between two numbers alone, which the others need too, and `rounded` for
-    rounding to fewer bits.
+    The name `choice` stands for the choice between two numbers alone, which the others need too, `rounded` for
+    rounding to fewer bits, and `ordered` for comparisons in the total order.
 
     Before it, the source has <float.h>, <math.h>, <stdint.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is
     a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own
@@ -208,13 +215,14 @@ def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] =
     arrays = set(arrays)
     needed = set(names) | arrays
     chosen = needed & set(VECTORISED)
-    if not chosen and not needed & {"choice", "rounded"}:
+    if not chosen and not needed & {"choice", "rounded", "ordered"}:
         return ""  # clang warns of what is not used
     facts = _values(precision)
     # By method 1 float is computed in double, which is wrong for the functions of float alone.
     text = [fill(_EVALUATION, precision, or_double=" && FLT_EVAL_METHOD != 1" * (precision == "f64"))] * bool(chosen)
     text.append(fill(_COMMON, precision, **facts))
     text += [fill(_ROUNDED, precision, **facts)] * ("rounded" in needed)
+    text += [fill(_ORDERED, precision, **facts)] * ("ordered" in needed)
     for name in (name for name in VECTORISED if name in chosen):
         bounded = name in BOUNDS
         text.append(_function(name, precision, "_within" * bounded))

@@ -8,11 +8,8 @@ from dln_jax.deploy.c.kinds import NUMPY_TYPES, UNSIGNED
 from dln_jax.deploy.c.nodes import Node, is_constant, values
 from dln_jax.deploy.c.primitives import convert
 from dln_jax.deploy.c.program import Program
-from dln_jax.deploy.c.reductions import RULES as REDUCE
-from dln_jax.types import InputError
+from dln_jax.deploy.c.reductions import rows_of
 
-SORTED = 64
-"""Numbers of a vector that is sorted by counting."""
 _ELEMENTWISE = {f"put_{name}": name for name in ("add", "sub", "mul", "min", "max")}
 _UPDATES = {"scatter": "put_set", **{f"scatter-{name}": op for op, name in _ELEMENTWISE.items()}}
 
@@ -127,27 +124,15 @@ def dynamic_update_slice(program: Program, _, operand: Node, update: Node, *star
 
 
 def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
-    """`lax.sort` of a short vector, as solving does of a permutation: each element moves to its rank."""
-    key, n = nodes[0], nodes[0].size
-    if key.shape != (n,) or n > SORTED or parameters["num_keys"] != 1:
-        raise InputError(f"the primitive 'sort' has C for one vector of up to {SORTED} numbers; this is {key.shape}")
-    if n < 2:
+    """`lax.sort` along an axis by the first `num_keys` arrays: stable, and NaN comes last."""
+    axis, shape = parameters["dimension"], nodes[0].shape
+    if shape[axis] < 2 or nodes[0].size == 0:
         return list(nodes)
-    index = np.broadcast_to(np.arange(n), (n, n))
-    own, other = program.arrange([key], index.T), program.arrange([key], index)
-
-    def before(first: Node, second: Node) -> Node:
-        less = program.elementwise("lt", first, second)
-        if key.dtype != "real":
-            return less
-        numbers = program.elementwise("eq", first, first), program.elementwise("ne", second, second)
-        return program.elementwise("or", less, program.elementwise("and", *numbers))  # NaN comes last
-
-    tied = program.elementwise("not", program.elementwise("or", before(own, other), before(other, own)))
-    earlier = program.elementwise("and", tied, program.constant(index < index.T, "bool"))
-    counted = convert(program, program.elementwise("or", before(other, own), earlier), "int")
-    rank = REDUCE["reduce_sum"](program, {"axes": (1,)}, counted)
-    return [put(program, "put_set", program.constant(np.zeros(n, np.int64), each.dtype), rank, each) for each in nodes]
+    rows = [rows_of(program, node, (axis,)) for node in nodes]
+    order = program.make("order", rows[0].shape, "index", rows[: parameters["num_keys"]])
+    last = np.moveaxis(np.empty(shape), axis, -1).shape
+    back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
+    return [program.arrange([take(program, each, order)], back) for each in rows]
 
 
 def _window(program: Program, shape, sizes, starts) -> Node:

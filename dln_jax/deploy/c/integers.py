@@ -1,10 +1,11 @@
 """Whole numbers in C as XLA computes them: sums wrap around, divisions never trap, conversions saturate.
 
-C leaves signed overflow, division by zero, the least number over -1, and the conversion of a real number that does not
-fit undefined. XLA defines them all (x / 0 is -1, or the largest unsigned number; x % 0 is x; NaN becomes 0), and so
-does the text here.
+C leaves undefined: signed overflow, division by zero, the least number over -1, the conversion of a real number that
+does not fit, and shifts by amounts outside the number's bits. XLA defines them all (x / 0 is -1, or the largest
+unsigned number; x % 0 is x; NaN becomes 0; all bits are shifted out), and so does the text here.
 """
 
+import functools
 from collections.abc import Iterable
 
 import numpy as np
@@ -56,8 +57,31 @@ def converted(x, kind: str):
     return np.where(inside | (x != x), whole, np.where(x > 0, to(high), to(low)))
 
 
+def _shifted_right(a, b, *, kind: str):
+    """`a >> b` of arrays, with zeros (kind "u") or copies of the sign bit (kind "i") shifted in.
+
+    NumPy shifts as XLA does: an amount outside the bits, negative ones included, shifts all of them out.
+    """
+    typed = np.dtype(f"{kind}{a.dtype.itemsize}")
+    return np.right_shift(a.view(typed), b.view(typed)).view(a.dtype)
+
+
+SHIFTS = {
+    "left": np.left_shift,
+    "right_logical": functools.partial(_shifted_right, kind="u"),
+    "right_arithmetic": functools.partial(_shifted_right, kind="i"),
+}
+"""Shifts of arrays, by name."""
+_ALL_SHIFTED_OUT = {"left": "0", "right_logical": "0", "right_arithmetic": "({s})a < 0 ? ({c})-1 : 0"}
+_SHIFTED = {
+    "left": "({c})(({u})a << b)",
+    "right_logical": "({c})(({u})a >> b)",
+    "right_arithmetic": "({s})a < 0 ? ({c})~(~({u})a >> b) : ({c})(({u})a >> b)",
+}
+
+
 def definitions(names: Iterable[str], precision: str) -> str:
-    """C functions of these names: `quotient_KIND`, `remainder_KIND` and `KIND_of`, a real number as the kind."""
+    """C functions of these names: `quotient_KIND`, `remainder_KIND`, `shift_NAME_KIND`, and `KIND_of` a real number."""
     names = set(names)
     text = ""
     for kind in (*SIGNED, *UNSIGNED):
@@ -70,6 +94,11 @@ def definitions(names: Iterable[str], precision: str) -> str:
                               _QUOTIENT[signed].format(**facts))  # fmt: skip
         if f"remainder_{kind}" in names:
             text += _function(f"{c} elementary_remainder_{kind}({c} a, {c} b)", "b == 0", "a", _REMAINDER[signed])
+        types = {"c": c, "u": f"u{c.removeprefix('u')}", "s": c.removeprefix("u")}
+        for shift in (each for each in SHIFTS if f"shift_{each}_{kind}" in names):
+            text += _function(f"{c} elementary_shift_{shift}_{kind}({c} a, {c} b)",
+                              f"({types['u']})b >= {8 * np.dtype(NUMPY_TYPES[kind]).itemsize}",
+                              _ALL_SHIFTED_OUT[shift].format(**types), _SHIFTED[shift].format(**types))  # fmt: skip
         if f"{kind}_of" in names:
             low, high = (float(limit) for limit in (np.iinfo(NUMPY_TYPES[kind]).min, np.iinfo(NUMPY_TYPES[kind]).max))
             least, most = f"{limits}_MIN" if signed else "0", f"{limits}_MAX"

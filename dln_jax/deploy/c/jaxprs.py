@@ -51,7 +51,8 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
             ]
             digest.update(repr((equation.primitive.name, types)).encode())
             digest.update(b"".join(np.asarray(each).tobytes() for each in literals))
-            for inner in (each for value in equation.params.values() for each in _jaxprs(value)):
+            values = equation.params.values() if _of_jax(equation.primitive) else ()
+            for inner in (each for value in values for each in _jaxprs(value)):
                 inside, likeness = called(inner)
                 within += inside
                 digest.update(likeness)
@@ -86,6 +87,38 @@ def expanded(primitive: Any) -> Any:
 
     examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
     return jax.make_jaxpr(expand)(*examples)
+
+
+def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
+    """What a primitive of another library, such as Equinox, is in JAX's own: its `impl`; None for one of JAX's own.
+
+    Args:
+        known: the numbers of each argument that is constant, None for others; only those are arguments of the jaxpr.
+    """
+    primitive = equation.primitive
+    if _of_jax(primitive):
+        return None
+
+    def run(*unknown: Any) -> list[Any]:
+        left = iter(unknown)
+        args = [next(left) if each is None else each for each in known]
+        return jax.tree.leaves(primitive.impl(*args, **equation.params))
+
+    avals = [variable.aval for variable, each in zip(equation.invars, known, strict=True) if each is None]
+    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(each.shape, each.dtype) for each in avals))
+
+
+def _of_jax(primitive: Any) -> bool:
+    """Whether a primitive is one of JAX's own."""
+    return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
+
+
+def is_error_of_equinox(equation: Any) -> bool:
+    """Whether an equation is the callback that raises the error of `equinox.error_if`."""
+    if equation.primitive.name != "pure_callback":
+        return False
+    callback = equation.params["callback"]
+    return getattr(callback, "callback_func", callback).__module__ == "equinox._errors"
 
 
 def closed_jaxpr(jaxpr: Any) -> Any:

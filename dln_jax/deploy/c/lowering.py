@@ -7,8 +7,8 @@ import numpy as np
 from jax.dtypes import float0
 
 from dln_jax.deploy.c import indexing, linear_algebra, primitives, reductions
-from dln_jax.deploy.c.jaxprs import closed_jaxpr, expanded, made_at, scanned
-from dln_jax.deploy.c.kinds import kind_of
+from dln_jax.deploy.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at, scanned
+from dln_jax.deploy.c.kinds import NUMPY_TYPES, kind_of
 from dln_jax.deploy.c.nodes import Loop, Node, is_constant, values
 from dln_jax.deploy.c.program import Part, Program
 from dln_jax.deploy.c.text import PRECISIONS
@@ -100,6 +100,8 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return _inline(program, expanded(parameters["_prim"]), args)
     if name == "scan":
         parameters = {**parameters, **scanned(equation)}
+    if is_error_of_equinox(equation):
+        return [_failed(program, variable.aval) for variable in equation.outvars]
     if name in _CONTROL:
         return _CONTROL[name](program, parameters, args)
     if name in _TYPED_RULES:
@@ -107,9 +109,21 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
     if name not in _RULES:
         why = next((reason for part, reason in _REFUSED.items() if part in name), None)
+        inner = (
+            None if why else implementation(equation, [values(each) if is_constant(each) else None for each in args])
+        )
+        if inner is not None:
+            return _inline(program, inner, [each for each in args if not is_constant(each)])
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
     results = _RULES[name](program, parameters, *args)
     return list(results) if isinstance(results, list | tuple) else [results]
+
+
+def _failed(program: Program, aval: Any) -> Node:
+    """What stands for an error that C cannot raise: NaN, the largest whole number, or true, as by EQX_ON_ERROR=nan."""
+    kind = kind_of(aval.dtype)
+    value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
+    return program.broadcast(program.constant(value, kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:

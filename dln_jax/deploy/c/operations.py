@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from dln_jax.deploy.c import integers
 from dln_jax.deploy.c.elementary import OPERATIONS as COSTS
 from dln_jax.deploy.c.elementary import VECTORISED as _VECTORISED
-from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES
+from dln_jax.deploy.c.kinds import C_TYPES, NUMPY_TYPES, UNSIGNED
 
 
 class Operation(NamedTuple):
@@ -53,6 +53,7 @@ OPERATIONS = {
     "sqrt": _function("sqrt", np.sqrt),
     "pow": _function("pow", np.power, arguments=2),
     "atan2": _function("atan2", np.arctan2, arguments=2),
+    "nextafter": _function("nextafter", np.nextafter, arguments=2),
     **{
         name: _function(name, fold)
         for name, fold in {
@@ -88,6 +89,9 @@ OPERATIONS = {
     "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
     # To so many bits of exponent and mantissa.
     "rounded": Operation("elementary_rounded({0}, {1}, {2})", None),
+    # In the total order of IEEE 754: -0 before 0, NaN outside the infinities.
+    "lt_to": Operation("(elementary_ordered({0}) < elementary_ordered({1}))", None, 0, "bool"),
+    "le_to": Operation("(elementary_ordered({0}) <= elementary_ordered({1}))", None, 0, "bool"),
     "eq": _comparison("==", np.equal),
     "ne": _comparison("!=", np.not_equal),
     "lt": _comparison("<", np.less),
@@ -99,6 +103,10 @@ OPERATIONS = {
     "xor": Operation("({0} ^ {1})", np.bitwise_xor, 0),
     "not": Operation("(!{0})", np.logical_not, 0),
     "integer_not": Operation("(~{0})", np.invert, 0),
+    **{
+        f"shift_{name}": Operation(f"elementary_shift_{name}({{0}}, {{1}})", fold, 0)
+        for name, fold in integers.SHIFTS.items()
+    },
     "select": Operation("({0} ? {1} : {2})", lambda c, a, b: np.where(c, a, b), 0),
     **{
         f"to_{kind}": Operation(f"(({C_TYPES[kind]}){{0}})", functools.partial(integers.converted, kind=kind), 0, kind)
@@ -117,8 +125,22 @@ def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
         return str(int(op in ("eq", "le", "ge")))
     if alike and op in ("max", "min"):
         return args[0]
+    if dtype in UNSIGNED and (known := _beside_zero(op, args)):
+        return known
     text = integers.pattern(op, dtype) if dtype != "real" else None
     return (text or OPERATIONS[op].c).format(*args, f=suffix)
+
+
+def _beside_zero(op: str, args: Sequence[str]) -> str | None:
+    """An operation on an unsigned number and a literal 0 that is known: compilers warn of the plain comparison."""
+    zeros = ("0U", "0ULL")
+    if op in ("max", "min") and not {*zeros}.isdisjoint(args):
+        other = args[0] if args[1] in zeros else args[1]
+        return other if op == "max" else f"({other} & 0U)"
+    if op in ("lt", "ge", "gt", "le"):
+        other, zero = args if op in ("lt", "ge") else args[::-1]
+        return f"(({other} == 0U) {'|' if op in ('ge', 'le') else '&'} ({other} > 0U))" if zero in zeros else None
+    return None
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))

@@ -17,7 +17,8 @@ WRITTEN_OUT = 64
 """Elements of a result, or products of a sum, up to which they may be written out one by one."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
-PLAIN_MEMORY = ("take", "cholesky", "triangular_solve", "lu", "call")
+_FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
+PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
 """What reads arguments through a pointer."""
 
 
@@ -148,7 +149,7 @@ def _is_written_out(node: Node) -> bool:
 
 def _is_scalar(node: Node) -> bool:
     """Whether what computes it can leave it without memory."""
-    return node.size == 1 and node.op not in ("contract", "cholesky", "triangular_solve") and node.op[:4] != "put_"
+    return node.size == 1 and node.op not in ("contract", *_FACTORED) and node.op[:4] != "put_"
 
 
 def _is_product(node: Node, written_out: set[Node]) -> bool:

@@ -24,7 +24,8 @@ _RENAMED = {
 _AS_NAMED = (
     "add", "sub", "mul", "atan2", "sqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p",
     "log2", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf",
-    "erfc", "lgamma", "floor", "ceil", "is_finite", "and", "or", "xor",
+    "erfc", "lgamma", "floor", "ceil", "is_finite", "and", "or", "xor", "nextafter", "shift_left",
+    "shift_right_logical", "shift_right_arithmetic",
 )  # fmt: skip
 
 
@@ -71,6 +72,16 @@ def _comparison(name: str) -> Rule:
         # a < b is (not a) and b; a <= b is (not a) or b
         low, high = (a, b) if name in ("lt", "le") else (b, a)
         return program.elementwise("and" if name in ("lt", "gt") else "or", program.elementwise("not", low), high)
+
+    return rule
+
+
+def _total_order(name: str) -> Rule:
+    """Whole numbers and truth values are compared as usual."""
+    usual = _comparison(name)
+
+    def rule(program: Program, parameters, a: Node, b: Node) -> Node:
+        return program.elementwise(f"{name}_to", a, b) if a.dtype == "real" else usual(program, parameters, a, b)
 
     return rule
 
@@ -218,6 +229,7 @@ RULES: dict[str, Rule] = {
     "square": lambda program, _, x: program.elementwise("mul", x, x),
     "neg": lambda program, _, x: program.elementwise("neg", x),
     **{name: _comparison(name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
+    **{f"{name}_to": _total_order(name) for name in ("lt", "le")},
     **{name: _extreme(name) for name in ("max", "min")},
     "reduce_precision": _reduce_precision,
     "not": _not,

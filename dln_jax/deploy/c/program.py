@@ -12,8 +12,12 @@ source it is. Arranges of arranges are one arrange.
 | `contract` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
 | `reduce_*`, `arg*` | over the last axis of an argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
+| `order` | flat indices that sort rows by keys [o, n], each row by the first key, then the next |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
 | `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
+| `permutation` | the order of rows after exchanges, as `lu` has them |
+| `geqrf`, `householder_product` | R, the reflectors and their factors [m n + min(m, n)] of a matrix; their product |
+| `eigh` | eigenvectors and eigenvalues [n n + n] of a symmetric matrix |
 | `call` | a function of its own |
 | `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
 

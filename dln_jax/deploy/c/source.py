@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from dln_jax.deploy.c import casadi as external
-from dln_jax.deploy.c import integers, kernels
+from dln_jax.deploy.c import factorisations, integers, ordering
 from dln_jax.deploy.c.body import Source
 from dln_jax.deploy.c.demo import cmake, demo
 from dln_jax.deploy.c.elementary import definitions
@@ -257,7 +257,8 @@ def _preamble(source: Source, name: str) -> str:
         f"#define MULTIPLY_ADD(a, b, c) ((a) * (b) + (c))\n#endif\n"
         "#ifdef __cplusplus\n#define RESTRICT\n#else\n#define RESTRICT restrict\n#endif\n\n"
         f"{tables}{definitions(source.functions, source.precision, arrays=source.arrays)}"
-        f"{integers.definitions(source.integers, source.precision)}{kernels.definitions(source.kernels, suffix)}"
+        f"{integers.definitions(source.integers, source.precision)}{ordering.definitions(source.orders)}"
+        f"{factorisations.definitions(source.kernels, suffix)}"
     )
 
 

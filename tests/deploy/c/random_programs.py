@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import primitives as of_jax
 
 REAL, WHOLE = (jnp.float64,), (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
 TYPES = (*REAL * 3, *WHOLE[:2] * 2, *WHOLE[2:], jnp.bool_)
@@ -131,17 +132,27 @@ ON_TWO_REAL = (
     jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, jnp.hypot, lambda a, b: a / (2 + jnp.abs(b)),
     lambda a, b: jnp.arctan2(a, 1 + b * b), lambda a, b: (1 + a * a) ** jnp.tanh(b), jnp.logaddexp,
     lambda a, b: jnp.fmod(a, 1.5 + jnp.abs(b)), lambda a, b: jnp.where(a > b, a, 2 * b),
+    lambda a, b: jnp.nextafter(1 + a * a, b),  # never subnormal, which XLA takes for zero
 )  # fmt: skip
 ON_TWO_WHOLE = (
     jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lax.div, lax.rem, jnp.bitwise_and, jnp.bitwise_or,
-    jnp.bitwise_xor, jnp.floor_divide, jnp.remainder,
+    jnp.bitwise_xor, jnp.floor_divide, jnp.remainder, lax.shift_left, lax.shift_right_logical,
+    lax.shift_right_arithmetic,
 )  # fmt: skip
 ON_WHOLE = (  # without squares, which XLA takes for positive though they wrap around
     jnp.negative, jnp.abs, jnp.sign, jnp.bitwise_not, lambda x: x * (x + 1), lambda x: x**3, lambda x: x & 1,
     lambda x: x | 0,
 )  # fmt: skip
 ON_TRUTHS = (jnp.logical_and, jnp.logical_or, jnp.logical_xor, jnp.equal, jnp.less, jnp.less_equal, jnp.maximum)
-COMPARED = (jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal)
+COMPARED = (
+    jnp.equal, jnp.not_equal, jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal,
+    lambda a, b: _in_total_order(of_jax.lt_to_p, a, b), lambda a, b: _in_total_order(of_jax.le_to_p, a, b),
+)  # fmt: skip
+
+
+def _in_total_order(comparison, a, b):
+    """Not of zeros, whose signs XLA and C may lose."""
+    return comparison.bind(*jnp.broadcast_arrays(*(1 + abs(x) if x.dtype == float else x for x in (a, b))))
 
 
 def _one(random, known, depth):
@@ -198,12 +209,13 @@ def _converted(random, known, depth):
 OVER_REAL = (
     lambda x, axis: _tame(x.mean(axis)), lambda x, axis: _tame(jnp.sum(x, axis)), jnp.max, jnp.min,
     lambda x, axis: jnp.prod(jnp.cos(x), axis), jnp.argmax, jnp.argmin, lambda x, axis: jnp.sqrt(1 + jnp.var(x, axis)),
-    lambda x, axis: _tame(jnp.cumsum(x, axis or 0)),
+    lambda x, axis: _tame(jnp.cumsum(x, axis or 0)), jnp.sort,
 )  # fmt: skip
 OVER_WHOLE = (
     jnp.sum, jnp.prod, jnp.max, jnp.min, jnp.argmax, jnp.argmin, lambda x, axis: jnp.cumsum(x, axis or 0),
     lambda x, axis: jnp.bitwise_xor.reduce(x, axis or 0), lambda x, axis: jnp.bitwise_or.reduce(x, axis or 0),
-    lambda x, axis: jnp.bitwise_and.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0),
+    lambda x, axis: jnp.bitwise_and.reduce(x, axis or 0), lambda x, axis: lax.cummax(x, axis or 0), jnp.argsort,
+    lambda x, axis: lax.sort((x & 3, x), axis or 0, num_keys=2)[1],
 )  # fmt: skip
 OVER_TRUTHS = (jnp.any, jnp.all, jnp.sum, jnp.max, jnp.min)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from comparison import BOUND, in_c, in_jax
 from jax import lax
+from jax.extend.core import primitives as of_jax
 from jax.scipy import linalg as scipy_linalg
 from jax.scipy import special
 
@@ -35,6 +36,13 @@ WIDE = {n: normal(5, n) / n**0.5 for n in SIZES}
 def of(x, w):
     """Constants at the precision of the arguments."""
     return jnp.asarray(w, x.dtype)
+
+
+def total_order(name, a, b):
+    """NaN has the sign that is written in the program: that of a computed one depends on the processor."""
+    bind = getattr(of_jax, f"{name}_p").bind
+    number = jnp.where(a == a, a, 0)
+    return bind(number, jnp.where(b == b, b, 1)), bind(a, a), bind(number, of(a, [np.nan] * a.size))
 
 
 def definite(a):
@@ -173,6 +181,38 @@ ON_INTEGERS = {
     ),
     "filled": lambda a, b: (a.at[b].get(mode="fill"), a.astype(jnp.uint32).at[b].get(mode="fill")),
     "mixed": lambda a, b: (a.astype(jnp.int32), a.astype(jnp.uint32), (a > 0) & (b > 0)),
+}
+ON_TWO_MORE = {
+    "nextafter": lambda a, b: (lax.nextafter(a, b), lax.nextafter(a, a), lax.nextafter(a, 0 * a)),
+    **{name: lambda a, b, name=name: total_order(name, a, b) for name in ("lt_to", "le_to")},
+}
+ON_INTEGERS_MORE = {
+    **{
+        f"shift_{name}": lambda a, b, name=name: [
+            getattr(lax, f"shift_{name}")(a.astype(kind), by.astype(kind))
+            for kind in (jnp.int32, jnp.int64, jnp.uint32, jnp.uint64)
+            for by in (b, b + 25, b - 7, b % 3 + 30, jnp.full_like(b, 31), jnp.full_like(b, -1))
+        ]
+        for name in ("left", "right_logical", "right_arithmetic")
+    },
+    "shift_of_constants": lambda a, b: [
+        a.astype(jnp.int32) + getattr(lax, f"shift_{name}")(jnp.int32(-(2**30) - 5), jnp.int32(by)) * (b > 0)
+        for name in ("left", "right_logical", "right_arithmetic")
+        for by in (0, 1, 30, 31, 32, -1)
+    ],
+    "unsigned_beside_some_zeros": lambda a, b: [
+        compared(x, known)
+        for kind in (jnp.uint32, jnp.uint64)
+        for x in (a[:3].astype(kind), a.astype(kind))
+        for known in (jnp.array([0, 7, 1] + [0] * (len(x) - 3), kind),)
+        for compare in (jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal, jnp.maximum, jnp.minimum)
+        for compared in (compare, lambda x, y, compare=compare: compare(y, x))
+    ],
+    "total_order": lambda a, b: [
+        primitive.bind(*pair)
+        for primitive in (of_jax.lt_to_p, of_jax.le_to_p)
+        for pair in ((a, b), (a, a), (a.astype(jnp.uint32), b.astype(jnp.uint32)), (a > 0, b > 0))
+    ],
 }
 MOVES = {
     "broadcast": lambda x: x[:, None] + x[None, 0] + jnp.ones((2, 1, 1, 1)),
@@ -334,6 +374,37 @@ FACTORED = {
     "batched_solve": lambda a, b: jnp.linalg.solve(jnp.stack([a, a.T]), jnp.stack([b, 2 * b])),
     "batched_cholesky": lambda a, b: jnp.linalg.cholesky(jnp.stack([definite(a), 2 * definite(a)])),
 }  # fmt: skip
+
+
+def spectral(a, function):
+    """A function of a symmetric matrix, which does not depend on the signs of eigenvectors."""
+    values, vectors = jnp.linalg.eigh(a)
+    return (vectors * function(values)) @ vectors.T
+
+
+ORTHOGONAL = {
+    "qr": lambda a, b: (jnp.linalg.qr(a), jnp.linalg.qr(a, mode="r")),
+    "qr_of_tall": lambda a, b: (jnp.linalg.qr(jnp.vstack([a, b.T])), jnp.linalg.qr(b), jnp.linalg.qr(b, "complete")),
+    "qr_of_wide": lambda a, b: (jnp.linalg.qr(b.T), jnp.linalg.qr(jnp.hstack([a, b]), mode="complete")),
+    "qr_of_several": lambda a, b: jnp.linalg.qr(jnp.stack([a, 2 * a.T, upper(a)])),
+    "reflectors": lambda a, b: (
+        *lax.linalg.householder_product(a, jnp.tanh(a[0])),
+        lax.linalg.householder_product(a, jnp.tanh(a[0, :1])),
+    ),
+    "gradient_of_qr": lambda a, b: jax.grad(lambda x: jnp.sum(jnp.sin(jnp.vstack(jnp.linalg.qr(x)))))(definite(a)),
+    "eigh": lambda a, b: (spectral(a + a.T, jnp.sin), jnp.linalg.eigvalsh(a), jnp.linalg.eigh(definite(a))[0]),
+    "eigh_of_a_triangle": lambda a, b: [
+        (values, (vectors * values) @ vectors.T, vectors.T @ vectors)
+        for lower in (True, False)
+        for vectors, values in [lax.linalg.eigh(a, lower=lower, symmetrize_input=False)]
+    ],
+    "eigh_of_several": lambda a, b: jax.vmap(lambda x: spectral(x, jnp.tanh))(jnp.stack([a + a.T, definite(a)])),
+    "eigh_of_equal_values": lambda a, b: (
+        jnp.linalg.eigvalsh(jnp.outer(b[:, 0], b[:, 0])),
+        spectral(2 * jnp.eye(a.shape[0], dtype=a.dtype) + jnp.outer(b[:, 0], b[:, 0]), jnp.cos),
+    ),
+    "gradient_of_eigh": lambda a, b: jax.grad(lambda x: jnp.sum(spectral(x + x.T, jnp.sin) * x))(a),
+}
 PRODUCTS = {
     "contraction": (
         lambda a, b: (jnp.einsum("bij,bjk->bik", a, b), jnp.einsum("bij,bjk->i", a, b), jnp.tensordot(a, b, 0)),
@@ -434,6 +505,33 @@ INTERFACES = {
     "of_constants": (lambda x: (jnp.ones(3), jnp.zeros(()), jnp.arange(4.0)), (normal(2),)),
     "unchanged": (lambda x, y: (y, x, x), (normal(3), normal(3))),
 }  # fmt: skip
+SORTED = {
+    "sort_along_axes": lambda x: (
+        *(jnp.sort(x, 0), jnp.sort(x, 1), jnp.sort(x, None), jnp.argsort(x, 0), jnp.argsort(x, 1), jnp.median(x, 1)),
+        *(jnp.sort(x, 0, descending=True), jnp.argsort(-x, 1, stable=False), jnp.sort(x.reshape(3, 4, 3), 1)),
+    ),
+    "sort_by_several": lambda x: (
+        lax.sort((jnp.round(x), x, lax.broadcasted_iota(int, x.shape, 0)), 0, num_keys=2),
+        lax.sort((jnp.round(x), x, x[::-1]), 1, num_keys=1),
+        lax.sort((x > 0, jnp.isfinite(x), jnp.sign(x), jnp.arange(36).reshape(6, 6) % 5, x), 0, num_keys=4),
+        jnp.lexsort((x[0], jnp.sign(x[0]))),
+    ),
+    "sort_of_integers": lambda x: [
+        (jnp.sort(k, 0), jnp.argsort(k, 1), jnp.sort(k, None), jnp.argsort(k[:, 0] > 0))
+        for whole in [(jnp.nan_to_num(x, posinf=9, neginf=-9) * 3).astype(int)]
+        for k in (whole, whole.astype(jnp.int32), whole.astype(jnp.uint32), whole.astype(jnp.uint64))
+    ],
+    "sort_of_known": lambda x: (jnp.sort(jnp.sin(jnp.arange(9.0) ** 2)), x[jnp.argsort(jnp.array([3, 1, 5, 1, 2, 0]))]),
+    "sort_and_search": lambda x: (
+        *(jnp.unique(x, size=20, fill_value=0), jnp.searchsorted(jnp.sort(x[0]), x)),
+        *(jnp.searchsorted(jnp.sort(x[1]), x, side="right"), jnp.ravel(x)[jnp.argsort(x, None)][:3]),
+        *(jnp.sort(x[:, :1], 1), jnp.sort(x[:0], 0), jnp.sort(x[0, :2])),
+    ),
+    "sort_in_a_loop": lambda x: lax.scan(
+        lambda c, row: (jnp.sort(c + row), (jnp.argsort(row), jnp.sort(x, 0))), x[0], x
+    ),
+    "sort_of_many": lambda x: jnp.sort((x[:, :, None] * jnp.cos(jnp.arange(80.0) ** 2)).reshape(6, 480), 1),
+}
 CASES = {
     **{f"of_{name}": (function, (SPECIAL,)) for name, function in UNARY.items()},
     **{f"of_two_{name}": (function, (SPECIAL, RANDOM.permutation(SPECIAL))) for name, function in BINARY.items()},
@@ -447,6 +545,25 @@ CASES = {
     **ROUNDED,
     **TYPES,
     **INTERFACES,
+    **{f"of_two_{name}": (function, (SPECIAL, RANDOM.permutation(SPECIAL))) for name, function in ON_TWO_MORE.items()},
+    **{
+        f"of_integers_{name}": (function, (INTEGERS, INTEGERS[::-1].copy()))
+        for name, function in ON_INTEGERS_MORE.items()
+    },
+    **{
+        name: (function, (np.concatenate([SPECIAL, RANDOM.permutation(SPECIAL)]).reshape(6, 6),))
+        for name, function in SORTED.items()
+    },
+    **{
+        f"{name}_{n}": (function, (normal(n, n), normal(n, 2)))
+        for n in (1, 2, 3, 9)
+        for name, function in ORTHOGONAL.items()
+        if n in (3, 9) or name in ("qr", "qr_of_tall", "eigh")
+    },
+    "gradient_of_sort": (
+        jax.grad(lambda x: jnp.sort(x, 1)[:, 0] @ jnp.sort(x, 0)[2, :5] + jnp.median(x)),
+        (normal(5, 7),),
+    ),
 }
 """Function and first example of each of its arguments."""
 
@@ -461,6 +578,7 @@ def drawn(leaf, random):
 
 NOT_FINITE = {
     **{f"{name}_{n}": (np.nan,) * ("cholesky" in name) for name in FACTORED for n in (1, 2, 3, 7, 9)},
+    **{f"{name}_{n}": () for name in ORTHOGONAL for n in (1, 2, 3, 9)},
     "gradient_of_max": (),
 }
 """What some cases are tried on; others on NaN and infinities. LAPACK makes finite numbers of infinities, and of
@@ -492,7 +610,9 @@ def states_of(name, examples):
 STATES = {name: states_of(name, examples) for name, (_, examples) in CASES.items()}
 
 
-SINGLE = {*(f"of_{name}" for name in UNARY), *INTERFACES, *list(CASES)[::4]}
+SINGLE = {
+    *(f"of_{name}" for name in UNARY), *(f"of_two_{name}" for name in ON_TWO_MORE), *INTERFACES, *list(CASES)[::4]
+}  # fmt: skip
 """Tried in single precision too by default: elementary functions, of which there are two sorts, types, some others."""
 
 
