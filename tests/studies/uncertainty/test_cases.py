@@ -6,8 +6,9 @@ from dln_jax.studies.uncertainty import cases
 def test_a_simulated_arm_is_covered_and_its_far_motions_are_flagged():
     rows = {row.quantity: row for row in cases.simulated_arm("arm", 2, noise=0.3, unmodelled=False, splits=2).rows}
     assert rows["coverage_95_lowest_joint"].passed and rows["coverage_95_highest_joint"].passed
-    # By the covariance alone: where a linear model is sure of its torque, a far state is not outside.
+    # The covariance alone flags a linear model's states: a far one that is not flagged has a sure torque, and bands hold.
     assert rows["far_outside_share"].value > 0.8 > 0.5 > rows["outside_share"].value
+    assert rows["far_coverage_95"].value > 0.9
 
 
 def test_recordings_are_cases_where_their_files_are_given(tmp_path):
