@@ -54,7 +54,7 @@ class OfSize:
 
 
 def require_size_of(energy: Callable[..., Any], size: int) -> None:
-    """Raises `InputError` if an energy (q, x) reads beyond vectors [size], or x in part only: it is of another size."""
+    """Raises `InputError` if an energy (q, x) reads beyond vectors [size], or nothing of a coordinate's q and x."""
     q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
     wrong = f"the system takes no states of size {size}"
     try:
@@ -64,10 +64,11 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
     except Exception:  # an energy need not take NumPy's arrays
         return
     with jax.ensure_compile_time_eval():
-        slope = np.asarray(jax.jit(jax.grad(energy, argnums=1))(jnp.asarray(q), jnp.asarray(x)))
-    if not slope.all():
-        unused = ", ".join(str(k) for k in np.flatnonzero(slope == 0))
-        raise InputError(f"{wrong}: its energy does not depend on the rate of coordinate {unused} (counted from 0)")
+        slopes = np.asarray(jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x)))
+    # A coordinate may be without a potential or, where the mass matrix is singular, without inertia, but not both.
+    if not (read := slopes.any(axis=0)).all():
+        unused = ", ".join(str(k) for k in np.flatnonzero(~read))
+        raise InputError(f"{wrong}: its energy does not depend on coordinate {unused} (counted from 0) or its rate")
 
 
 def answer(function: Callable[..., Answer], *state: Array) -> Answer:

@@ -64,14 +64,14 @@ def read(given: Options) -> Recorded:
     if robot is not None:
         data = with_joints(data, robot.tree.names)
     needs, origin = stated_needs(given, scene, data, robot)
+    if needs.degrees_of_freedom != data.degrees_of_freedom:
+        raise InputError(
+            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
+        )
     if "tau" in data.estimated:
         raise InputError(
             f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
             f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
-        )
-    if needs.degrees_of_freedom != data.degrees_of_freedom:
-        raise InputError(
-            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
         )
     if robot is not None and needs.joints != robot.tree.joints:
         raise InputError(

@@ -90,7 +90,7 @@ def test_tests_and_noise_may_be_stated(double):
 def test_mistakes_are_one_line(double, capsys):
     cases = [
         ((*MEASURE, "--noise", "small"), "--noise is 'small'"),
-        ((*MEASURE, "--noise", "0"), "positive, finite"),
+        ((*MEASURE, "--noise", "0"), "finite positive numbers"),
         ((*MEASURE, "--coordinates", "absolute"), "--coordinates is for planar-chain"),
         ((*MEASURE, "--model", "trigonometric", "--width", "3"), "--width is for networks"),
         (("--task", "spring", "--test", "a"), "--test is for measured"),

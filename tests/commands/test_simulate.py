@@ -210,7 +210,7 @@ def test_the_script_refuses_mistakes_and_leaves_nothing_behind(tmp_path, capsys)
         "invalid choice 'leapfrog'": ("--integrator", "leapfrog"),
         "--friction is no choice of the beam scene": ("--friction", "0.1"),
         "--mesh is no choice of the creature scene": ("--scene", "creature", "--mesh", tmp_path / "absent.npz"),
-        "--seed is -1": ("--seed", "-1"),
+        "seed is -1": ("--seed", "-1"),
         "dimension is 4": ("--dimension", "4"),
         "number of cells along x is 0": ("--cells", "0"),
         "absent.npz: no such file": ("--mesh", tmp_path / "absent.npz"),

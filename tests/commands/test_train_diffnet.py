@@ -79,7 +79,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     np.testing.assert_allclose(np.mean((answers.hessian - grid.d2y) ** 2), metrics["hessian_mse"], rtol=1e-6)
     out = capsys.readouterr().out
     assert "value, gradient; gauss-newton, f64" in out and "almost everywhere" not in out
-    assert "not empty" in refused(capsys, train_diffnet, *TINY, "--out", folder)
+    assert "already contains a run" in refused(capsys, train_diffnet, *TINY, "--out", folder)
 
 
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
@@ -158,7 +158,7 @@ MISTAKES = {
     "pickle": ({"y": np.array([None] * 60)}, [], "without pickled objects"),
     "no gradient": ({"dy": None}, [], "no dy; add it or choose type2"),
     "no Hessian": ({"d2y": None}, ["--derivative", "2"], "no d2y"),
-    "activation": ({}, ["--activation", "sigmoidal"], "unknown activation 'sigmoidal'; choose one of relu"),
+    "activation": ({}, ["--activation", "sigmoidal"], "activation is 'sigmoidal'; choose one of relu"),
     "loss": ({}, ["--loss", "type3"], "loss is 'type3'; expected one of type1, type2"),
     "width": ({}, ["--width", "0"], "width is 0"),
     "depth": ({}, ["--depth", "-1"], "depth is -1"),

@@ -30,7 +30,7 @@ def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
         said = refused(capsys, train_value, "--stored", tmp_path / "run", option, value, "--out", tmp_path / "other")
         assert f"{option} does not go with --stored" in said
         assert not (tmp_path / "other").exists()
-    assert "not empty" in refused(capsys, train_value, *TINY, "--out", tmp_path / "run")
+    assert "already contains a run" in refused(capsys, train_value, *TINY, "--out", tmp_path / "run")
 
 
 def test_the_numbers_of_several_seeds():
@@ -44,7 +44,7 @@ MISTAKES = [
     (("--goal", "1.2"), "limits cannot hold the goal"),
     (("--plant", "cart-pole", "--goal", "0,0.5"), "no equilibrium"),
     (("--goal", "0,0"), "expected the posture of pendulum, which has 1"),
-    (("--goal", "up"), "expected numbers"),
+    (("--goal", "up"), "expected finite numbers"),
     (("--width", "0"), "width is 0"),
     (("--seed", "-1"), "seed is -1"),
     (("--stored", "/nowhere"), "no such file"),

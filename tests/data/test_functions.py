@@ -169,7 +169,7 @@ def test_settings_that_make_no_sense_are_named():
     for given, changes, message in [
         (data, {"loss": "type3"}, "loss is 'type3'"),
         (data, {"derivative": 3}, "derivative is 3"),
-        (data, {"activation": "sigmoidal"}, "unknown activation"),
+        (data, {"activation": "sigmoidal"}, "activation is 'sigmoidal'; choose one of"),
         (data, {"members": 0}, "members is 0"),
         (bare, {"loss": "type1"}, "no dy"),
         (bare, {"loss": "type2", "derivative": 2}, "no d2y"),

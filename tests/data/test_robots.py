@@ -260,7 +260,10 @@ MALFORMED = {
     "damping that is NaN": (ARM.replace('damping="0.2"', 'damping="nan"', 1), "damping of joint"),
     "damping that drives": (ARM.replace('damping="0.2"', 'damping="-1"', 1), "zero or more"),
     "mass beyond all": (ARM.replace('mass value="2.0"', 'mass value="1e308"'), "inertia of joint"),
-    "velocity in words": (ARM.replace('velocity="3"', 'velocity="fast"', 1), "velocity in <limit> is 'fast'"),
+    "velocity in words": (
+        ARM.replace('velocity="3"', 'velocity="fast"', 1),
+        "limit of velocity of 'fast'; expected a number",
+    ),
 }
 
 

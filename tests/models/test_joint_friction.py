@@ -137,7 +137,11 @@ def test_learned_shapes_start_where_they_are_stated_and_the_scale_is_held():
     "kind, laws, message",
     [
         ("trigonometric", ("load",), "the model is not linear in its parameters; leave load out"),
-        ("structured-delan", ("viscous", "rust"), "joint_friction has 'rust'; expected some of viscous"),
+        (
+            "structured-delan",
+            ("viscous", "rust"),
+            r"joint_friction: \('viscous', 'rust'\); expected a tuple of viscous",
+        ),
         ("polynomial-hamiltonian", ("viscous",), "conserves energy"),
         ("pairwise-hnn", ("viscous",), "without friction"),
     ],

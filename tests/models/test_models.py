@@ -179,7 +179,7 @@ def of_mass(diagonal):
     "diagonal, expected",
     [
         (lambda q: jnp.array([1.0, 4.0]), (1.0, 0.0, 4.0)),
-        (lambda q: jnp.array([1.0, 0.0]), (0.0, 1.0, np.inf)),
+        (lambda q: jnp.stack([1.0 + q[1] ** 2, 0.0 * q[1]]), (0.0, 1.0, np.inf)),
         (lambda q: jnp.array([1.0, -2.0]), (-2.0, 1.0, 2.0)),
         (lambda q: jnp.stack([jnp.ones_like(q[0]), q[0]]), (-0.5, 0.25, 2.0)),
         (lambda q: jnp.array([1.0, 1e-17]), (1e-17, 1.0, np.inf)),

@@ -131,7 +131,7 @@ LOG_FAULTS = {
     "jitter": (jittered, "jitter", (), "vary by"),
     "gap": (with_gap, "gaps", (), "1 gap"),
     "one run": (one_run, "split", (), "1 trajectories"),
-    "torque turned round": (lambda a: {**a, "tau": column(a["tau"], 1, np.negative)}, "torque-sign", (1,), "against"),
+    "torque turned round": (lambda a: {**a, "tau": column(a["tau"], 1, np.negative)}, "torque-sign", (1,), "sign"),
     "torques late": (lambda a: {**a, "tau": late(a["tau"], 8)}, "delay", (), "late"),
     "torques cut off": (lambda a: {**a, "tau": np.clip(a["tau"], -6, 6)}, "saturation-tau", None, "cut off"),
     "q cut off": (

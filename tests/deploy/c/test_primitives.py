@@ -139,6 +139,13 @@ BINARY = {
     **{name: getattr(jnp, name) for name in ("equal", "not_equal", "less", "less_equal", "greater", "greater_equal")},
     **{name: getattr(jnp, name) for name in ("mod", "floor_divide", "hypot", "logaddexp")},
 }
+
+
+def wide(number, kind=np.int64):
+    """A 64-bit whole number, cut to what JAX has of it in single precision."""
+    return np.array(number, kind).astype(jax.dtypes.canonicalize_dtype(kind))
+
+
 ON_INTEGERS = {
     **{name: getattr(jnp, name) for name in ("add", "subtract", "multiply", "maximum", "minimum", "less", "equal")},
     **{name: getattr(jnp, f"bitwise_{name}") for name in ("and", "or", "xor")},
@@ -152,14 +159,18 @@ ON_INTEGERS = {
     "integer_power": lambda a, b: a**3 + b,
     "integer_sums": lambda a, b: (a.sum(), b.prod(), a.max(), b.min(), jnp.argmin(a), jnp.cumsum(b)),
     "to_real": lambda a, b: a.astype(float) * b,
-    "wrapped": lambda a, b: (a * (2**62 + 3), a + (2**63 - 1), a.astype(jnp.int32) * 77777 * b.astype(jnp.int32) ** 5),
+    "wrapped": lambda a, b: (
+        a * wide(2**62 + 3),
+        a + wide(2**63 - 1),
+        a.astype(jnp.int32) * 77777 * b.astype(jnp.int32) ** 5,
+    ),
     "unsigned": lambda a, b: (
         *(a.astype(jnp.uint32) - 5, -a.astype(jnp.uint64), jnp.sign(a.astype(jnp.uint32)), a.astype(jnp.uint32) < 0),
-        *(a.astype(jnp.uint64) >= 0, a.astype(jnp.uint32) // 3, jnp.uint64(2**63 + 5) + a.astype(jnp.uint64)),
+        *(a.astype(jnp.uint64) >= 0, a.astype(jnp.uint32) // 3, wide(2**63 + 5, np.uint64) + a.astype(jnp.uint64)),
     ),
     "one_bit": lambda a, b: (a & 1, a | 0, a ^ 0, a & -1, (a & 3) * b, a & b),
     "constants": lambda a, b: (
-        *(a + jnp.int64(2**53 + 1) // 3, a + lax.div(jnp.int64(-(2**53) - 1), jnp.int64(2)), a + jnp.int64(-(2**63))),
+        *(a + wide(2**53 + 1) // 3, a + lax.div(wide(-(2**53) - 1), wide(2)), a + wide(-(2**63))),
         a.astype(jnp.int32) + jnp.int32(-(2**31)),
     ),
     "compared_with_itself": lambda a, b: (a == a, a != a, a <= a, a < a, jnp.maximum(a, a), a[:3].max(), a > a),
