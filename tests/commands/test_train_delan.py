@@ -218,9 +218,9 @@ MISTAKES = {
     "mark for a missing rate": (arrays(qd=marked(1e40)), [], "qd has numbers of up to 1.0e+40 where half are below"),
     "mark whose square overflows": (arrays(qd=marked(1e120)), [], "qd has numbers of up to 1.0e+120, whose squares"),
     "mark for a missing rate of a network": (
-        arrays(qd=marked(1e40)),
+        arrays(qd=marked(1e120)),
         ["--width", "4"],
-        "qd has numbers of up to 1.0e+40 where half are below",
+        "qd has numbers of up to 1.0e+120, whose squares",
     ),
     "mark that has a square": (arrays(tau=marked(9.96921e36)), [], "up to 1.0e+37 where half are below"),
     "tiny torque": (arrays(tau=np.full((20, 2), 1e-170)), [], "squares vanish"),

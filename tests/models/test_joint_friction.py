@@ -148,8 +148,8 @@ def test_learned_shapes_start_where_they_are_stated_and_the_scale_is_held():
 )
 def test_what_a_model_cannot_have_is_refused(kind, laws, message):
     joints = ("prismatic",) * 4 if kind == "pairwise-hnn" else ("revolute",) * 2
-    needs = Needs(joints=joints)._replace(joint_friction=laws)
     with pytest.raises(InputError, match=message) as caught:
+        needs = Needs(joints=joints)._replace(joint_friction=laws)
         build(describe(kind, needs=Needs(joints=joints), precision="f64") | {"needs": needs._asdict()})
     assert "\n" not in str(caught.value)
 
