@@ -48,7 +48,7 @@ def results(tmp_path_factory):
     return in_c(functions, states, tmp_path_factory.mktemp("c"))
 
 
-@pytest.mark.parametrize("place, name", enumerate(MATRICES))
+@pytest.mark.parametrize("place, name", list(enumerate(MATRICES)))
 def test_eigenvectors_are_orthonormal_and_have_their_values(place, name, results):
     values, vectors = (each[place] for each in results["eigh"])
     size = max(np.abs(SYMMETRIC[name]).max(), np.finfo(float).tiny)
@@ -59,7 +59,7 @@ def test_eigenvectors_are_orthonormal_and_have_their_values(place, name, results
     np.testing.assert_allclose(values / size, np.linalg.eigvalsh(a), rtol=0, atol=20 * N * EPS)
 
 
-@pytest.mark.parametrize("place, name", enumerate(MATRICES))
+@pytest.mark.parametrize("place, name", list(enumerate(MATRICES)))
 def test_qr_is_orthonormal_times_upper_triangular(place, name, results):
     q, r = (each[place] for each in results["qr"])
     size = max(np.abs(MATRICES[name]).max(), np.finfo(float).tiny)
