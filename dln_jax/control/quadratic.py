@@ -53,7 +53,7 @@ def lqr(A: Any, B: Any, Q: Any, R: Any) -> Regulator:
     except (LinAlgError, ValueError) as error:
         raise _no_solution(error) from None
     K = np.linalg.solve(R, B.T @ S)
-    _require_stable(np.linalg.eigvals(A - B @ K).real.max() < 0)
+    _require_stable(np.max(np.real(np.linalg.eigvals(A - B @ K))) < 0)
     return Regulator(jnp.asarray(K), jnp.asarray(S))
 
 

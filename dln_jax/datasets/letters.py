@@ -105,9 +105,9 @@ def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
     vertices, codes = _DesignUnits().get_text_path(font, character)
     # The font's points are integers, those that TrueType implies between them halves.
     exact = np.round(2.0 * np.asarray(vertices, np.float64).reshape(-1, 2)) / 2.0
-    polygons = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
+    outlines = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
     # Fonts keep lone points as anchors; they draw nothing.
-    polygons = [np.asarray(polygon) for polygon in polygons if np.ptp(polygon, axis=0).max() > 0.0]
+    polygons = [polygon for polygon in map(np.asarray, outlines) if np.ptp(polygon, axis=0).max() > 0.0]
     if not polygons:
         raise InputError(f"character is {character!r}, an empty glyph; {expected}")
     return polygons

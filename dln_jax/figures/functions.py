@@ -62,7 +62,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
         wanted, found = (_square(getattr(data, key)[(slice(None), 0, *index)]) for data in (truth, predicted))
         factor, power = _power_of_ten(found - wanted)
         sizes = (abs(wanted).max(), abs(found).max(), 1e-300), (abs(found - wanted).max() / factor, 1e-300)
-        scale, narrow = (Normalize(-max(each), max(each)) for each in sizes)
+        scale, narrow = (Normalize(-float(max(each)), float(max(each))) for each in sizes)
         pictures = ((wanted, scale), (found, scale), ((found - wanted) / factor, narrow))
         for axis, (values, norm) in zip(column, pictures, strict=True):
             axis.pcolormesh(*grid, values, norm=norm, cmap=SIGNED, rasterized=True)
@@ -93,7 +93,7 @@ def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
         factor, power = _power_of_ten(found - wanted)
         error, colours = abs(found - wanted) / factor, POSITIVE if key == "dy" else SIGNED
         panels = ((wanted, "truth", limits, colours), (found, "model", limits, colours))
-        panels = (*panels, (error, f"|error|{power}", (0, error.max() or 1), POSITIVE))
+        panels = (*panels, (error, f"|error|{power}", (0, float(error.max()) or 1), POSITIVE))
         for column, (values, text, limits, colours) in enumerate(panels):
             axis = figure.add_subplot(len(keys), 3, 3 * row + column + 1, projection="3d")
             shown = {"cmap": colours, "norm": Normalize(*limits), "linewidth": 0, "antialiased": False}
