@@ -19,9 +19,10 @@ and for least squares also the training's, each as if it had been left out (`pos
 multiplied by the `scatter` of the motions: what a model lacks shows more in some motions than in others, and a new one
 may be of the former.
 
-A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them:
-its states are outside where the deviation by the parameters exceeds both that on the data and `HARMLESS` of the torque.
-A network is also outside where its inputs leave the range of the data.
+A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them.
+A deviation by the parameters below `HARMLESS` of the torque therefore puts none of its states outside. Above that, a
+state is outside if its deviation exceeds those on the data, or if it leaves the range of the data. A network is outside
+wherever it leaves that range.
 """
 
 from typing import NamedTuple
@@ -50,9 +51,11 @@ FOLDS = 10
 MOST_SAMPLES = 2_000
 """Of the validation, spread evenly."""
 HARMLESS = 0.01
-"""Share of a torque's standard deviation: a smaller uncertainty by the parameters puts no state outside."""
+"""Share of a torque's standard deviation: a smaller uncertainty by the parameters puts no state of a linear model
+outside."""
 STILL = 1e-3
 """rad, m, 1/s or 1/s²: how far a coordinate may move that rests in all data."""
+TINY = np.finfo(np.float64).tiny
 
 
 class Estimate(NamedTuple):
@@ -128,14 +131,12 @@ def estimate(
     undetermined = found.directions[:, found.sizes == 0] if chosen.ridge == 0 else np.zeros((len(scale), 0))
     if basis is not None:
         factor, scale, undetermined = basis @ factor, np.ones(len(basis)), np.zeros((len(basis), 0))
-    limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), np.finfo(np.float64).tiny)
-    if ridge == 0:
-        harmless = HARMLESS * np.asarray(torque_scale(train), np.float64)
-        limit, centre, reach = np.maximum(limit, harmless / np.sqrt(chosen.inflation)), np.zeros(0), np.zeros(0)
-    else:
-        centre, reach = _reach(train, validation, quantile)
-        reach = np.maximum(margin * reach, STILL)
-    domain = Domain(limit, scale, undetermined, centre, reach)
+    limit = np.maximum(margin * np.quantile(limits, quantile, axis=0), TINY)
+    share = HARMLESS if ridge == 0 else 0.0
+    harmless = share * np.asarray(torque_scale(train), np.float64) / np.sqrt(np.maximum(chosen.inflation, TINY))
+    centre, reach = _reach(train, validation, quantile)
+    reach = np.maximum(margin * reach, STILL)
+    domain = Domain(np.maximum(limit, harmless), scale, undetermined, centre, reach, harmless)
     uncertainty = Uncertainty(factor, chosen.noise, chosen.inflation, domain)
     return Estimate(uncertainty, chosen.ridge, chosen.posterior.degrees_of_freedom, chosen.posterior.noise)
 
@@ -152,8 +153,8 @@ def calibration(
         samples: how many of the residuals are independent.
     """
     ratios = np.asarray(RATIOS)[:, None]
-    relative = np.maximum(noise**2 + ratios * variance, np.finfo(np.float64).tiny)
-    factors = np.maximum(np.mean(residual**2 / relative, axis=1), np.finfo(np.float64).tiny)
+    relative = np.maximum(noise**2 + ratios * variance, TINY)
+    factors = np.maximum(np.mean(residual**2 / relative, axis=1), TINY)
     both = 0.5 + 0.5 * (np.log(factors) + np.mean(np.log(relative), axis=1))
     one = int(np.argmin(abs(ratios - 1)))
     best = int(np.argmin(both))
@@ -242,7 +243,7 @@ def _calibrated(
         for r, noise, variance in zip(residual.T, found.noise, variances.T, strict=True)
     ]
     a, b, unlikeliness = (np.array(each) for each in zip(*joints, strict=True))
-    expected = np.maximum(a * found.noise**2 + b * variances, np.finfo(np.float64).tiny)
+    expected = np.maximum(a * found.noise**2 + b * variances, TINY)
     factors = np.array([scatter(each, trajectory) for each in (residual / np.sqrt(expected)).T])
     a, b = factors * a, factors * b
     return _Calibrated(found, ridge, np.sqrt(a) * found.noise, b, float(unlikeliness.mean()))

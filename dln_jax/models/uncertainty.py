@@ -39,10 +39,12 @@ class Domain(NamedTuple):
     """[P, P - rank], orthonormal directions of scaled parameters that the data leave undetermined; there are none of a
     network, whose prior determines them."""
     centre: Any
-    """[3 d], middle of the range of (q, qd, qdd); [0] for models that are linear in their parameters, which their
-    covariance alone puts outside."""
+    """[3 d], middle of the range of (q, qd, qdd)."""
     reach: Any
-    """Likewise, how far from it the data come."""
+    """[3 d], how far from the middle the data come."""
+    harmless: Any
+    """[d], |phi F| below which it does not matter that a state leaves the range of the data, N m or N. Zeros for
+    networks, whose covariance alone cannot be trusted there."""
 
 
 class Uncertainty(NamedTuple):
@@ -65,8 +67,8 @@ class Scores(NamedTuple):
     undetermined: Array
     """[], share of Phi in directions that the data leave undetermined, over `UNDETERMINED`."""
     distance: Array
-    """[], from the middle of the range of (q, qd, qdd), over its reach; the coordinate's where that is largest. 0 for
-    models without a range."""
+    """[], from the middle of the range of (q, qd, qdd), over its reach; the coordinate's where that is largest. 0 where
+    every joint's deviation by the parameters is below `Domain.harmless`."""
 
 
 def predictive(
@@ -99,11 +101,15 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
         state = vectors(len(uncertainty.noise), q=q, qd=qd, qdd=qdd)
         rows, _ = linearised(model, parameters, *state)
         domain = uncertainty.domain
-        limit, centre, reach = (jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach))
+        limit, centre, reach, harmless = (
+            jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach, domain.harmless)
+        )
+        deviation = jnp.sqrt(parameter_variance(rows, uncertainty.factor))
+        distance = jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach)
         return Scores(
-            parameters=jnp.max(jnp.sqrt(parameter_variance(rows, uncertainty.factor)) / limit),
+            parameters=jnp.max(deviation / limit),
             undetermined=jnp.sqrt(jnp.max(undetermined_share(rows, domain))) / UNDETERMINED,
-            distance=jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach) if len(reach) else jnp.zeros(()),
+            distance=jnp.where(jnp.any(deviation >= harmless), distance, 0),
         )
 
     return of_state

@@ -56,18 +56,30 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
     try:
         stated = {key: tuple(each["shape"]) for key, each in manifest["tensors"].items()}
         (P, K), (d,), u = stated["factor"], stated["noise"], stated["domain/undetermined"][1]
-        reach = (0,) if stated["domain/reach"] == (0,) else (3 * d,)
+        # Releases before `harmless` stored no range for models that are linear in their parameters.
+        old = "domain/harmless" not in stated
+        reach = (0,) if old and stated["domain/reach"] == (0,) else (3 * d,)
         dtype = data_type(str(of["model"]["precision"]))
     except (KeyError, TypeError, ValueError, IndexError):
         raise InputError(f"{path}: does not state its arrays; {REMEDY}") from None
-    domain = Domain((d,), (P,), (P, u), reach, reach)
+    domain = Domain((d,), (P,), (P, u), reach, reach, None if old else (d,))
     shapes = Uncertainty((P, K), (d,), (d,), domain)
     like = jax.tree.map(
         lambda shape: jax.ShapeDtypeStruct(shape, dtype),
         shapes,
         is_leaf=lambda each: type(each) is tuple,
     )
-    return load_tree(directory, UNCERTAINTY, like)
+    known = load_tree(directory, UNCERTAINTY, like)
+    return _with_harmless(known) if old else known
+
+
+def _with_harmless(known: Uncertainty) -> Uncertainty:
+    """An uncertainty of an earlier release, with flags as that release gave them."""
+    domain, d = known.domain, len(known.noise)
+    if not len(domain.reach):
+        everywhere = np.full(3 * d, np.finfo(domain.reach.dtype).max)
+        domain = domain._replace(centre=np.zeros_like(everywhere), reach=everywhere)
+    return known._replace(domain=domain._replace(harmless=np.zeros_like(known.noise)))
 
 
 def discard_uncertainty(directory: Path) -> None:

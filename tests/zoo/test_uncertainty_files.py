@@ -29,7 +29,8 @@ def known(undetermined=0):
     random = np.random.default_rng(0)
     directions = np.linalg.qr(random.normal(size=(P, P)))[0]
     # Of states within 1 of zero about half are nearer than 0.9 in all coordinates; no deviation is above its limit.
-    domain = Domain(np.array([30.0, 50.0]), np.ones(P), directions[:, :undetermined], np.zeros(6), np.full(6, 0.9))
+    ranges, harmless = (np.zeros(6), np.full(6, 0.9)), np.zeros(2)
+    domain = Domain(np.array([30.0, 50.0]), np.ones(P), directions[:, :undetermined], *ranges, harmless)
     return Uncertainty(0.05 * random.normal(size=(P, P)), np.array([0.1, 0.2]), np.array([1.0, 4.0]), domain)
 
 
@@ -112,10 +113,32 @@ def test_it_is_stored_in_the_precision_of_the_model(tmp_path):
     assert load(tmp_path).torque_std(*STATES[0]).dtype == jnp.float32
 
 
-def test_uncertainty_without_a_range_comes_back(folder):
+@pytest.mark.parametrize("ranged", [True, False])
+def test_files_of_earlier_releases_keep_their_flags(folder, ranged):
     stored = known()
-    stored = stored._replace(domain=stored.domain._replace(centre=np.zeros(0), reach=np.zeros(0)))
-    save_uncertainty(folder, stored)
+    reach = stored.domain.reach if ranged else np.zeros(0)
+    older = stored._replace(domain=stored.domain._replace(harmless=None, centre=np.zeros_like(reach), reach=reach))
+    save_uncertainty(folder, older)
     run = load(folder)
-    assert run.uncertainty is not None and run.uncertainty.domain.reach.shape == (0,)
-    assert run.outside(*STATES[0].tolist()) == outside(MODEL, PARAMETERS, stored)(*STATES[0])
+    for state in STATES[:8]:
+        # No deviation is above its limit, so that only the range can put these states outside.
+        assert bool(run.outside(*state.tolist())) == (ranged and np.abs(state).max() > 0.9)
+
+
+def test_a_state_out_of_range_is_outside_only_where_the_deviation_matters(folder):
+    stored = known()
+    run = load_with(folder, stored)
+    deviations = np.array([run.torque_std(*state) ** 2 - stored.noise**2 for state in STATES])
+    deviations = np.sqrt(np.maximum(deviations, 0) / stored.inflation)
+    level = np.median(deviations, axis=0)
+    run = load_with(folder, stored._replace(domain=stored.domain._replace(harmless=level)))
+    expected = [
+        np.abs(state).max() > 0.9 and (each >= level).any() for state, each in zip(STATES, deviations, strict=True)
+    ]
+    assert [bool(run.outside(*state.tolist())) for state in STATES] == expected
+    assert {True, False} == set(expected) and sum(expected) < sum(np.abs(state).max() > 0.9 for state in STATES)
+
+
+def load_with(folder, uncertainty):
+    save_uncertainty(folder, uncertainty)
+    return load(folder)
