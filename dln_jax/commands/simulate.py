@@ -146,6 +146,12 @@ def simulate(prepared: Prepared, folder: Path) -> Moments:
         f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
         f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
     )
+    if pieces > 1:
+        loose = "no two elements share a vertex" if pieces == len(mesh.elements) else f"{pieces} parts share no vertex"
+        print(
+            f"warning: {loose}: they move apart, or through one another, for there is no contact between them; if the "
+            "body is one, merge vertices at the same position before you save the mesh"
+        )
     if size.max() > LARGEST_SIZE:
         print(
             f"warning: the body is {size.max():.4g} m long; expected lengths in metres: if the mesh is in millimetres, "
