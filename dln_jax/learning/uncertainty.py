@@ -17,7 +17,7 @@ and keeps the simplest that no other betters by more than half the logarithm of 
 factor (Schwarz 1978): a few seconds that agree with the training leave it as it is. These motions are the validation's,
 and for least squares also the training's, each as if it had been left out (`posterior.left_out`). Both parts are then
 multiplied by the `scatter` of the motions: what a model lacks shows more in some motions than in others, and a new one
-may be of the former.
+may be among the former.
 
 A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them.
 A deviation by the parameters below `HARMLESS` of the torque therefore puts none of its states outside. Above that, a
@@ -30,6 +30,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri, stdtrit
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
@@ -55,6 +56,8 @@ HARMLESS = 0.01
 outside."""
 STILL = 1e-3
 """rad, m, 1/s or 1/s²: how far a coordinate may move that rests in all data."""
+UPPER = 0.975
+"""Quantile by which `scatter` widens bands of few motions: that of two-sided bands of 95 %."""
 TINY = np.finfo(np.float64).tiny
 
 
@@ -174,9 +177,11 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
 
     With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
 
-        1 + sqrt((1 + 1 / M) max(var(s) - chance, 0))
+        (1 + sqrt((1 + 1 / M) (var(s) - chance))) (t / z)²    where var(s) > chance
 
-    which is one standard deviation of a new motion's s above their mean. By chance alone the variance of s is 2 / n for
+    The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
+    97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one: a variance that
+    motions share unequally is known from M values only, and 1.96 of the result hold 95 %. By chance alone the variance of s is 2 / n for
     normal residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
 
         e² = 2 / (M - 1) + 12 / (n M)
@@ -192,7 +197,9 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
     n = 1 / np.mean([1 / effective_samples(each, np.zeros(len(each))) for each in motions])
     chance = 2 / n * (1 + 2 * np.sqrt(2 / (M - 1) + 12 / (n * M)))
     beyond = np.var(squares, ddof=1) - chance * np.mean(squares) ** 2
-    return float(1 + np.sqrt((1 + 1 / M) * max(beyond, 0.0)))
+    if not beyond > 0:
+        return 1.0
+    return float((1 + np.sqrt((1 + 1 / M) * beyond)) * (stdtrit(M - 1, UPPER) / ndtri(UPPER)) ** 2)
 
 
 def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:

@@ -139,6 +139,15 @@ def test_bands_with_scatter_hold_for_new_motions():
     assert np.mean(np.array(scattered) >= 0.9) > 0.75 > np.mean(np.array(plain) >= 0.9)
 
 
+def test_few_motions_widen_bands_more_than_many_of_the_same_scatter():
+    random = np.random.default_rng(0)
+    four = np.sqrt([[0.3], [0.6], [1.1], [4.0]]) * random.normal(size=(4, 500))
+    few = scatter(four.ravel(), np.repeat(np.arange(4), 500))
+    many = scatter(np.tile(four.ravel(), 30), np.repeat(np.arange(120), 500))
+    # Student's quantile is 3.18 of 4 motions and 1.98 of 120.
+    assert few / many > (3.18 / 1.98) ** 2
+
+
 def test_a_direction_that_data_never_showed_is_told_even_where_the_deviation_is_blind():
     train, validation = drawn(0, still=True), drawn(1, still=True)
     parameters = fit_linear(ARM, train, negligible=1e-12).parameters
