@@ -203,7 +203,7 @@ def test_components_and_size_are_printed_and_millimetres_are_warned_of(tmp_path,
 def test_a_mesh_of_loose_elements_is_warned_of(tmp_path, capsys):
     # Corners near each other, not at the same position: merging by position alone cannot find them.
     triangle = np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
-    vertices = np.concatenate([triangle + [0.011 * i, 0.0] for i in range(4)])
+    vertices = np.concatenate([triangle + np.array([0.011 * i, 0.0]) for i in range(4)])
     np.savez(tmp_path / "mesh.npz", vertices=vertices, elements=np.arange(12).reshape(4, 3), held=[0, 1])
     options = ("--mesh", tmp_path / "mesh.npz", "--seconds", "0.02", "--dt", "0.01", "--no-figures")
     command(simulate, "--scene", "beam", *options, "--out", tmp_path / "run")
