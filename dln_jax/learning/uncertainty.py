@@ -182,7 +182,8 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
     The first factor is one standard deviation of a new motion's s above their mean. In the second, t and z are the
     97.5 % quantiles of Student's distribution with M - 1 degrees of freedom and of the normal one: a variance that
     motions share unequally is known from M values only, and 1.96 of the result hold 95 %. By chance alone the variance
-    of s is 2 / n for normal residuals, and an estimate of it from M motions has the relative error e; chance is 2 / n (1 + 2 e) with
+    of s is 2 / n for normal residuals, and an estimate of it from M motions has the relative error e; chance is
+    2 / n (1 + 2 e) with
 
         e² = 2 / (M - 1) + 12 / (n M)
 
