@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.files import finite as finite_values
+from dln_jax.interrupts import held_back
 from dln_jax.learning.engine.checkpoint import has_checkpoint, stored_rows
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, run_episode
@@ -145,6 +146,7 @@ def learn(
 
     Raises:
         InputError: the stored run had other settings, or its files are damaged.
+        KeyboardInterrupt: raised only after the evaluation at hand is stored.
     """
     learner, name = compiled.learner, f"{CHECKPOINT}-{seed}"
     identity = {"settings": {**(settings or {}), "seed": seed}}
@@ -156,17 +158,18 @@ def learn(
     before = records[-1].seconds if records else compiled.seconds
     began = time.perf_counter()
     while not reached(records, goal):
-        state = compiled.improve(state)
-        distance = float(compiled.evaluate(learner.parameters(state)))
-        if distance > farthest:
-            farthest, best = distance, learner.parameters(state)
-        steps = (records[-1].steps if records else 0) + learner.steps
-        seconds = before + time.perf_counter() - began
-        records.append(Record(steps, seconds, distance, int(learner.skipped(state))))
-        if directory is not None:
-            rows = [[value if math.isfinite(value) else None for value in record] for record in records]
-            stored = {**identity, "records": rows}
-            checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
+        with held_back():
+            state = compiled.improve(state)
+            distance = float(compiled.evaluate(learner.parameters(state)))
+            if distance > farthest:
+                farthest, best = distance, learner.parameters(state)
+            steps = (records[-1].steps if records else 0) + learner.steps
+            seconds = before + time.perf_counter() - began
+            records.append(Record(steps, seconds, distance, int(learner.skipped(state))))
+            if directory is not None:
+                rows = [[value if math.isfinite(value) else None for value in record] for record in records]
+                stored = {**identity, "records": rows}
+                checkpoints.save_tree(directory, name, (state, best), stored, number=steps)
         report(records[-1])
     return Learned(local(best, compiled.mesh), records, compiled.seconds, len(records) * compiled.episode)
 

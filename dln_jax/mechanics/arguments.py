@@ -54,7 +54,11 @@ class OfSize:
 
 
 def require_size_of(energy: Callable[..., Any], size: int) -> None:
-    """Raises `InputError` if an energy (q, x) reads beyond vectors [size], or nothing of a coordinate's q and x."""
+    """Raises `InputError` unless an energy (q, x) takes vectors [size].
+
+    It does not if it reads entries beyond them, or if it depends on neither q nor x of some coordinate. The first is
+    found where the energy takes NumPy's arrays, the second where it depends on nothing that is traced.
+    """
     q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
     wrong = f"the system takes no states of size {size}"
     try:
@@ -62,11 +66,13 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
     except IndexError as error:  # of NumPy's arrays, where JAX takes the last element
         raise InputError(f"{wrong} ({error}); give vectors [d] of its own size") from error
     except Exception:  # an energy need not take NumPy's arrays
-        return
+        pass
     with jax.ensure_compile_time_eval():
-        slopes = np.asarray(jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x)))
+        slopes = jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x))
+    if any(isinstance(slope, jax.core.Tracer) for slope in slopes):
+        return
     # A coordinate may be without a potential or, where the mass matrix is singular, without inertia, but not both.
-    if not (read := slopes.any(axis=0)).all():
+    if not (read := np.any(slopes, axis=0)).all():
         unused = ", ".join(str(k) for k in np.flatnonzero(~read))
         raise InputError(f"{wrong}: its energy does not depend on coordinate {unused} (counted from 0) or its rate")
 

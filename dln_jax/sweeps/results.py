@@ -81,6 +81,17 @@ def names_in(found: Sequence[Entry], validation: str | None, error: str | None, 
     return Names(validation or first(VALIDATION), error or first(ERRORS), first(SECONDS), largest)
 
 
+def require_known(found: Sequence[Entry], **asked: str | None) -> None:
+    """Raises `InputError` for a metric asked for by an option that no job has, if any job has metrics."""
+    known = sorted({name for entry in found for name in entry.metrics})
+    for option, name in asked.items():
+        if known and name is not None and name not in known:
+            raise InputError(
+                f"--{option}: no job has the metric {name!r:.40}; choose from {', '.join(known)}. Jobs that are done "
+                f"are kept: --resume with another --{option} only makes the table"
+            )
+
+
 def problem_of(values: Mapping[str, str]) -> tuple[str, ...]:
     """What of a job's values states its problem."""
     return tuple(f"{name} {shown(text)}" for name, text in values.items() if name in PROBLEM)

@@ -12,7 +12,7 @@ from dln_jax.sweeps.engines import Engine, run_all
 from dln_jax.sweeps.here import cores, here
 from dln_jax.sweeps.on_ray import ray
 from dln_jax.sweeps.plan import Job, write_jobs
-from dln_jax.sweeps.results import ERRORS, Entry, Names, best_of, entries, groups, names_in
+from dln_jax.sweeps.results import ERRORS, Entry, Names, best_of, entries, groups, names_in, require_known
 from dln_jax.sweeps.slurm import slurm
 from dln_jax.sweeps.status import status_of
 from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
@@ -40,7 +40,7 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
     """Runs the jobs that are not done, prints and writes what came of all; whether all are done.
 
     Raises:
-        InputError: what runs the jobs is missing, or refuses them.
+        InputError: what runs the jobs is missing, or refuses them; or no job has a metric that was asked for.
         KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
     """
     if asked.where == "later":
@@ -57,6 +57,7 @@ def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool
             print(f"{command}: {len(left)} of {len(jobs)} jobs{before}; {asked.where}, {beside}", flush=True)
             run_all(engine, [job.path for job in left], lambda over, bad: show(over, f"{bad} not done" if bad else ""))
     found = entries(jobs)
+    require_known(found, metric=asked.metric, error=asked.error)
     names = names_in(found, asked.metric, asked.error, largest=asked.largest)
     best, of = best_of(found, names), groups(found, asked.over, names)
     write_tables(folder, found, best, of, names, command=command, where=asked.where, at_once=asked.beside)
@@ -81,8 +82,7 @@ def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder
     """Prints what was chosen and by what, what is not done, and where everything is."""
     known = sorted({name for entry in found for name in entry.metrics})
     if known and names.validation not in known:
-        missing = names.validation or "a validation error"
-        print(f"no job has {missing}: none is chosen; --metric takes one of {', '.join(known)}")
+        print(f"no job has a validation error: none is chosen; --metric takes one of {', '.join(known)}")
     for entry in best:
         values = " ".join(f"{name}={text}" for name, text in entry.job.values.items())
         print(f"best by {names.validation}: {values}, run folder {entry.job.folder / entry.status.run}")
