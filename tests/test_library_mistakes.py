@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +10,19 @@ import numpy as np
 import pytest
 
 import dln_jax
+from dln_jax import sizes
 from dln_jax.data import schema
+from dln_jax.datasets.generators import uniform
+from dln_jax.learning.engine import newton
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Problem
+from dln_jax.learning.engine.sharing import sharing
 from dln_jax.mechanics.trees import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
-from dln_jax.sizes import memory, require_memory
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.sizes import memory, require_memory, require_network
 from dln_jax.softbody import make_scene, with_parameters
-from dln_jax.softbody.mesh import beam
+from dln_jax.softbody.mesh import beam, box
 from dln_jax.softbody.terms.gravity import gravity
 from dln_jax.types import InputError, Needs
 
@@ -178,3 +186,34 @@ def test_more_memory_than_there_is_is_refused_with_both_numbers():
         require_memory("much", 2 * min(memory(), 1e18))
     with pytest.raises(InputError, match="elements"):
         beam(1.0, 1.0, 100_000, 100_000)
+
+
+def equations_of(parameters):
+    """Gauss-Newton's stages for so many parameters."""
+    score = lambda theta: (jnp.sum(theta), jnp.nan)  # noqa: E731
+    problem = Problem(lambda theta, x: theta[:1] * x, jnp.zeros(parameters), (jnp.ones((4, 1)),), score)
+    return newton.stages(problem, GaussNewton(steps=1), sharing(problem, None))
+
+
+AT_THE_LIMIT = {  # what is asked for, and the bytes that it is estimated to take
+    "equations": (lambda: equations_of(3_000), 24 * 3_000**2),
+    "mesh": (lambda: box((1.0, 1.0, 1.0), (12, 12, 12)), 4096 * 5 * 12**3),
+    "samples": (lambda: uniform(two_link_arm(), samples=100_000, seed=0), 160 * 100_000 * 2),
+    "network": (lambda: require_network(width=3_000, depth=3), 32 * 3_000**2 * 2),
+}
+
+
+@pytest.mark.parametrize("asked, estimate", AT_THE_LIMIT.values(), ids=AT_THE_LIMIT)
+def test_what_does_not_fit_is_refused_before_it_is_allocated(asked, estimate, monkeypatch):
+    monkeypatch.setattr(sizes, "memory", lambda: estimate - 1.0)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"would take about .* GiB of memory.*ask for less") as caught:
+            asked()
+        assert tracemalloc.get_traced_memory()[1] < estimate / 5
+    finally:
+        tracemalloc.stop()
+    assert "\n" not in str(caught.value)
+    # One byte more is enough: what is made is what was estimated for.
+    monkeypatch.setattr(sizes, "memory", lambda: float(estimate))
+    asked()

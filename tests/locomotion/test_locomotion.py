@@ -3,6 +3,8 @@
 import importlib.util
 import itertools
 import json
+import os
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -141,6 +143,22 @@ def test_a_resumed_run_continues_bit_for_bit(compiled, tmp_path):
             settings={"width": 4},
             resume=True,
         )
+
+
+def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):
+    def learned(compiled, folder, **keywords):
+        folder.mkdir(exist_ok=True)
+        return learn(compiled, seed=3, goal=Goal(2 * compiled.learner.steps), directory=folder, **keywords)
+
+    def interrupted(state):
+        os.kill(os.getpid(), signal.SIGINT)
+        return compiled.improve(state)
+
+    with pytest.raises(KeyboardInterrupt):
+        learned(compiled._replace(improve=interrupted), tmp_path / "parts")
+    assert len(json.loads((tmp_path / "parts" / "checkpoint-3.json").read_text())["records"]) == 1
+    continued, whole = learned(compiled, tmp_path / "parts", resume=True), learned(compiled, tmp_path / "whole")
+    assert same(continued.parameters, whole.parameters)
 
 
 def test_updates_without_a_gradient_are_skipped_and_counted(compiled):

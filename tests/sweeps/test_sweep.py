@@ -76,6 +76,19 @@ def engine(monkeypatch):
     return begun
 
 
+@pytest.mark.parametrize("option", ["metric", "error"])
+def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, engine, capfd, option):
+    out = tmp_path / "sweep"
+    with pytest.raises(SystemExit) as stop:
+        command(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
+    said = capfd.readouterr().err
+    assert stop.value.code == 2 and not (out / "table.csv").exists()
+    assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in said
+    begun = len(engine)
+    command(sweep, "--out", out, "--resume", f"--{option}", "torque_mse")
+    assert len(engine) == begun == 2 and (out / "table.csv").is_file()
+
+
 def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, engine, capfd):
     out = tmp_path / "sweep"
     with pytest.raises(SystemExit) as stop:
