@@ -125,9 +125,9 @@ def test_names_of_precisions_and_activations_are_checked():
     for make in (dln_jax.make_delan, make_black_box_hamiltonian):
         with pytest.raises(InputError, match="choose one of"):
             make(ARM, activation="tangent")
-        for sizes in ({"width": 10**9}, {"depth": 10**9}, {"width": 0}):
+        for wrong in ({"width": 10**9}, {"depth": 10**9}, {"width": 0}):
             with pytest.raises(InputError, match="expected"):
-                make(ARM, **sizes)
+                make(ARM, **wrong)
 
 
 def two_coordinates(q, qd):
