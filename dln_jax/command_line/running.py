@@ -1,15 +1,13 @@
-"""What the command lines share: errors as one line, names for scenes, and the arguments that a run was started with."""
+"""What the command lines share: errors as one line, names for scenes, and the folder of a run."""
 
 import contextlib
 import dataclasses
-import hashlib
 import math
 import os
-import reprlib
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar
 
 import jax
 import tyro
@@ -17,8 +15,8 @@ import tyro
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
+from dln_jax.command_line.stored_arguments import with_stored_arguments, write_config
 from dln_jax.data.schema import needs_from_text
-from dln_jax.files import in_words, is_file, matches, read_json, write_json
 from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits
@@ -27,19 +25,8 @@ from dln_jax.sizes import require_magnitude, require_within
 from dln_jax.types import InputError, Needs, require_seed
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
-CHOSEN = "chosen"
-"""Key in a run's config.json of what its arguments came to, beside these."""
-FILES = "files"
-"""Key of the SHA-256 of the files that are arguments, by their names."""
-SCALE = ("devices", "processes", "coordinator", "process_id")
-"""Arguments that say where a result is computed."""
-PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
-"""Arguments that do not decide the result."""
 MOST_CHARACTERS = 400
 """Of each end of a message, of which the middle is left out if it is longer."""
-CHANGEABLE = ("seconds",)
-"""Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""
-
 SceneName = Annotated[str, choice(SCENES)]
 
 Arguments = TypeVar("Arguments")
@@ -208,96 +195,3 @@ def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
             wait_for_all(given)
         write_config(folder, given, **chosen)
         yield folder
-
-
-def write_config(folder: Path, given: Any, **chosen: Any) -> None:
-    """Writes the arguments of a run into its folder, and what they came to."""
-    files = fingerprints(stored_files(given))
-    more = {CHOSEN: chosen} if chosen else {}
-    write_json(folder / CONFIG, {**stored_arguments(given), **more, **({FILES: files} if files else {})})
-
-
-def stored_arguments(given: Any) -> dict[str, Any]:
-    """The arguments that decide the result, as JSON values."""
-    values = dataclasses.asdict(given)
-    return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
-
-
-def stored_files(given: Any) -> dict[str, Path]:
-    """The files that decide the result, by the names of their arguments."""
-    values = dataclasses.asdict(given)
-    return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
-
-
-def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 of each file, by which a resumed run knows it wherever it is."""
-    found = {}
-    for name, path in files.items():
-        with path.open("rb") as file:
-            found[name] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
-
-
-def with_stored_arguments(given: Arguments) -> Arguments:
-    """The arguments that the run in --out was started with; what is given anew must not differ.
-
-    A file may have another path, if it is the same file.
-
-    Raises:
-        InputError: --out holds no run, one of other arguments or files, or one whose config.json is damaged.
-    """
-    folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
-    if folder is None or not is_file(folder / CONFIG):
-        raise InputError(f"--resume continues the run in --out, but {folder or '--out'} holds none; name its folder")
-    unset = stored_arguments(type(given)())
-    stored = checked_arguments(folder / CONFIG, type(given), unset)
-    changeable = (*CHANGEABLE, *getattr(type(given), "CHANGEABLE", ()))
-    known = read_json(folder / CONFIG, remedy="restore it").get(FILES)
-    known = known if isinstance(known, dict) else {}
-    anew = stored_files(given)
-    for key, digest in known.items():
-        path = anew.get(key, Path(str(stored.get(key))))
-        option = f"--{key.replace('_', '-')}"
-        if not is_file(path):
-            raise InputError(f"the run in {folder} reads {path}, which is not here; give its new path by {option}")
-        if fingerprints({key: path})[key] != digest:
-            raise InputError(
-                f"the run in {folder} was started with other data than {path} has now (SHA-256); give the file it was "
-                f"started with by {option}"
-            )
-        stored[key] = str(path)
-    for key, value in stored_arguments(given).items():
-        if key not in changeable and value not in (stored[key], unset[key]):
-            option = key.replace("_", "-")
-            raise InputError(f"the run in {folder} was started with {key} = {stored[key]}; leave --{option} out")
-    hints = get_type_hints(type(given))
-    stored |= {key: getattr(given, key) for key in changeable if getattr(given, key, None) is not None}
-    for key, value in stored.items():
-        if isinstance(value, str) and Path in (hints[key], *get_args(hints[key])):
-            stored[key] = Path(value)
-    return dataclasses.replace(cast(Any, given), **stored)
-
-
-def checked_arguments(path: Path, arguments: type, expected: Collection[str]) -> dict[str, Any]:
-    """The stored arguments in a config.json, each of the type that a script's arguments state for it.
-
-    Raises:
-        InputError: the file is damaged, or a release with other arguments has written it.
-    """
-    remedy = "restore the file, or train again into another folder"
-    stored = read_json(path, remedy=remedy)
-    for each in (CHOSEN, FILES):
-        stored.pop(each, None)
-    if absent := [key for key in expected if key not in stored]:
-        raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
-    hints = get_type_hints(arguments)
-    # What another release had and nobody gave decides nothing.
-    stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
-    for key, value in stored.items():
-        if where := getattr(arguments, "MOVED", {}).get(f"--{key}"):
-            raise InputError(f"{path}: a run with --{key}, which is a command of its own now: {where}; train it again")
-        if key not in expected:
-            raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
-        if not matches(value, hints[key]):
-            raise InputError(f"{path}: {key} is {reprlib.repr(value)}; expected {in_words(hints[key])}; {remedy}")
-    return stored

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from dln_jax.command_line.arguments import choice, names_in
 from dln_jax.command_line.options import Folder
-from dln_jax.command_line.running import stored_arguments
+from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.studies.case import measure_and_publish
 from dln_jax.studies.differential_networks.one_pass import PLAIN, cases
 from dln_jax.zoo.run_folder import run_folder

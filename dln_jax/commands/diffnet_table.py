@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dln_jax.command_line.options import Resumable
-from dln_jax.command_line.running import command_folder, stored_arguments
+from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.studies.case import by_case, measure, rows_in, say_numbers
 from dln_jax.studies.differential_networks.table import OPTIMIZERS, QUANTITIES, cases, comparison, table_rows

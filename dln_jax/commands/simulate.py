@@ -25,7 +25,7 @@ import numpy as np
 from dln_jax.command_line.arguments import Unstated, resolved
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import stored_arguments
+from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import write_figure, write_json

@@ -6,8 +6,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 from dln_jax.command_line.optimisers import name_of
-from dln_jax.command_line.running import command_folder, write_config
+from dln_jax.command_line.running import command_folder
 from dln_jax.command_line.scaled import mesh_of
+from dln_jax.command_line.stored_arguments import write_config
 from dln_jax.data.splits import merged
 from dln_jax.files import write_json
 from dln_jax.learning.engine.optimisers import Adam

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from dln_jax.command_line.optimisers import name_of
 from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import command_folder, write_config
+from dln_jax.command_line.running import command_folder
 from dln_jax.command_line.scaled import mesh_of
+from dln_jax.command_line.stored_arguments import write_config
 from dln_jax.data.functions import SampleSplit
 from dln_jax.figures import functions as drawing
 from dln_jax.figures.training import training_curve

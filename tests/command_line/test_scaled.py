@@ -5,8 +5,8 @@ import pytest
 from calls import refused
 
 from dln_jax.command_line.options import Scaled
-from dln_jax.command_line.running import stored_arguments
 from dln_jax.command_line.scaled import mesh_of
+from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.commands import train_delan, train_diffnet, train_hnn, train_locomotion, train_value
 from dln_jax.types import InputError
 

@@ -8,7 +8,7 @@ from calls import command, refused
 from motions import quick_motion
 from safetensors.numpy import load_file
 
-from dln_jax.command_line.running import stored_arguments
+from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.commands import hnn_table, train_hnn, train_hnn_task
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples

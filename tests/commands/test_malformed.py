@@ -16,7 +16,7 @@ from calls import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dln_jax.command_line.running import checked_arguments, stored_arguments
+from dln_jax.command_line.stored_arguments import checked_arguments, stored_arguments
 from dln_jax.commands import (
     arm_table,
     benchmark,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.command_line.running import with_stored_arguments, write_config
+from dln_jax.command_line.stored_arguments import with_stored_arguments, write_config
 from dln_jax.commands import (
     arm_table,
     benchmark,
