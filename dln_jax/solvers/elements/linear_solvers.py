@@ -57,7 +57,7 @@ _MOST_ENTRIES = 3e7
 
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
-_SEARCH_RESIDUAL = 1e-2
+SEARCH_RESIDUAL = 1e-2
 _MOST_PRODUCTS = 10_000
 
 
@@ -83,7 +83,7 @@ def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, data: Sequence[Any]) -> LinearSolver:
     """The way that `least_work` names for the Hessian at x, with concrete data of the elements."""
-    measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=_SEARCH_RESIDUAL)
+    measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=SEARCH_RESIDUAL)
     return least_work(energies, at, measure)(energies, at)
 
 
@@ -221,7 +221,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         right = jnp.where(at.free, right, 0)
         return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_MOST_PRODUCTS)
 
-    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, _SEARCH_RESIDUAL))
+    return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
 
 
 def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from dln_jax.precision import in_float64
 from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.soft_bodies import gradients, motions, robustness, sliding, speed, statics
+from dln_jax.studies.soft_bodies import choices, gradients, motions, robustness, sliding, speed, statics
 from dln_jax.studies.soft_bodies.figures import FIGURES
 
 __all__ = ["SUBJECTS", "cases"]
@@ -20,7 +20,14 @@ MEASURES: dict[str, tuple[Callable[[bool], Findings], ...]] = {
         *(robustness.chain, robustness.twist, robustness.float32, robustness.not_converged),
     ),
     "gradients": (gradients.crawler, gradients.coulomb, gradients.modes),
-    "speed": (speed.creature, speed.beams, speed.backward, speed.linear_solvers, speed.speed_against_error),
+    "speed": (
+        speed.creature,
+        speed.beams,
+        speed.backward,
+        speed.linear_solvers,
+        speed.speed_against_error,
+        choices.solver_choice,
+    ),
 }
 SUBJECTS = {
     subject: {measure.__name__.replace("_", "-"): measure for measure in measures}
