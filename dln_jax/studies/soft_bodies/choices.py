@@ -82,7 +82,7 @@ def _choice(scene: SoftScene, dt: float) -> linear_solvers.LinearSolverFactory:
     rest, masses = scene.params.rest, scene.params.masses
     inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], written_out=True)
     energies = (inertia, *element_energies(scene))
-    at = pattern(energies, *rest.shape, scene.free)
+    at = pattern(energies, len(rest), rest.shape[1], scene.free)
     data = (masses / dt**2, *prepare(scene, scene.params, rest, dt=dt))
     takes = functools.partial(
         search_takes_at_most, energies=energies, at=at, x=rest, data=data, residual=linear_solvers.SEARCH_RESIDUAL
