@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from dln_jax.types import InputError
 
@@ -69,7 +70,7 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
         pass
     with jax.ensure_compile_time_eval():
         slopes = jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x))
-    if any(isinstance(slope, jax.core.Tracer) for slope in slopes):
+    if any(isinstance(slope, Tracer) for slope in slopes):
         return
     # A coordinate may be without a potential or, where the mass matrix is singular, without inertia, but not both.
     if not (read := np.any(slopes, axis=0)).all():
