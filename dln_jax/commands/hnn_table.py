@@ -10,6 +10,7 @@ table, writes report.json and table.md, and draws each task's motions and energi
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -79,7 +80,8 @@ def compare_own_files(given: Arguments, own: Path) -> None:
     """Own files beside the named tasks."""
     refuse_given(given, ["trajectories", "real_pendulum"], "for the table without --own")
     require_positive_if_given(given, ["seeds", "steps"])
-    chosen = own_cases(own, names_in("--tasks", given.tasks, TASKS), seeds=given.seeds, steps=given.steps)
+    counts = {"seeds": given.seeds, "steps": given.steps}
+    chosen = own_cases(own, names_in("--tasks", given.tasks, TASKS), **counts, report=partial(print, flush=True))
     with command_folder(given, "hnn_table") as folder:
         found = measure(chosen, say_numbers("energy_mse", "energy_mse_largest"), folder=folder, resume=given.resume)
         rows = compared(rows_in(found))
