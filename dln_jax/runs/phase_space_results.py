@@ -1,6 +1,7 @@
 """Numbers and figures of a Hamiltonian training: what metrics.json holds, in words, and what is drawn."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def evaluate(
     return metrics | {"verdict": verdict.number}, seen, verdict
 
 
-def units_of_judgement(problem: Problem) -> dict[str, np.ndarray | None]:
+def units_of_judgement(problem: Problem) -> dict[str, Any]:
     """Spread of q and p, which of them are bounded, and their noise where it is known."""
     data, d = problem.fitted, problem.needs.degrees_of_freedom
     size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
