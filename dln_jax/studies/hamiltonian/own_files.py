@@ -16,6 +16,7 @@ import numpy as np
 from dln_jax.metrics.phase_space import Motions, motion_errors, predict
 from dln_jax.studies.case import Case, Findings, by_case, rows_of
 from dln_jax.studies.hamiltonian.choice import choose_model, description_of
+from dln_jax.studies.hamiltonian.recipes import RECIPES
 from dln_jax.studies.hamiltonian.tasks import HORIZONS, MEASURED, Problem, Stated, problem_of
 from dln_jax.studies.hamiltonian.training import Trained, train
 from dln_jax.studies.report import Row, markdown_table
@@ -85,7 +86,7 @@ def measured(
         default = problem_of(MEASURED, data=file)
         for kind, problem in {STATED: stated, DEFAULT: default}.items():
             fit(kind, problem, choose_model(problem, precision="f64"), file.name)
-        if stated.trust is None or not stated.trust.free_of_noise:
+        if RECIPES[task].weights is not None:  # the task has noise
             fit(RECIPE, named._replace(fitted=stated.fitted), recipe, file.name)
     rows = []
     for kind, each in errors.items():
