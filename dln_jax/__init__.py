@@ -6,7 +6,8 @@ of shape [d], SI units): `jax.vmap` them over samples. The documentation has a p
 
 import importlib.metadata
 
-import dln_jax.interrupts  # noqa: F401  first, as the others take a second to import
+import dln_jax.interrupts
+import dln_jax.time_limit  # noqa: F401  that second counts
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.schema import load as load_trajectories

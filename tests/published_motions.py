@@ -2,9 +2,14 @@
 
 Greydanus, Dzamba and Yosinski (2019). Keys are those of the schema; q and p carry the published noise, their rates are
 exact at the noiseless states, and bodies are ordered axis by axis: x1, x2, .., y1, y2, .. as in the published arrays.
+
+`python -m tests.published_motions FOLDER --tasks spring,pendulum --seeds 101,102,103` writes TASK-SEED.npz files, which
+`python -m scripts.hnn_table --own FOLDER` reads.
 """
 
+import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -110,3 +115,22 @@ def published_arrays(name: str, seed: int, *, trajectories: int | None = None) -
     flat = {key: array.reshape(-1, q.shape[2]) for key, array in arrays.items()}
     times = {"t": np.tile(system.t, count), "trajectory": np.repeat(np.arange(count), len(system.t))}
     return flat | times
+
+
+def main() -> None:
+    """Writes the files that the command line names."""
+    parser = argparse.ArgumentParser(description="Write files of the published Hamiltonian tasks.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--tasks", default=",".join(PUBLISHED))
+    parser.add_argument("--seeds", default="101,102,103")
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    for name in given.tasks.split(","):
+        for seed in given.seeds.split(","):
+            file = given.folder / f"{name}-{seed}.npz"
+            np.savez(file, **published_arrays(name, int(seed)))
+            print(file)
+
+
+if __name__ == "__main__":
+    main()

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 FLOORS = {
     "types": -3,  # symbols: everyone may read them
     "interrupts": -3,
+    "time_limit": -3,
     "files": -2,
     "sizes": -2,
     "precision": -2,

@@ -32,11 +32,13 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Limited:
-    """How long a training may take."""
+    """How long it may take until there is a model."""
 
     seconds: Unstated[float] = None
-    """Seconds of training after which to stop and keep the best so far, compilation included (default: no limit). At
-    least a few iterations are done. With --resume they count anew, and another number may be given."""
+    """Seconds from the start of the command until the model is stored (default: no limit). Reading the data, choosing a
+    model, compiling and fitting count; the evaluation, timings and figures that follow do not. The best parameters so
+    far are kept. Every fit does at least one dispatch of iterations, which may pass the limit. With --resume the
+    seconds count anew, and another number may be given."""
 
 
 @dataclass(frozen=True)

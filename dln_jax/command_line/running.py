@@ -5,6 +5,7 @@ import dataclasses
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -22,6 +23,7 @@ from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits
 from dln_jax.scenes.registry import SCENES
 from dln_jax.sizes import require_magnitude, require_within
+from dln_jax.time_limit import IMPORTED, counting_from
 from dln_jax.types import InputError, Needs, require_seed
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
@@ -63,8 +65,10 @@ def run(
         before = compilation_cache.compilation() if from_shell else None
         unkept = compilation_cache.keep(whole.compilation_cache) if from_shell else ""
 
+    began = IMPORTED if from_shell else time.perf_counter()
+
     def work(given: Arguments) -> None:
-        with as_one_line(prog, given):
+        with as_one_line(prog, given), counting_from(began):
             main(given)
             if before and (line := compilation_cache.summary(before, unkept)):
                 print(line)

@@ -8,8 +8,8 @@ gives the rates) and helmholtz-hnn (the gradients of two networks do, friction i
 needs state it. Load the model with dln_jax.load.
 """
 
-from dln_jax.runs.phase_space import Options as Arguments
 from dln_jax.runs.phase_space import run
+from dln_jax.runs.phase_space_options import Options as Arguments
 
 
 def main(given: Arguments) -> None:

@@ -113,8 +113,10 @@ def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tupl
         return fit_directly(task, given)
     if given.target is not None:
         return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
-    training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
-    if given.seeds > 1 and given.folds > 1:
+    several = given.seeds > 1 and given.folds > 1
+    fits = given.folds + 1 if several else 1
+    training = train(task, task.solver, folder, resume=given.resume, mesh=mesh, fits=fits)
+    if several:
         task = cross_validated(task, task.solver, folder, folds=given.folds, resume=given.resume, mesh=mesh)
     return task, training
 

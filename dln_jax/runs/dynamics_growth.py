@@ -21,6 +21,7 @@ from dln_jax.precision import data_type
 from dln_jax.runs.dynamics_results import latency_of
 from dln_jax.runs.dynamics_task import Task
 from dln_jax.scale.mesh import of_first_process
+from dln_jax.time_limit import SOON
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import compiled
 
@@ -56,8 +57,13 @@ def grow_to_target(
     """
     tried: list[tuple[Candidate, Task, Training]] = []
     enough: list[tuple[Candidate, Task, Training]] = []
+    kinds = list(itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)))
+    ended = ""
     for width in WIDTHS:
-        for depth, shared in itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)):
+        for depth, shared in kinds:
+            if tried and of_first_process(task.seconds <= SOON, mesh):
+                ended = f"out of time: networks of width {width} and more were not all tried"
+                break
             description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
             tried.append(_try(task._replace(description=description), optimiser, folder, resume=resume, mesh=mesh))
             candidate = tried[-1][0]
@@ -65,8 +71,10 @@ def grow_to_target(
             enough += tried[-1:] * met
             verdict = "met" if met else "not met"
             print(f"{candidate.name}: validation {candidate.validation_error:.2e}, target {verdict}")
-        if enough:
+        if enough or ended:
             break
+    if ended:
+        print(ended)
     fastest = min(enough, key=lambda each: each[0].one_step_us, default=None)
     chosen = fastest or min(tried, key=lambda each: each[0].validation_error)
     write_json(folder / "candidates.json", {"candidates": [candidate._asdict() for candidate, *_ in tried]})

@@ -33,6 +33,7 @@ from dln_jax.runs.dynamics_task import Task, needs_of_tree, task_of
 from dln_jax.runs.dynamics_training import train
 from dln_jax.runs.identification_additions import with_network
 from dln_jax.runs.identification_task import Case, Sets, with_description, with_shapes
+from dln_jax.time_limit import deadline, seconds_left
 from dln_jax.zoo.descriptions import Description, build, describe
 
 LADDER_SECONDS, RUNG_SECONDS = 300.0, 120.0
@@ -65,7 +66,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | 
         train_set,
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
-        seconds=LADDER_SECONDS if given.seconds is None else given.seconds,
+        seconds=LADDER_SECONDS if given.seconds is None else seconds_left(deadline(given.seconds)),
         report=report,
     )
     print_ladder(found)
@@ -150,8 +151,8 @@ def _too_large(size: int | None) -> Callable[[float], str]:
 def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
     """A model that `--model` names, as it would be trained alone."""
     limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
-    own = dataclasses.replace(given, model=name, seconds=limit)
-    task = task_of(own, recorded, checked=True)
+    own = dataclasses.replace(given, model=name)
+    task = task_of(own, recorded, checked=True, until=time.perf_counter() + limit)
     if task.solver is None:
         task, training = fit_directly(task, own)
     else:

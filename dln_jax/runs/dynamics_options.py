@@ -70,7 +70,7 @@ class Options(Filtered, Limited, Resumable, Drawn, SingleCalls, Scaled):
     training samples (default: inverse; of Hamiltonians with momenta, Hamilton's equations; of feed-forward, both)."""
     target: Unstated[float] = None
     """Validation error, in (N m)² or N²: grow the structured network (width 4, 8, 16, 32; one or two layers; M and V
-    from one network or two) until it is met, and keep the fastest model that meets it. --seconds counts for each."""
+    from one network or two) until it is met, and keep the fastest model that meets it."""
     seed: int = 0
     """Of the initial parameters, the shuffling and the validation split; 0 to 4294967295."""
     seeds: int = 1
@@ -115,7 +115,8 @@ def with_model(given: Options) -> tuple[Options, str]:
     if not asked:
         return dataclasses.replace(given, model=AUTO), ""
     option = f"--{asked[0].replace('_', '-')}"
-    said = f"{option} is for networks, so the model is {NETWORK}; without it several models are tried (--model auto)"
+    kind = "one model" if asked[0] == "objective" else "networks"
+    said = f"{option} is for {kind}, so the model is {NETWORK}; without it several models are tried (--model auto)"
     return dataclasses.replace(given, model=NETWORK), said
 
 
@@ -124,21 +125,22 @@ def check_options(given: Options, kind: str) -> None:
     if given.data is None:
         refuse_given(given, ["rate", "units"], "for a file: add --data")
     require_positive(seeds=given.seeds, folds=given.folds)
+    require_positive_if_given(given, ["seconds"])
     require_seed(given.seed, given.seeds)
     if isinstance(given, ArmOptions):
         check_arm_options(given, kind)
     if kind == AUTO:
-        check_direct_options(
-            given,
-            ("degree", "precision", "samples", "objective"),
-            "the ladder",
-            "chooses by validation",
-        )
+        if given.objective is not None:
+            raise InputError(
+                "--objective is for one model, and --model auto compares several by their torques; choose a --model "
+                "with an energy, such as structured-delan, trigonometric or learned-tree, or leave --objective out"
+            )
+        check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
         return
     properties = CATALOGUE[kind].properties
     if properties.kernel:
-        others = ("degree", "seconds", "objective")
-        check_direct_options(given, others, "the trigonometric kernel", "is one linear problem")
+        refuse_given(given, ["objective"], "for models with parameters; the trigonometric kernel is fitted to torques")
+        check_direct_options(given, ("degree", "seconds"), "the trigonometric kernel", "is one linear problem")
         require_positive_if_given(given, ["samples"])
         return
     if properties.searched:

@@ -1,6 +1,5 @@
 """From options to a task of dynamics: the data, what they need, the model, and how it is trained."""
 
-import math
 from typing import Any, NamedTuple
 
 from dln_jax.command_line.arguments import refuse_given, resolved
@@ -17,7 +16,8 @@ from dln_jax.runs.dynamics_data import Recorded
 from dln_jax.runs.dynamics_options import OF_ADAM, SAMPLES_OF_KERNEL, Options, check_options
 from dln_jax.scenes.scene import Scene
 from dln_jax.sizes import require_network
-from dln_jax.types import InputError, Needs, require_positive
+from dln_jax.time_limit import deadline, seconds_left
+from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build, describe_for
 
@@ -45,12 +45,17 @@ class Task(NamedTuple):
     """`None` for models that have a fit of their own."""
     seeds: int | tuple[int, ...]
     """One, or several in one program."""
-    seconds: float
-    """Of training, after which to stop."""
+    until: float
+    """Reading of `time.perf_counter` at which training stops, for the command or a rung of the ladder."""
     search: TreeFit | None = None
     """How the joint frames of a learned tree were found."""
     best: int | None = None
     """Index of the seed that cross-validation prefers; `None` where that was not asked."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that are left for fits."""
+        return seconds_left(self.until)
 
     @property
     def name(self) -> str:
@@ -78,13 +83,14 @@ class Task(NamedTuple):
         return self.description["precision"]
 
 
-def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Task:
+def task_of(given: Options, recorded: Recorded, *, checked: bool = False, until: float | None = None) -> Task:
     """The model that the arguments name, for these data; nothing is written yet.
 
     Args:
         given: the arguments.
         recorded: the data.
         checked: whether it is known that the model reads the options that are given.
+        until: deadline of the fit by `time.perf_counter` (default: that of the command).
 
     Raises:
         InputError: options that it does not read, or data that it cannot be fitted to.
@@ -97,15 +103,14 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False) -> Tas
         objective = SCALED_TORQUE
     description, optimiser, samples, reason = model_and_optimiser(given, kind, recorded, objective)
     seeds = given.seed if given.seeds == 1 else tuple(range(given.seed, given.seed + given.seeds))
-    limit = resolved(given, {"seconds": math.inf})
-    require_positive(**limit)
+    until = deadline(given.seconds) if until is None else until
     model, solver = build(description), None
     if optimiser is not None:
         require_finite_start(
             dynamics.problem(model, sets, objective, seeds=seeds), dynamics.samples(model, sets, objective)
         )
         solver = Solver(optimiser, reason, posed(description, sets, objective, samples, seeds), samples)
-    return Task(recorded, kind, description, objective, solver, seeds, **limit)
+    return Task(recorded, kind, description, objective, solver, seeds, until)
 
 
 def posed(

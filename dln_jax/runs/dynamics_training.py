@@ -15,8 +15,8 @@ from dln_jax.runs.dynamics_task import Solver, Task, posed
 from dln_jax.runs.results import losses
 
 
-def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh | None) -> Training:
-    """Trains the task's model, one seed or several, by the devices of the mesh."""
+def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh | None, fits: int = 1) -> Training:
+    """Trains the task's model, one seed or several, in its share of the time that is left for so many fits."""
     total = solver.optimiser.steps
     identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
@@ -25,7 +25,7 @@ def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh 
             solver.optimiser,
             checkpoint=Checkpoint(folder, identity, resume),
             report=lambda at: show(min(int(np.max(at.step)), total), losses(at)),
-            seconds=task.seconds,
+            seconds=task.seconds / fits,
             mesh=mesh,
         )
 
@@ -38,18 +38,19 @@ def cross_validated(task: Task, solver: Solver, folder: Path, *, folds: int, res
     rest = merged(task.sets._replace(test=select(task.sets.test, [])))
     motions = np.random.default_rng(np.ravel(task.seeds)[0]).permutation(np.unique(rest.trajectory))
     total = np.zeros(len(np.ravel(task.seeds)))
-    for number, held in enumerate(np.array_split(motions, min(folds, len(motions)))):
+    folds = min(folds, len(motions))
+    for number, held in enumerate(np.array_split(motions, folds)):
         sets = Split(select(rest, np.setdiff1d(motions, held)), select(rest, held), task.sets.test)
         identity = dynamics.identity_of(solver.optimiser, sets, task.objective, seeds=task.seeds)
         training = fit(
             posed(task.description, sets, task.objective, solver.samples, task.seeds),
             solver.optimiser,
             checkpoint=Checkpoint(folder, identity, resume, f"checkpoint_fold_{number + 1}"),
-            seconds=task.seconds,
+            seconds=task.seconds / (folds - number),
             mesh=mesh,
         )
         total += np.asarray(training.validation) * len(sets.validation.t)
     errors = total / len(rest.t)
     said = ", ".join(f"{seed}: {error:.2e}" for seed, error in zip(np.ravel(task.seeds), errors, strict=True))
-    print(f"cross-validated errors by seed, {min(folds, len(motions))} folds: {said}")
+    print(f"cross-validated errors by seed, {folds} folds: {said}")
     return task._replace(best=int(np.argmin(np.nan_to_num(errors, nan=np.inf))))

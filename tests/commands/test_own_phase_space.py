@@ -1,6 +1,7 @@
 """Own files with momenta: published protocols made by numpy and scipy, trained by the command that a user types."""
 
 import json
+import time
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from dln_jax import load
 from dln_jax.commands import train_hnn, train_hnn_task
 from dln_jax.mechanics.equations import flow
+from dln_jax.runs import phase_space, phase_space_options
 from dln_jax.studies.hamiltonian import recipes, training
 from dln_jax.studies.hamiltonian.choice import description_of
 from dln_jax.studies.hamiltonian.tasks import MEASURED, Stated, problem_of
@@ -146,3 +148,53 @@ def test_the_fit_of_motions_ends_where_it_is_flat(files):
 def test_a_file_without_torques_names_the_command_for_it(files, capsys):
     line = refused(capsys, train_hnn, "--data", "spring.npz", "--out", "none")
     assert "spring.npz has no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
+
+
+def test_a_model_whose_motions_explode_is_refused(files, capsys):
+    """The file's forces point away from rest: its rates are fitted exactly, and every predicted motion grows."""
+    arrays = published_arrays("spring", 11, trajectories=8)
+    system, t = PUBLISHED["spring"], PUBLISHED["spring"].t
+    starts = [arrays[key][arrays["t"] == 0] for key in ("q", "p")]
+    q, p = (each.reshape(-1, 1) for each in integrated(system, *starts, t))
+    qd, pd = system.rates(q, p)
+    np.savez("away.npz", t=arrays["t"], trajectory=arrays["trajectory"], q=q, p=p, qd=qd, pd=-pd)
+    still = ("--needs", '{"joints": ["prismatic"]}', "--model", "polynomial-hamiltonian", "--degree", "2")
+    with pytest.raises(SystemExit) as stop:
+        command(train_hnn_task, *TASK, "away.npz", *still, "--out", "away")
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: ")
+    assert "verdict: refused: 1 of 1 predicted test motions grow beyond 10 times the range" in said.out
+    assert json.loads((files / "away" / "metrics.json").read_text())["verdict"] == 2
+
+
+class Clock:
+    """Time that passes only where a test says so."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+    def passing(self, seconds, function):
+        """The function, which takes so long."""
+
+        def slow(*arguments, **options):
+            self.now += seconds
+            return function(*arguments, **options)
+
+        return slow
+
+
+def test_seconds_count_from_the_start_of_the_command_to_the_stored_model(files, monkeypatch):
+    """Reading takes 20 s, choosing 10 s and each dispatch 4 s: the model is stored before 60 s and a dispatch."""
+    clock, stored = Clock(), []
+    monkeypatch.setattr(time, "perf_counter", clock)
+    monkeypatch.setattr(phase_space_options, "problem_of", clock.passing(20.0, problem_of))
+    monkeypatch.setattr(phase_space_options, "choose_model", clock.passing(10.0, phase_space_options.choose_model))
+    monkeypatch.setattr(phase_space, "losses", clock.passing(4.0, lambda at: ""))  # reported after each dispatch
+    monkeypatch.setattr(phase_space, "save", lambda *_: stored.append(clock.now - 1000.0))
+    monkeypatch.setattr(phase_space, "evaluate", lambda *_, **__: (_ for _ in ()).throw(InputError("enough")))
+    with pytest.raises(SystemExit):
+        command(train_hnn_task, *TASK, "spring.npz", "--seconds", "60", "--out", "limited")
+    assert 60.0 <= stored[-1] <= 64.0

@@ -20,6 +20,7 @@ from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.chain import chain
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]
@@ -239,11 +240,15 @@ MISTAKES = {
         ["--model", "feed-forward", "--objective", "forward"],
         "feed-forward model has no energy",
     ),
-    "objective of the ladder": (arrays(), ["--model", "auto", "--objective", "both"], "the ladder chooses"),
+    "objective of the ladder": (
+        arrays(),
+        ["--model", "auto", "--objective", "both"],
+        "choose a --model",
+    ),
     "objective of a kernel": (
         arrays(),
         ["--model", "trigonometric-kernel", "--objective", "both"],
-        "--objective is for networks",
+        "--objective is for models with parameters; the trigonometric kernel is fitted to torques",
     ),
     "batch": (arrays(), ["--batch", "64"], "--batch is for adam, but auto chose gauss-newton"),
     "patience": (arrays(), ["--patience", "3", "--optimizer", "gauss-newton"], "--patience is for adam"),
@@ -251,6 +256,7 @@ MISTAKES = {
     "rate": (arrays(), ["--learning-rate", "nan", "--optimizer", "adam"], "--learning-rate is nan"),
     "decay": (arrays(), ["--weight-decay", "inf", "--optimizer", "adam"], "--weight-decay is inf"),
     "seconds": (arrays(), ["--seconds", "nan"], "seconds is nan"),
+    "negative seconds": (arrays(), ["--seconds", "-5"], "seconds is -5"),
     "width of a linear model": (arrays(), ["--model", "trigonometric", "--width", "4"], "--width is for networks"),
     "optimizer of a linear model": (arrays(), ["--model", "trigonometric", "--optimizer", "adam"], "least-squares"),
     "seeds of a linear model": (arrays(), ["--model", "trigonometric", "--seeds", "2"], "has no seeds"),
@@ -319,15 +325,23 @@ def test_a_cart_that_is_driven_alone_is_trained(workplace, capsys):
     assert json.loads((workplace / "cart" / "metrics.json").read_text())["torque_mse"] < 1e-16
 
 
-@pytest.mark.parametrize("options", [("structured-delan", *TINY[:7]), ("trigonometric", "--degree", "1")])
-def test_both_errors_are_fitted_together_on_request(workplace, capsys, options):
-    data = generators.uniform(cart_pole(friction=0.2), samples=60, rate_bound=2.0, acceleration_bound=5.0)
+@pytest.mark.parametrize(
+    "scene, options",
+    [
+        (cart_pole(friction=0.2), ("structured-delan", *TINY[:7])),
+        (cart_pole(friction=0.2), ("trigonometric", "--degree", "1")),
+        pytest.param(chain(2), ("learned-tree", "--seconds", "60"), marks=pytest.mark.slow),
+    ],
+    ids=["network", "least-squares", "tree"],
+)
+def test_both_errors_are_fitted_together_on_request(workplace, capsys, scene, options):
+    data = generators.uniform(scene, samples=60, rate_bound=2.0, acceleration_bound=5.0)
     noisy = data._replace(tau=data.tau + [0.1, 0.0] * np.random.default_rng(0).normal(size=data.tau.shape))
     schema.save("noisy.npz", noisy, overwrite=True)
     out = workplace / f"both-{options[0]}"
     command(train_delan, "--data", "noisy.npz", "--model", *options, *BRIEF, "--objective", "both", "--out", out)
     said = capsys.readouterr().out
-    assert ("refined by both sides' errors" in said) == (options[0] == "trigonometric")
+    assert ("refined by both sides' errors" in said) == (options[0] != "structured-delan")
     assert json.loads((out / "config.json").read_text())["objective"] == "both"
     assert np.isfinite(json.loads((out / "metrics.json").read_text())["forward_mse"])
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -171,8 +171,15 @@ def choose_model(
             )
         return found
     target = EXACT * mean_square_rates(problem, described(every[-1]), parts[1])
-    in_time = (each for at, each in enumerate(every) if not at or time.perf_counter() - began < seconds)
-    return grow(in_time, attempt, target=target)[0].outcome
+
+    def in_time() -> Iterator[Candidate]:
+        for at, each in enumerate(every):
+            if at and time.perf_counter() - began >= seconds:
+                say(f"auto: out of time, not tried: {'; '.join(other.words for other in every[at:])}")
+                return
+            yield each
+
+    return grow(in_time(), attempt, target=target)[0].outcome
 
 
 def rates_are_biased(problem: Problem) -> bool:

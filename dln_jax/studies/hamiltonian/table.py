@@ -65,8 +65,8 @@ class Seen(NamedTuple):
     rates: Field
 
 
-def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen]:
-    """Errors and times of one run, and what it predicts."""
+def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen, list[Motions]]:
+    """Errors and times of one run, what a figure shows of it, and the motions that it predicts."""
     model, parameters = build(trained.description), trained.result.parameters
     predicted, rates = predicted_motions(problem, trained), partial(field_rates, model, parameters)
     if in_velocities(problem, trained.description):
@@ -81,7 +81,7 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
     for name in ("train_seconds", "compile_seconds"):
         numbers[name] = sum(getattr(fit, name) for fit in trained.fits.values())
     numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
-    return numbers, Seen(predicted[0], rates)
+    return numbers, Seen(predicted[0], rates), predicted
 
 
 def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
@@ -201,9 +201,9 @@ def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folde
     return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
 
 
-def medians(runs: Sequence[tuple[dict[str, float], Any]]) -> dict[str, float]:
+def medians(runs: Sequence[tuple[dict[str, float], *tuple[Any, ...]]]) -> dict[str, float]:
     """Of each quantity over the seeds, and the largest energy error."""
-    of_seeds = [numbers for numbers, _ in runs]
+    of_seeds = [numbers for numbers, *_ in runs]
     found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
     found["energy_mse_largest"] = float(np.max([each["energy_mse"] for each in of_seeds]))
     return {key: value for key, value in found.items() if not np.isnan(value)}

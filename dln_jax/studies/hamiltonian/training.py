@@ -33,6 +33,7 @@ from dln_jax.zoo.descriptions import build
 
 RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
+OUT_OF_TIME = "out of time"
 WINDOWS_OF_A_STEP = 64
 """Of Adam, when it fits motions."""
 
@@ -54,6 +55,11 @@ class Trained(NamedTuple):
     """Why a stage was left out, or ended before its time; empty where all went well."""
     diverged: bool = False
     """Whether that is a loss that stopped being finite."""
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether a limit of time ended a fit, or left one out."""
+        return self.stopped.startswith(OUT_OF_TIME)
 
     @property
     def result(self) -> Training:
@@ -134,10 +140,10 @@ def train(
     fits = {RATES: first}
     left = of_first_process(seconds - (time.perf_counter() - began), mesh)
     if not recipe.trajectory_steps or first.stop.reason == "not finite":
-        return _ended(description, fits, RATES, first)
+        return _ended(description, fits, RATES, first, optimiser)
     if rates_are_exact(problem, description, parts[1], first):
         return Trained(description, fits, "the measured rates are free of noise or fitted exactly: motions need no fit")
-    alone = Trained(description, fits, "out of time after the fit of rates: motions were not fitted")
+    alone = Trained(description, fits, f"{OUT_OF_TIME} after the fit of rates: motions were not fitted")
     if first.stop.reason == "time" or left <= MOTIONS_COMPILE * (first.compile_seconds or first.train_seconds):
         return alone
     if keep is not None:
@@ -148,7 +154,7 @@ def train(
         second = second._replace(parameters=second.parameters["model"])
     if second.stop.step and np.isfinite(second.validation):
         fits[MOTIONS] = second
-    return _ended(description, fits, MOTIONS, second)
+    return _ended(description, fits, MOTIONS, second, optimiser)
 
 
 def rates_are_exact(problem: Problem, description: dict[str, Any], validation: Trajectories, fit: Training) -> bool:
@@ -160,12 +166,16 @@ def rates_are_exact(problem: Problem, description: dict[str, Any], validation: T
     return problem.trust.free_of_noise or fit.validation <= EXACT * size
 
 
-def _ended(description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training) -> Trained:
+def _ended(
+    description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training, optimiser: Optimiser
+) -> Trained:
     """With what is to be said of how the last fit ended."""
     at = f"after step {last.stop.step} of the fit of {stage}"
+    remedy = (
+        "lower --learning-rate" if isinstance(optimiser, Adam) else "state the plant's --needs, try another --model"
+    )
     words = {
-        "time": f"out of time {at}: kept is the best so far",
-        "not finite": f"the loss stopped being finite {at}; lower --learning-rate or look for very large numbers in "
-        "the data",
+        "time": f"{OUT_OF_TIME} {at}: kept is the best so far",
+        "not finite": f"the loss stopped being finite {at}; {remedy}, or look for very large numbers in the data",
     }
     return Trained(description, fits, words.get(last.stop.reason, ""), last.stop.reason == "not finite")
