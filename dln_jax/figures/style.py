@@ -32,6 +32,7 @@ MODELS: dict[str, tuple[str, str]] = {
     "black-box-hnn": (ORANGE, "v"),
     "trigonometric": (GREEN, "D"),
     "learned-tree": ("#117733", "d"),
+    "identified-arm": (GREEN, "D"),
     "feed-forward": (PURPLE, "X"),
     "separable-hnn": ("#B2182B", "^"),
     "pairwise-hnn": ("#882255", "P"),

@@ -1,0 +1,106 @@
+"""Figures of the experiments on letters: errors of several models, and what an arm writes while it learns."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dln_jax.figures import style
+from dln_jax.figures.benchmarks import EXACT, exact_band, exact_ground
+from dln_jax.figures.labels import label_ends
+
+
+def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
+    """Median and range over runs of each model's error, and below it the share of samples outside the training data.
+
+    Args:
+        curves: "places" [K] along x; "errors", of each model [K, runs] in (N m)²; "zero" and "outside" [K, runs], the
+            mean square of the torque and a share.
+        x: name of the places.
+        zero: name of the line of mean squares.
+    """
+    places = np.asarray(curves["places"], float)
+    figure, axes = style.figure(2, 1, height=4.6, sharex=True, gridspec_kw={"height_ratios": [4, 1]})
+    top, bottom = axes[:, 0]
+    every = [value for errors in curves["errors"].values() for each in errors for value in each if value > 0]
+    ground, ends = exact_ground(every, EXACT), {}
+    for model, errors in curves["errors"].items():
+        shown = np.maximum(np.asarray(errors, float), ground)
+        colour = style.colour(model)
+        top.fill_between(places, shown.min(axis=1), shown.max(axis=1), color=colour, alpha=0.15, linewidth=0)
+        top.plot(places, np.median(shown, axis=1), "-", marker=style.marker(model), color=colour, markersize=4.5)
+        ends[model] = (float(places[-1]), float(np.median(shown, axis=1)[-1]))
+    mean_squares = np.median(np.asarray(curves["zero"], float), axis=1)
+    top.plot(places, mean_squares, "--", color=style.REFERENCE, linewidth=1.2)
+    ends[zero] = (float(places[-1]), float(mean_squares[-1]))
+    top.set(yscale="log", ylabel="test torque MSE, (N m)²")
+    exact_band(top, ground)
+    outside = 100 * np.median(np.asarray(curves["outside"], float), axis=1)
+    bottom.fill_between(places, outside, color="0.8", linewidth=0)
+    bottom.plot(places, outside, color="0.4", linewidth=1.2)
+    bottom.set(xlabel=x, ylabel="outside the\ntraining range, %", ylim=(0, 100))
+    bottom.set_xscale(style.scale_of(places))
+    bottom.set_xticks(places, [f"{place:g}" for place in places])
+    bottom.minorticks_off()
+    colours = {model: style.colour(model) for model in curves["errors"]} | {zero: style.REFERENCE}
+    figure.align_ylabels()
+    figure.canvas.draw()  # labels stand at heights of the finished layout
+    label_ends(top, ends, colours=colours)
+    return figure
+
+
+def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
+    """What each model's arm writes, letter by letter as it learns, over what it is to write; and all errors of the tip.
+
+    Args:
+        curves: "letters" [K]; "wanted" [K] and "paths" by model [K] of tips [N, 2], m; "errors" by model [runs, K], m,
+            of which a letter that was lost is infinite.
+        title: of the figure.
+    """
+    letters, models = curves["letters"], list(curves["paths"])
+    shown = _shown(len(letters))
+    figure = style.blank(height=0.78 * len(models) + 3.4)
+    figure.suptitle(title, fontsize=style.TEXT)
+    above, below = figure.subfigures(2, 1, height_ratios=[0.78 * len(models) + 0.4, 3.0])
+    axes = above.subplots(len(models), len(shown), squeeze=False)
+    for row, model in enumerate(models):
+        for column, place in enumerate(shown):
+            _letter(axes[row, column], curves["wanted"][place], curves["paths"][model][place], style.colour(model))
+            if row == 0:
+                style.title(axes[row, column], f"letter {place + 1}: {letters[place]}")
+        axes[row, 0].set_ylabel(model.replace("-", "\n", 1), fontsize=style.SMALL, rotation=0, ha="right", va="center")
+    _errors(below.subplots(), curves["errors"])
+    return figure
+
+
+def _shown(count: int) -> list[int]:
+    """Letters that are drawn: the first ones, then some of the later ones."""
+    return list(dict.fromkeys(place for place in (0, 1, 2, 4, count - 1) if place < count))
+
+
+def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
+    wanted, path = np.asarray(wanted), np.asarray(path)
+    axis.plot(*wanted.T, color="0.75", linewidth=2.5, solid_capstyle="round")
+    axis.plot(*path.T, color=colour, linewidth=1.0)
+    middle = (wanted.min(axis=0) + wanted.max(axis=0)) / 2
+    half = 0.75 * np.ptp(wanted, axis=0).max()
+    axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+    axis.set_xticks([])
+    axis.set_yticks([])
+    axis.spines[:].set_visible(False)
+
+
+def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None:
+    """Median over runs of each model's error against the letters written before, and each run that was lost."""
+    style.prepare(axis)
+    for model, runs in errors.items():
+        values = 1e3 * np.asarray(runs, float)
+        places, colour = 1 + np.arange(values.shape[1]), style.colour(model)
+        median = np.median(values, axis=0)
+        finite = np.where(np.isfinite(values), values, np.nan)
+        axis.plot(places, np.where(np.isfinite(median), median, np.nan), color=colour, linewidth=1.4, label=model)
+        axis.plot(np.tile(places, len(values)), finite.ravel(), style.marker(model), color=colour, markersize=3.5)
+    axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
+    style.legend(axis, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -1,0 +1,165 @@
+"""Torque errors on unseen letters: against the number of training letters, and at other speeds than the trained one.
+
+The offline experiments of Lutter, Ritter and Peters (2019, arXiv:1907.04490). All models are fitted to the same samples
+of the same letters by the same number of iterations, and selected by the same held-out samples. A letter at s times its
+speed is the motion (q, s qd, s² qdd), and its torque is the exact plant's.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import every, label_indices, partition_labels, select
+from dln_jax.figures.letters import error_lines
+from dln_jax.learning.online import appended, empty_replay
+from dln_jax.mechanics import closed_form
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.errors import mean_square
+from dln_jax.models.model import Parameters
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.studies.arm.rivals import Rival, rivals, size
+from dln_jax.studies.case import Case, Findings
+from dln_jax.studies.report import Row
+
+COUNTS, SPEEDS = (1, 2, 3, 5, 8, 12, 17), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+THINNED = 2
+"""Every second sample is fitted, 12.5 a second; all samples of test letters are judged."""
+
+
+class Effort(NamedTuple):
+    """How much is measured, and with how many iterations."""
+
+    splits: int = 3
+    """Sets of test letters: the published one first."""
+    seeds: int = 2
+    """Of each split; a seed draws the initial parameters and the order of the training letters."""
+    rounds: int = 12
+    """Of five iterations of Levenberg-Marquardt."""
+
+
+QUICK = Effort(splits=1, seeds=1, rounds=2)
+
+
+class Fit(NamedTuple):
+    """A rival fitted to some letters."""
+
+    parameters: Parameters
+    low: Float[np.ndarray, " 6"]
+    high: Float[np.ndarray, " 6"]
+    """Range of the fitted (q, qd, qdd)."""
+
+
+def cases(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> list[Case]:
+    """Errors against letters, and against speeds; `name` is that of the data, `test` the first set of test letters."""
+    effort = QUICK if quick else Effort()
+    labels = data.label[np.unique(data.trajectory)]
+    splits = test_sets(labels, test, data, effort.splits)
+    counts = [count for count in COUNTS if count < len(labels) - len(test)] + [len(labels) - len(test)]
+    against_letters = partial(
+        measure, name, data, splits, effort, {f"{count}-letters": (count, 1.0) for count in counts}
+    )
+    at_speeds = partial(
+        measure, name, data, splits, effort, {f"speed-{speed:g}": (counts[-1], speed) for speed in SPEEDS}
+    )
+    draw = partial(error_lines, zero="a guess of zero")
+    return [
+        Case(f"{name}/letters", against_letters, draw=partial(draw, x="training letters")),
+        Case(f"{name}/speeds", at_speeds, draw=partial(draw, x="speed of the test letters over that of training")),
+    ]
+
+
+def test_sets(labels: np.ndarray, test: Sequence[str], data: Trajectories, splits: int) -> list[list[str]]:
+    """The given test letters, then groups of the same size in which no letter is twice."""
+    groups = partition_labels(data, len(labels) // len(test))
+    return [list(test), *(group for group in groups if set(group) != set(test))][:splits]
+
+
+def measure(
+    name: str,
+    data: Trajectories,
+    splits: Sequence[Sequence[str]],
+    effort: Effort,
+    settings: dict[str, tuple[int, float]],
+) -> Findings:
+    """Test errors of every rival in each setting (number of letters, speed), over splits and seeds."""
+    known = rivals(rounds=effort.rounds)
+    errors: dict[str, dict[str, list[float]]] = {each: {setting: [] for setting in settings} for each in known}
+    zero, outside = ({setting: [] for setting in settings} for _ in range(2))
+    for test in splits:
+        held_out = select(data, label_indices(data, test))
+        for seed in range(effort.seeds):
+            fits: dict[int, dict[str, Fit]] = {}
+            for setting, (count, speed) in settings.items():
+                if count not in fits:
+                    fits[count] = {each: fitted(rival, data, test, count, seed) for each, rival in known.items()}
+                at_speed = faster(held_out, speed)
+                for each, fit in fits[count].items():
+                    errors[each][setting].append(torque_mse(known[each], fit.parameters, at_speed))
+                zero[setting].append(mean_square(at_speed.tau))
+                outside[setting].append(share_outside(next(iter(fits[count].values())), at_speed))
+    rows = [Row(f"{each}/{name}", "parameters", float(size(rival))) for each, rival in known.items()]
+    for each, by_setting in errors.items():
+        for setting, values in by_setting.items():
+            case = f"{each}/{name}/{setting}"
+            rows.append(Row(case, "torque_mse_median", float(np.median(values)), "N^2 m^2"))
+            rows.append(Row(case, "torque_mse_worst", float(np.max(values)), "N^2 m^2"))
+    for setting in settings:
+        rows.append(Row(f"data/{name}/{setting}", "torque_mean_square", float(np.median(zero[setting])), "N^2 m^2"))
+        rows.append(Row(f"data/{name}/{setting}", "share_outside_training", float(np.median(outside[setting]))))
+    places = [
+        speed if len({count for count, _ in settings.values()}) == 1 else count for count, speed in settings.values()
+    ]
+    curves = {each: list(by_setting.values()) for each, by_setting in errors.items()}
+    return Findings(
+        rows, {"places": places, "errors": curves, "zero": list(zero.values()), "outside": list(outside.values())}
+    )
+
+
+def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
+    """A rival fitted to `count` letters that are no test; fewer letters are the first of more."""
+    letters = np.setdiff1d(np.unique(data.trajectory), label_indices(data, test))
+    chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count]
+    thin = every(data, THINNED)
+    replay = empty_replay(len(thin.t), data.degrees_of_freedom)
+    for index in chosen:
+        letter = select(thin, [index])
+        replay = appended(replay, letter.q, letter.qd, letter.qdd, letter.tau)
+    parameters = rival.refit(jax.jit(rival.model.init)(jax.random.key(seed)), replay)
+    seen = states(select(thin, chosen))
+    return Fit(parameters, seen.min(axis=0), seen.max(axis=0))
+
+
+def states(data: Trajectories) -> Float[np.ndarray, "N 6"]:
+    """(q, qd, qdd) of each sample."""
+    return np.hstack([data.q, data.qd, data.qdd])
+
+
+def faster(data: Trajectories, speed: float) -> Trajectories:
+    """The same paths at a multiple of their speed, with the torques of the exact plant."""
+    q, qd, qdd = data.q, speed * data.qd, speed**2 * data.qdd
+    exact = jax.jit(jax.vmap(partial(closed_form.inverse_dynamics, two_link_arm().closed_form)))
+    return data._replace(
+        t=data.t / speed, qd=qd, qdd=qdd, tau=np.asarray(exact(q, qd, qdd)), p=None, pd=None,
+        tau_inertial=None, tau_coriolis=None, tau_gravity=None,
+    )  # fmt: skip
+
+
+def torque_mse(rival: Rival, parameters: Parameters, data: Trajectories) -> float:
+    """Mean squared torque error, summed over joints."""
+
+    @jax.jit
+    def torques(parameters: Parameters, *motion: np.ndarray) -> jax.Array:
+        return jax.vmap(dynamics(rival.model.energies(parameters)).inverse_dynamics)(*motion)
+
+    return mean_square(np.asarray(torques(parameters, data.q, data.qd, data.qdd)) - data.tau)
+
+
+def share_outside(fit: Fit, data: Trajectories) -> float:
+    """Share of the samples of which an angle, a rate or an acceleration is beyond all that was fitted."""
+    now = states(data)
+    return float(np.mean(((now < fit.low) | (now > fit.high)).any(axis=1)))
