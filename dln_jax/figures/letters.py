@@ -16,39 +16,38 @@ def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
     """Median and range over runs of each model's error, and below it the share of samples outside the training data.
 
     Args:
-        curves: "places" [K] along x; "errors", of each model [K, runs] in (N m)²; "zero" and "outside" [K, runs], the
-            mean square of the torque and a share.
+        curves: "places" [K] along x; "torque_mean_square" and "share_outside_training" [K, runs]; all others are the
+            errors of models [K, runs] in (N m)².
         x: name of the places.
         zero: name of the line of mean squares.
     """
-    places = np.asarray(curves["places"], float)
+    places, mean_squares, share = (np.asarray(curves[key], float) for key in _NOT_MODELS)
+    models = {model: np.asarray(errors, float) for model, errors in curves.items() if model not in _NOT_MODELS}
     figure, axes = style.figure(2, 1, height=4.6, sharex=True, gridspec_kw={"height_ratios": [4, 1]})
     top, bottom = axes[:, 0]
-    every = [value for errors in curves["errors"].values() for each in errors for value in each if value > 0]
-    ground, ends = exact_ground(every, EXACT), {}
-    for model, errors in curves["errors"].items():
-        shown = np.maximum(np.asarray(errors, float), ground)
-        colour = style.colour(model)
-        top.fill_between(places, shown.min(axis=1), shown.max(axis=1), color=colour, alpha=0.15, linewidth=0)
-        top.plot(places, np.median(shown, axis=1), "-", marker=style.marker(model), color=colour, markersize=4.5)
-        ends[model] = (float(places[-1]), float(np.median(shown, axis=1)[-1]))
-    mean_squares = np.median(np.asarray(curves["zero"], float), axis=1)
-    top.plot(places, mean_squares, "--", color=style.REFERENCE, linewidth=1.2)
-    ends[zero] = (float(places[-1]), float(mean_squares[-1]))
+    ground = exact_ground(np.concatenate([errors.ravel() for errors in models.values()]), EXACT)
+    colours, ends = {zero: style.REFERENCE}, {zero: (float(places[-1]), float(np.median(mean_squares[-1])))}
+    for model, errors in models.items():
+        shown, colours[model] = np.maximum(errors, ground), style.colour(model)
+        median = np.median(shown, axis=1)
+        top.fill_between(places, *np.quantile(shown, (0, 1), axis=1), color=colours[model], alpha=0.15, linewidth=0)
+        top.plot(places, median, marker=style.marker(model), color=colours[model], markersize=4.5, linewidth=1.4)
+        ends[model] = (float(places[-1]), float(median[-1]))
+    top.plot(places, np.median(mean_squares, axis=1), "--", color=colours[zero], linewidth=1.2)
     top.set(yscale="log", ylabel="test torque MSE, (N m)²")
     exact_band(top, ground)
-    outside = 100 * np.median(np.asarray(curves["outside"], float), axis=1)
-    bottom.fill_between(places, outside, color="0.8", linewidth=0)
+    outside = 100 * np.median(share, axis=1)
+    bottom.fill_between(places, outside, color="0.85", linewidth=0)
     bottom.plot(places, outside, color="0.4", linewidth=1.2)
-    bottom.set(xlabel=x, ylabel="outside the\ntraining range, %", ylim=(0, 100))
-    bottom.set_xscale(style.scale_of(places))
+    bottom.set(xlabel=x, ylabel="outside the\ntraining, %", ylim=(0, 100), xscale=style.scale_of(places))
     bottom.set_xticks(places, [f"{place:g}" for place in places])
     bottom.minorticks_off()
-    colours = {model: style.colour(model) for model in curves["errors"]} | {zero: style.REFERENCE}
     figure.align_ylabels()
-    figure.canvas.draw()  # labels stand at heights of the finished layout
     label_ends(top, ends, colours=colours)
     return figure
+
+
+_NOT_MODELS = ("places", "torque_mean_square", "share_outside_training")
 
 
 def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:

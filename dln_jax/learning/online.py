@@ -12,6 +12,7 @@ Lutter, Ritter and Peters (2019, arXiv:1907.04490).
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from dln_jax.compilation import quick_compilation
 from dln_jax.learning.engine.problem import better_of, no_best
 from dln_jax.learning.linear import design, unravelled
 from dln_jax.mechanics.equations import dynamics
@@ -113,7 +115,7 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
     def residual(parameters: Parameters, q: Array, qd: Array, qdd: Array, tau: Array, factor: Array) -> Array:
         return (dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd) - tau) * factor
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=quick_compilation())
     def refit(parameters: Parameters, replay: Replay) -> Parameters:
         unit = _scale(replay)
         fitted, held_out = (jnp.sqrt(each)[:, None] / unit for each in (replay.fitted, replay.held_out))

@@ -5,7 +5,7 @@ of the same letters by the same number of iterations, and selected by the same h
 speed is the motion (q, s qd, s² qdd), and its torque is the exact plant's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,17 +18,19 @@ from dln_jax.data.splits import every, label_indices, partition_labels, select
 from dln_jax.figures.letters import error_lines
 from dln_jax.learning.online import appended, empty_replay
 from dln_jax.mechanics import closed_form
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import mean_square
 from dln_jax.models.model import Parameters
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.studies.arm.rivals import Rival, rivals, size
+from dln_jax.studies.arm.rivals import IDENTIFIED, Rival, rivals, size
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
 
-COUNTS, SPEEDS = (1, 2, 3, 5, 8, 12, 17), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+COUNTS, SPEEDS = (1, 2, 3, 5, 8, 12), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
 THINNED = 2
 """Every second sample is fitted, 12.5 a second; all samples of test letters are judged."""
+
+_exact = jax.jit(jax.vmap(partial(closed_form.inverse_dynamics, two_link_arm().closed_form)))
 
 
 class Effort(NamedTuple):
@@ -79,45 +81,50 @@ def test_sets(labels: np.ndarray, test: Sequence[str], data: Trajectories, split
     return [list(test), *(group for group in groups if set(group) != set(test))][:splits]
 
 
+Settings = Mapping[str, tuple[int, float]]
+"""By name, a number of training letters and a speed."""
+
+
 def measure(
-    name: str,
-    data: Trajectories,
-    splits: Sequence[Sequence[str]],
-    effort: Effort,
-    settings: dict[str, tuple[int, float]],
+    name: str, data: Trajectories, splits: Sequence[Sequence[str]], effort: Effort, settings: Settings
 ) -> Findings:
-    """Test errors of every rival in each setting (number of letters, speed), over splits and seeds."""
-    known = rivals(rounds=effort.rounds)
-    errors: dict[str, dict[str, list[float]]] = {each: {setting: [] for setting in settings} for each in known}
-    zero, outside = ({setting: [] for setting in settings} for _ in range(2))
+    """Test errors of every rival in each setting, over splits and seeds."""
+    known, runs = rivals(rounds=effort.rounds), []
     for test in splits:
-        held_out = select(data, label_indices(data, test))
         for seed in range(effort.seeds):
-            fits: dict[int, dict[str, Fit]] = {}
-            for setting, (count, speed) in settings.items():
-                if count not in fits:
-                    fits[count] = {each: fitted(rival, data, test, count, seed) for each, rival in known.items()}
-                at_speed = faster(held_out, speed)
-                for each, fit in fits[count].items():
-                    errors[each][setting].append(torque_mse(known[each], fit.parameters, at_speed))
-                zero[setting].append(mean_square(at_speed.tau))
-                outside[setting].append(share_outside(next(iter(fits[count].values())), at_speed))
+            runs.append(one_run(known, data, test, seed, settings))
     rows = [Row(f"{each}/{name}", "parameters", float(size(rival))) for each, rival in known.items()]
-    for each, by_setting in errors.items():
-        for setting, values in by_setting.items():
-            case = f"{each}/{name}/{setting}"
+    for each in known:
+        for setting in settings:
+            case, values = f"{each}/{name}/{setting}", [run[setting][each] for run in runs]
             rows.append(Row(case, "torque_mse_median", float(np.median(values)), "N^2 m^2"))
             rows.append(Row(case, "torque_mse_worst", float(np.max(values)), "N^2 m^2"))
     for setting in settings:
-        rows.append(Row(f"data/{name}/{setting}", "torque_mean_square", float(np.median(zero[setting])), "N^2 m^2"))
-        rows.append(Row(f"data/{name}/{setting}", "share_outside_training", float(np.median(outside[setting]))))
-    places = [
-        speed if len({count for count, _ in settings.values()}) == 1 else count for count, speed in settings.values()
-    ]
-    curves = {each: list(by_setting.values()) for each, by_setting in errors.items()}
-    return Findings(
-        rows, {"places": places, "errors": curves, "zero": list(zero.values()), "outside": list(outside.values())}
-    )
+        zero, outside = ([run[setting][quantity] for run in runs] for quantity in (ZERO, OUTSIDE))
+        rows.append(Row(f"data/{name}/{setting}", ZERO, float(np.median(zero)), "N^2 m^2"))
+        rows.append(Row(f"data/{name}/{setting}", OUTSIDE, float(np.median(outside))))
+    several = len({count for count, _ in settings.values()}) > 1
+    curves = {key: [[run[setting][key] for run in runs] for setting in settings] for key in (*known, ZERO, OUTSIDE)}
+    places = [count if several else speed for count, speed in settings.values()]
+    return Findings(rows, {"places": places, **curves})
+
+
+def one_run(
+    known: Mapping[str, Rival], data: Trajectories, test: Sequence[str], seed: int, settings: Settings
+) -> dict[str, dict[str, float]]:
+    """By setting: the torque MSE of each rival, the mean square of the torque, and the share outside the training."""
+    held_out, fits = select(data, label_indices(data, test)), {}
+    found: dict[str, dict[str, float]] = {}
+    for setting, (count, speed) in settings.items():
+        if count not in fits:
+            fits[count] = {each: fitted(rival, data, test, count, seed) for each, rival in known.items()}
+        faster_letters = faster(held_out, speed)
+        found[setting] = {
+            **{each: torque_mse(known[each], fit.parameters, faster_letters) for each, fit in fits[count].items()},
+            ZERO: mean_square(faster_letters.tau),
+            OUTSIDE: share_outside(fits[count][IDENTIFIED], faster_letters),
+        }
+    return found
 
 
 def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
@@ -129,7 +136,7 @@ def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, se
     for index in chosen:
         letter = select(thin, [index])
         replay = appended(replay, letter.q, letter.qd, letter.qdd, letter.tau)
-    parameters = rival.refit(jax.jit(rival.model.init)(jax.random.key(seed)), replay)
+    parameters = rival.refit(rival.start(seed), replay)
     seen = states(select(thin, chosen))
     return Fit(parameters, seen.min(axis=0), seen.max(axis=0))
 
@@ -142,21 +149,15 @@ def states(data: Trajectories) -> Float[np.ndarray, "N 6"]:
 def faster(data: Trajectories, speed: float) -> Trajectories:
     """The same paths at a multiple of their speed, with the torques of the exact plant."""
     q, qd, qdd = data.q, speed * data.qd, speed**2 * data.qdd
-    exact = jax.jit(jax.vmap(partial(closed_form.inverse_dynamics, two_link_arm().closed_form)))
     return data._replace(
-        t=data.t / speed, qd=qd, qdd=qdd, tau=np.asarray(exact(q, qd, qdd)), p=None, pd=None,
+        t=data.t / speed, qd=qd, qdd=qdd, tau=np.asarray(_exact(q, qd, qdd)), p=None, pd=None,
         tau_inertial=None, tau_coriolis=None, tau_gravity=None,
     )  # fmt: skip
 
 
 def torque_mse(rival: Rival, parameters: Parameters, data: Trajectories) -> float:
     """Mean squared torque error, summed over joints."""
-
-    @jax.jit
-    def torques(parameters: Parameters, *motion: np.ndarray) -> jax.Array:
-        return jax.vmap(dynamics(rival.model.energies(parameters)).inverse_dynamics)(*motion)
-
-    return mean_square(np.asarray(torques(parameters, data.q, data.qd, data.qdd)) - data.tau)
+    return mean_square(np.asarray(rival.torques(parameters, data.q, data.qd, data.qdd)) - data.tau)
 
 
 def share_outside(fit: Fit, data: Trajectories) -> float:

@@ -10,7 +10,7 @@ written twice, so each error is that of a motion that the model has not seen.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,8 @@ GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
 """N m/rad and N m s/rad."""
 LIMITS = np.array([25.0, 15.0])
 """N m."""
+PLACES = 250
+"""Of the replay for each letter, 10 s."""
 CUTOFF = 50.0
 """Hz, of the low-pass behind differences of noisy readings."""
 LOST = 1.0
@@ -100,6 +102,8 @@ class Written(NamedTuple):
     """Share of the samples at a torque limit."""
     path: np.ndarray
     """Tip [N, 2], m, up to where it was lost."""
+    wanted: np.ndarray
+    """Tip of the whole letter, m."""
 
 
 def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
@@ -151,7 +155,7 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
     rows = [row for each, runs in written.items() for row in rows_of(f"{each}/{name}/{condition}", runs)]
     curves = {
         "letters": [motion.label for motion in motions[0]],
-        "wanted": [_tips(motion.reference.q[: motion.samples]) for motion in motions[0]],
+        "wanted": [visit.wanted for visit in written["exact-model"][0]],
         "paths": {each: [visit.path for visit in runs[0]] for each, runs in written.items()},
         "errors": {each: [[visit.tip_error for visit in run] for run in runs] for each, runs in written.items()},
     }
@@ -160,10 +164,8 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
 
 def written_by(drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int) -> list[Written]:
     """The letters one after the other, with a refit after each; without a learner nothing is learned."""
-    replay = empty_replay(sum(motion.samples for motion in motions), 2)
-    start, refit = (), lambda parameters, _: parameters
-    if learner is not None:
-        start, refit = jax.jit(learner.model.init)(jax.random.key(seed)), learner.refit
+    start, refit = ((), lambda parameters, _: parameters) if learner is None else (learner.start(seed), learner.refit)
+    replay = empty_replay(len(motions) * PLACES, 2)
     return [visit.outcome for visit in learn_online(motions, drive, refit, start, replay)]
 
 
@@ -203,8 +205,19 @@ def reference(letter: Trajectories, speed: float = 1.0) -> Reference:
     return Reference(spline(t), speed * spline(t, 1), speed**2 * spline(t, 2))
 
 
-Loop = Callable[[Parameters, Reference, Array], tuple[Run, Array]]
-"""(parameters, reference, key of the noise) -> the run, and the acceleration at the start of each sample."""
+class Driven(NamedTuple):
+    """A run of N samples along a reference."""
+
+    run: Run
+    qdd: Any
+    """rad/s² at the start of each sample [N, 2]."""
+    tip: Any
+    """m, of the arm and of the reference [N, 2]."""
+    wanted_tip: Any
+
+
+Loop = Callable[[Parameters, Reference, Array], Driven]
+"""(parameters, reference, key of the noise) -> the run along it."""
 
 
 def closed_loop(law: Law, condition: Condition) -> Loop:
@@ -212,35 +225,38 @@ def closed_loop(law: Law, condition: Condition) -> Loop:
     gains = Gains(condition.gains * GAINS.proportional, condition.gains**0.5 * GAINS.derivative)
     noisy = condition.encoder_noise > 0
     laboratory = Laboratory(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
-    field = field_of(dynamics(two_link_arm().closed_form))
+    arm = two_link_arm()
+    field, tip = field_of(dynamics(arm.closed_form)), jax.vmap(arm.tip)
 
     @jax.jit
-    def run(parameters: Parameters, wanted: Reference, key: Array) -> tuple[Run, Array]:
+    def run(parameters: Parameters, wanted: Reference, key: Array) -> Driven:
         controller = following(law(parameters, gains), wanted, rate=RATE)
         if noisy:
             controller = with_differences(controller, 2, rate=RATE, cutoff=CUTOFF)
         start = jnp.concatenate([wanted.q[0], wanted.qd[0]])
         seconds, about = len(wanted.q) / RATE, {"rate": RATE, "controls": 2, "laboratory": laboratory, "key": key}
         done = simulate(field, controller, start, seconds=seconds, **about)
-        return done, jax.vmap(field)(done.x[:-1], done.u)[:, 2:]
+        x = done.x[:-1]
+        return Driven(done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]), tip(wanted.q))
 
     return run
 
 
 def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Motion) -> tuple[Written, tuple]:
     """One letter, and what is recorded of it: exact states, or readings of the encoders behind a filter."""
-    run, qdd = jax.tree.map(np.asarray, loop(parameters, motion.reference, jax.random.key(motion.samples)))
-    q, qd, u = run.x[: motion.samples, :2], run.x[: motion.samples, 2:], run.u[: motion.samples]
-    off = q - motion.reference.q[: motion.samples]
-    lost = np.flatnonzero(~(np.abs(off).max(axis=1) <= LOST))
+    driven = jax.tree.map(np.asarray, loop(parameters, motion.reference, jax.random.key(motion.samples)))
+    run, off = driven.run, driven.run.x[:-1, :2] - motion.reference.q
+    lost = np.flatnonzero(~(np.abs(off[: motion.samples]).max(axis=1) <= LOST))
     end = int(lost[0]) if len(lost) else motion.samples
     step = round(RATE / (RECORDED * condition.speed))
-    recording = tuple(each[:end:step] for each in (q, qd, qdd[: motion.samples], u))
+    q, qd = np.hsplit(run.x[:end], 2)
+    recording = tuple(each[:end:step] for each in (q, qd, driven.qdd, run.u))
     if condition.encoder_noise > 0:
-        recording = _filtered(run.t[:end], run.y[:end], u[:end], step)
-    path, wanted = _tips(q[:end]), _tips(motion.reference.q[:end])
-    size = [np.inf if len(lost) else float(np.sqrt(np.mean(np.sum(each**2, axis=1)))) for each in (off, path - wanted)]
-    return Written(*size, float(np.mean((np.abs(u[:end]) >= LIMITS).any(axis=1))), path), recording
+        recording = _filtered(run.t[:end], run.y[:end], run.u[:end], step)
+    errors = [np.sqrt(np.mean(np.sum(each[:end] ** 2, axis=1))) for each in (off, driven.tip - driven.wanted_tip)]
+    joint_error, tip_error = (np.inf if len(lost) else float(each) for each in errors)
+    saturated = float(np.mean((np.abs(run.u[: max(end, 1)]) >= LIMITS).any(axis=1)))
+    return Written(joint_error, tip_error, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
 
 
 def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple[np.ndarray, ...]:
@@ -250,10 +266,3 @@ def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple
     log = from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(len(t), int)})
     data = smooth(log, decimate=step).data
     return data.q, data.qd, data.qdd, data.tau
-
-
-def _tips(q: np.ndarray) -> np.ndarray:
-    """Tip [N, 2] in m."""
-    scene = two_link_arm()
-    assert scene.tip is not None
-    return np.asarray(jax.jit(jax.vmap(scene.tip))(q))

@@ -1,13 +1,15 @@
 """The models that the first DeLaN paper compares, in sizes and units that are stated before any data are seen."""
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import Array
 
-from dln_jax.data.schema import Trajectories
-from dln_jax.learning.online import Refit, Replay, make_linear_refit, make_refit
+from dln_jax.learning.online import Refit, make_linear_refit, make_refit
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.model import Model, Parameters
@@ -16,17 +18,22 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.models import WIDTHS
 
 RATE, ACCELERATION, TORQUE = 0.5, 2.0, 2.0
-"""Typical sizes of a letter's motion: rad/s, rad/s² and N m. Every network is scaled by them, whatever it is fitted to."""
+"""Typical sizes of a letter's motion in rad/s, rad/s² and N m, by which networks are scaled whatever the data."""
 IDENTIFIED = "identified-arm"
 
 
 class Rival(NamedTuple):
-    """A model and how it is fitted."""
+    """A model and how it is fitted; the functions are compiled once for all cases of a report."""
 
     model: Model
     refit: Refit
+    start: Callable[[int], Parameters]
+    """Seed -> parameters before any data."""
+    torques: Callable[[Parameters, Any, Any, Any], Array]
+    """(parameters, q, qd, qdd [N, d]) -> tau [N, d]."""
 
 
+@functools.cache
 def rivals(*, rounds: int) -> dict[str, Rival]:
     """The models by name; networks are fitted by `rounds` of five iterations of Levenberg-Marquardt.
 
@@ -45,9 +52,17 @@ def rivals(*, rounds: int) -> dict[str, Rival]:
     }
     chain = make_planar_chain(needs._replace(friction=True), symmetric=False)
     return {
-        **{name: Rival(model, make_refit(model, rounds=rounds)) for name, model in networks.items()},
-        IDENTIFIED: Rival(chain, make_linear_refit(chain)),
+        **{name: _rival(model, make_refit(model, rounds=rounds)) for name, model in networks.items()},
+        IDENTIFIED: _rival(chain, make_linear_refit(chain)),
     }
+
+
+def _rival(model: Model, refit: Refit) -> Rival:
+    @jax.jit
+    def torques(parameters: Parameters, *motion: Array) -> Array:
+        return jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*motion)
+
+    return Rival(model, refit, jax.jit(lambda seed: model.init(jax.random.key(seed))), torques)
 
 
 def _inverse_side(parameters: Parameters) -> Parameters:
@@ -58,8 +73,3 @@ def _inverse_side(parameters: Parameters) -> Parameters:
 def size(rival: Rival) -> int:
     """How many parameters are fitted."""
     return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(rival.model.init, jax.random.key(0))))
-
-
-def replay_of(data: Trajectories, fitted: np.ndarray, held_out: np.ndarray) -> Replay:
-    """All samples of a file, of which masks [N] say which are fitted and which are held out."""
-    return Replay(data.q, data.qd, data.qdd, data.tau, fitted.astype(float), held_out.astype(float))
