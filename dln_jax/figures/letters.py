@@ -25,7 +25,7 @@ def error_lines(curves: Mapping[str, Any], *, x: str, zero: str) -> Figure:
     models = {model: np.asarray(errors, float) for model, errors in curves.items() if model not in _NOT_MODELS}
     figure, axes = style.figure(2, 1, height=4.6, sharex=True, gridspec_kw={"height_ratios": [4, 1]})
     top, bottom = axes[:, 0]
-    ground = exact_ground(np.concatenate([errors.ravel() for errors in models.values()]), EXACT)
+    ground = exact_ground(np.concatenate([errors.ravel() for errors in models.values()]).tolist(), EXACT)
     colours, ends = {zero: style.REFERENCE}, {zero: (float(places[-1]), float(np.median(mean_squares[-1])))}
     for model, errors in models.items():
         shown, colours[model] = np.maximum(errors, ground), style.colour(model)
@@ -62,14 +62,16 @@ def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
     shown = _shown(len(letters))
     figure = style.blank(height=0.78 * len(models) + 3.4)
     figure.suptitle(title, fontsize=style.TEXT)
-    above, below = figure.subfigures(2, 1, height_ratios=[0.78 * len(models) + 0.4, 3.0])
+    above, below = np.ravel(figure.subfigures(2, 1, height_ratios=[0.78 * len(models) + 0.4, 3.0]))
     axes = above.subplots(len(models), len(shown), squeeze=False)
     for row, model in enumerate(models):
         for column, place in enumerate(shown):
             _letter(axes[row, column], curves["wanted"][place], curves["paths"][model][place], style.colour(model))
             if row == 0:
                 style.title(axes[row, column], f"letter {place + 1}: {letters[place]}")
-        axes[row, 0].set_ylabel(model.replace("-", "\n", 1), fontsize=style.SMALL, rotation=0, ha="right", va="center")
+        axes[row, 0].set_ylabel(
+            "\n".join(model.rsplit("-", 1)), fontsize=style.SMALL, rotation=0, ha="right", va="center"
+        )
     _errors(below.subplots(), curves["errors"])
     return figure
 
@@ -84,7 +86,7 @@ def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
     axis.plot(*wanted.T, color="0.75", linewidth=2.5, solid_capstyle="round")
     axis.plot(*path.T, color=colour, linewidth=1.0)
     middle = (wanted.min(axis=0) + wanted.max(axis=0)) / 2
-    half = 0.75 * np.ptp(wanted, axis=0).max()
+    half = 0.65 * np.ptp(wanted, axis=0).max()
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set_xticks([])
     axis.set_yticks([])
@@ -94,12 +96,13 @@ def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
 def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None:
     """Median over runs of each model's error against the letters written before, and each run that was lost."""
     style.prepare(axis)
+    places = 1 + np.arange(len(next(iter(errors.values()))[0]))
     for model, runs in errors.items():
-        values = 1e3 * np.asarray(runs, float)
-        places, colour = 1 + np.arange(values.shape[1]), style.colour(model)
+        values, colour = 1e3 * np.asarray(runs, float), style.colour(model)
         median = np.median(values, axis=0)
         finite = np.where(np.isfinite(values), values, np.nan)
         axis.plot(places, np.where(np.isfinite(median), median, np.nan), color=colour, linewidth=1.4, label=model)
         axis.plot(np.tile(places, len(values)), finite.ravel(), style.marker(model), color=colour, markersize=3.5)
     axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
+    axis.set_xticks(places)
     style.legend(axis, loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -39,7 +39,8 @@ MODELS: dict[str, tuple[str, str]] = {
     "polynomial-hamiltonian": ("#44AA99", "D"),
     "phase-network": ("#7E57A6", "X"),
     "differential-network": ("#332288", "o"),
-    **dict.fromkeys((TRUTH, "plant"), ("black", ".")),
+    **dict.fromkeys((TRUTH, "plant", "exact-model"), ("black", ".")),
+    "feedback-alone": (REFERENCE, "x"),
     "published": (REFERENCE, "x"),
 }
 """Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""

@@ -43,8 +43,8 @@ class Replay(NamedTuple):
     """1 for a sample that selects among the iterates of a refit, else 0."""
 
     @property
-    def count(self) -> int:
-        """Samples, fitted or held out."""
+    def recorded(self) -> int:
+        """How many samples there are, fitted or held out."""
         return int(np.count_nonzero(np.asarray(self.fitted) + np.asarray(self.held_out)))
 
 
@@ -55,7 +55,8 @@ def empty_replay(capacity: int, d: int) -> Replay:
         InputError: a size that is not positive.
     """
     require_positive(capacity=capacity, d=d)
-    return Replay(*(np.zeros((capacity, d)) for _ in range(4)), np.zeros(capacity), np.zeros(capacity))
+    motion, weight = np.zeros((capacity, d)), np.zeros(capacity)
+    return Replay(motion, motion, motion, motion, weight, weight)
 
 
 def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
@@ -70,7 +71,7 @@ def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int
         InputError: numbers that are not finite, arrays of other shapes, or more samples than places.
     """
     require_positive(blocks=blocks)
-    used, arrays = replay.count, tuple(np.asarray(each, float) for each in (q, qd, qdd, tau))
+    used, arrays = replay.recorded, tuple(np.asarray(each, float) for each in (q, qd, qdd, tau))
     capacity, d = np.shape(replay.q)
     samples = len(arrays[0])
     if any(each.shape != (samples, d) for each in arrays):

@@ -51,9 +51,9 @@ class Fit(NamedTuple):
     """A rival fitted to some letters."""
 
     parameters: Parameters
-    low: Float[np.ndarray, " 6"]
-    high: Float[np.ndarray, " 6"]
-    """Range of the fitted (q, qd, qdd)."""
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    """Range of the fitted (q, qd, qdd); n = 6."""
 
 
 def cases(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> list[Case]:
@@ -130,7 +130,7 @@ def one_run(
 def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
     """A rival fitted to `count` letters that are no test; fewer letters are the first of more."""
     letters = np.setdiff1d(np.unique(data.trajectory), label_indices(data, test))
-    chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count]
+    chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count].tolist()
     thin = every(data, THINNED)
     replay = empty_replay(len(thin.t), data.degrees_of_freedom)
     for index in chosen:
@@ -141,7 +141,7 @@ def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, se
     return Fit(parameters, seen.min(axis=0), seen.max(axis=0))
 
 
-def states(data: Trajectories) -> Float[np.ndarray, "N 6"]:
+def states(data: Trajectories) -> Float[np.ndarray, "N n"]:
     """(q, qd, qdd) of each sample."""
     return np.hstack([data.q, data.qd, data.qdd])
 

@@ -186,8 +186,9 @@ def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
 
 def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> list[Motion]:
     """Different letters in an order that the seed draws."""
-    longest = max(len(reference(select(data, [index]), speed).q) for index in np.unique(data.trajectory))
-    order = np.random.default_rng([seed, 2]).permutation(np.unique(data.trajectory))[:count]
+    letters = np.unique(data.trajectory).tolist()
+    longest = max(len(reference(select(data, [index]), speed).q) for index in letters)
+    order = np.random.default_rng([seed, 2]).permutation(letters)[:count].tolist()
     found = []
     for index in order:
         q, qd, qdd = reference(select(data, [index]), speed)
@@ -226,6 +227,7 @@ def closed_loop(law: Law, condition: Condition) -> Loop:
     noisy = condition.encoder_noise > 0
     laboratory = Laboratory(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
     arm = two_link_arm()
+    assert arm.tip is not None
     field, tip = field_of(dynamics(arm.closed_form)), jax.vmap(arm.tip)
 
     @jax.jit
