@@ -25,7 +25,7 @@ from dln_jax.studies.arm.rivals import IDENTIFIED, Rival, rivals, size
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
 
-COUNTS, SPEEDS = (1, 2, 3, 5, 8, 12), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
 THINNED = 2
 """Every second sample is fitted, 12.5 a second; all samples of test letters are judged."""
@@ -40,7 +40,7 @@ class Effort(NamedTuple):
     """Sets of test letters: the published one first."""
     seeds: int = 2
     """Of each split; a seed draws the initial parameters and the order of the training letters."""
-    rounds: int = 12
+    rounds: int = 8
     """Of five iterations of Levenberg-Marquardt."""
 
 

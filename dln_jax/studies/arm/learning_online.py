@@ -51,8 +51,6 @@ GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
 """N m/rad and N m s/rad."""
 LIMITS = np.array([25.0, 15.0])
 """N m."""
-PLACES = 250
-"""Of the replay for each letter, 10 s."""
 CUTOFF = 50.0
 """Hz, of the low-pass behind differences of noisy readings."""
 LOST = 1.0
@@ -148,9 +146,10 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
     learners, under = rivals(rounds=effort.rounds), CONDITIONS[condition]
     written: dict[str, list[list[Written]]] = {}
     motions = [drawn_letters(data, effort.letters, seed, under.speed) for seed in range(effort.seeds)]
+    places = capacity(data, effort.letters)
     for each, law in laws(learners).items():
         drive = partial(write, closed_loop(law, under), under)
-        runs = [written_by(drive, learners.get(each), motions[seed], seed) for seed in range(effort.seeds)]
+        runs = [written_by(drive, learners.get(each), motions[seed], seed, places) for seed in range(effort.seeds)]
         written[each] = runs
     rows = [row for each, runs in written.items() for row in rows_of(f"{each}/{name}/{condition}", runs)]
     curves = {
@@ -162,10 +161,19 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
     return Findings(rows, curves)
 
 
-def written_by(drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int) -> list[Written]:
+def capacity(data: Trajectories, letters: int) -> int:
+    """Places for the recordings of any so many letters: one program for all conditions and seeds."""
+    starts = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
+    seconds = np.maximum.reduceat(data.t, starts) - np.minimum.reduceat(data.t, starts)
+    return int(np.sort(np.ceil(RECORDED * seconds) + 1)[-letters:].sum())
+
+
+def written_by(
+    drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int, places: int
+) -> list[Written]:
     """The letters one after the other, with a refit after each; without a learner nothing is learned."""
     start, refit = ((), lambda parameters, _: parameters) if learner is None else (learner.start(seed), learner.refit)
-    replay = empty_replay(len(motions) * PLACES, 2)
+    replay = empty_replay(places, 2)
     return [visit.outcome for visit in learn_online(motions, drive, refit, start, replay)]
 
 

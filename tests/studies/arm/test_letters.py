@@ -70,8 +70,8 @@ def test_an_arm_that_identifies_itself_writes_its_second_letter_as_the_exact_mod
     motions = drawn_letters(letters, 2, 0, 1.0)
     exact = partial(write, closed_loop(lambda _, gains: EXACT, under), under)
     by_model = lambda p, gains: feed_forward(dynamics(identified.model.energies(p)), gains)  # noqa: E731
-    learned = written_by(partial(write, closed_loop(by_model, under), under), identified, motions, 0)
-    known = written_by(exact, None, motions, 0)
+    learned = written_by(partial(write, closed_loop(by_model, under), under), identified, motions, 0, 400)
+    known = written_by(exact, None, motions, 0, 400)
     assert learned[0].joint_error > 100 * known[0].joint_error
     np.testing.assert_allclose(learned[1].joint_error, known[1].joint_error, rtol=1e-6)
     assert known[0].joint_error < 2e-4 and known[0].saturated == 0
@@ -80,7 +80,7 @@ def test_an_arm_that_identifies_itself_writes_its_second_letter_as_the_exact_mod
 def test_a_letter_that_is_lost_is_said_and_not_averaged(letters):
     under = Condition(gains=0.0)
     falling = partial(write, closed_loop(lambda _, gains: partial(feedback, gains), under), under)
-    runs = [written_by(falling, None, drawn_letters(letters, 2, 0, 1.0), 0)]
+    runs = [written_by(falling, None, drawn_letters(letters, 2, 0, 1.0), 0, 400)]
     assert all(np.isinf(each.joint_error) and np.isinf(each.tip_error) for each in runs[0])
     assert len(runs[0][0].path) < len(runs[0][0].wanted)
     rows = {row.quantity: row.value for row in learning_online.rows_of("falling", runs)}
