@@ -7,6 +7,7 @@ letters, torque errors at 0.5 to 2 times the speed, and tracking errors of an ar
 each beside a feed-forward network and an identified arm. Prints tables, writes report.json and draws figures.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -17,7 +18,7 @@ from dln_jax.data.splits import split
 from dln_jax.datasets.default_data import CHARACTERS_TEST
 from dln_jax.studies.arm import few_letters, learning_online, published_protocol
 from dln_jax.studies.arm.table import letters
-from dln_jax.studies.case import measure_and_publish
+from dln_jax.studies.case import Case, measure_and_publish
 from dln_jax.types import require_positive
 from dln_jax.zoo.run_folder import run_folder
 
@@ -54,14 +55,16 @@ def main(given: Arguments) -> None:
     test = given.test.split(",")
     sets = [split(data, test=test, seed=seed) for seed in range(given.seeds)]
     steps = min(given.steps, QUICK_STEPS) if given.quick else given.steps
-    found = {
-        "published": published_protocol.cases(name, sets, steps=steps),
-        **{case.name.split("/")[1]: [case] for case in few_letters.cases(name, data, test, quick=given.quick)},
-        "online": learning_online.cases(name, data, quick=given.quick),
+    found: dict[str, Callable[[], list[Case]]] = {
+        "published": lambda: published_protocol.cases(name, sets, steps=steps),
+        "letters": lambda: [few_letters.against_letters(name, data, test, quick=given.quick)],
+        "speeds": lambda: [few_letters.at_speeds(name, data, test, quick=given.quick)],
+        "online": lambda: learning_online.cases(name, data, quick=given.quick),
     }
+    chosen = [case for subject in subjects for case in found[subject]()]
     with run_folder(given.out, "delan_report") as folder:
         measure_and_publish(
-            folder, [case for subject in subjects for case in found[subject]], figures=given.figures, quick=given.quick,
-            dtype="float64; published protocol float32", seeds=list(range(given.seeds)), call_path="default jit",
+            folder, chosen, figures=given.figures, quick=given.quick, seeds=list(range(given.seeds)),
+            dtype="float64; published protocol float32", call_path="default jit",
             data="embedded letters" if given.data is None else given.data.name,
         )  # fmt: skip

@@ -86,7 +86,7 @@ def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
     axis.plot(*wanted.T, color="0.75", linewidth=2.5, solid_capstyle="round")
     axis.plot(*path.T, color=colour, linewidth=1.0)
     middle = (wanted.min(axis=0) + wanted.max(axis=0)) / 2
-    half = 0.65 * np.ptp(wanted, axis=0).max()
+    half = 0.72 * np.ptp(wanted, axis=0).max()
     axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axis.set_xticks([])
     axis.set_yticks([])
@@ -94,15 +94,26 @@ def _letter(axis: Axes, wanted: Any, path: Any, colour: str) -> None:
 
 
 def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None:
-    """Median over runs of each model's error against the letters written before, and each run that was lost."""
+    """All errors and their median over runs, in the order of writing; letters that were lost are hollow, on top."""
     style.prepare(axis)
-    places = 1 + np.arange(len(next(iter(errors.values()))[0]))
-    for model, runs in errors.items():
-        values, colour = 1e3 * np.asarray(runs, float), style.colour(model)
-        median = np.median(values, axis=0)
-        finite = np.where(np.isfinite(values), values, np.nan)
-        axis.plot(places, np.where(np.isfinite(median), median, np.nan), color=colour, linewidth=1.4, label=model)
-        axis.plot(np.tile(places, len(values)), finite.ravel(), style.marker(model), color=colour, markersize=3.5)
+    values = {model: 1e3 * np.asarray(runs, float) for model, runs in errors.items()}
+    every = np.concatenate([each.ravel() for each in values.values()])
+    top = 4 * every[np.isfinite(every)].max(initial=1.0)
+    places = 1 + np.arange(next(iter(values.values())).shape[1])
+    for number, (model, each) in enumerate(values.items()):
+        look: dict[str, Any] = {"color": style.colour(model), "markersize": 4}
+        beside = places + 0.06 * (number - (len(values) - 1) / 2)
+        median, lost = np.median(each, axis=0), np.isinf(each)
+        axis.plot(beside, np.where(np.isfinite(median), median, np.nan), color=look["color"], linewidth=1.2)
+        for run in np.where(lost, np.nan, each):
+            axis.plot(beside, run, style.marker(model), **look)
+        hollow = beside[lost.any(axis=0)]
+        axis.plot(hollow, np.full(len(hollow), top), style.marker(model), markerfacecolor="white", **look)
+        axis.plot([], [], f"{style.marker(model)}-", label=model, **look)
+    if np.isinf(every).any():
+        axis.axhspan(top / 2, 2 * top, color="0.95", zorder=-1, linewidth=0)
+        axis.text(1.0, top, " lost", transform=axis.get_yaxis_transform(), va="center", fontsize=style.SMALL)
+        axis.set_ylim(top=2 * top)
     axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
     axis.set_xticks(places)
-    style.legend(axis, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    style.legend(axis, loc="center left", bbox_to_anchor=(1.0, 0.45))

@@ -24,6 +24,7 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm.rivals import IDENTIFIED, Rival, rivals, size
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
+from dln_jax.types import InputError
 
 COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
 ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
@@ -56,33 +57,43 @@ class Fit(NamedTuple):
     """Range of the fitted (q, qd, qdd); n = 6."""
 
 
-def cases(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> list[Case]:
-    """Errors against letters, and against speeds; `name` is that of the data, `test` the first set of test letters."""
-    effort = QUICK if quick else Effort()
-    labels = data.label[np.unique(data.trajectory)]
-    splits = test_sets(labels, test, data, effort.splits)
-    counts = [count for count in COUNTS if count < len(labels) - len(test)] + [len(labels) - len(test)]
-    against_letters = partial(
-        measure, name, data, splits, effort, {f"{count}-letters": (count, 1.0) for count in counts}
-    )
-    at_speeds = partial(
-        measure, name, data, splits, effort, {f"speed-{speed:g}": (counts[-1], speed) for speed in SPEEDS}
-    )
-    draw = partial(error_lines, zero="a guess of zero")
-    return [
-        Case(f"{name}/letters", against_letters, draw=partial(draw, x="training letters")),
-        Case(f"{name}/speeds", at_speeds, draw=partial(draw, x="speed of the test letters over that of training")),
-    ]
-
-
-def test_sets(labels: np.ndarray, test: Sequence[str], data: Trajectories, splits: int) -> list[list[str]]:
-    """The given test letters, then groups of the same size in which no letter is twice."""
-    groups = partition_labels(data, len(labels) // len(test))
-    return [list(test), *(group for group in groups if set(group) != set(test))][:splits]
-
-
 Settings = Mapping[str, tuple[int, float]]
 """By name, a number of training letters and a speed."""
+
+
+def against_letters(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
+    """Errors against the number of training letters; `name` is that of the data, `test` the first test letters."""
+    most = _training_letters(data, test)
+    counts = {f"{count}-letters": (count, 1.0) for count in (*(each for each in COUNTS if each < most), most)}
+    return _case(f"{name}/letters", data, test, counts, quick, "training letters")
+
+
+def at_speeds(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
+    """Errors at other speeds of the test letters, likewise, with all other letters for training."""
+    speeds = {f"speed-{speed:g}": (_training_letters(data, test), speed) for speed in SPEEDS}
+    return _case(f"{name}/speeds", data, test, speeds, quick, "speed of the test letters, times their own")
+
+
+def _training_letters(data: Trajectories, test: Sequence[str]) -> int:
+    return len(np.unique(data.trajectory)) - len(test)
+
+
+def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings, quick: bool, x: str) -> Case:
+    if not np.allclose(faster(data, 1.0).tau, data.tau, atol=1e-6):
+        raise InputError(
+            "tau is not that of the published two-link arm, whose torques at other speeds are to be predicted; "
+            "give letters of that arm, or leave --data out"
+        )
+    effort = QUICK if quick else Effort()
+    run = partial(measure, name.split("/")[0], data, test_sets(data, test, effort.splits), effort, settings)
+    return Case(name, run, draw=partial(error_lines, x=x, zero="a guess of zero"))
+
+
+def test_sets(data: Trajectories, test: Sequence[str], splits: int) -> list[list[str]]:
+    """The given test letters, then groups of as many, in which no letter is twice."""
+    parts = max(2, len(np.unique(data.trajectory)) // len(test))
+    groups = [group[: len(test)] for group in partition_labels(data, parts) if set(group) != set(test)]
+    return [list(test), *groups][:splits]
 
 
 def measure(

@@ -19,6 +19,7 @@ from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm import few_letters, learning_online
 from dln_jax.studies.arm.learning_online import CONDITIONS, Condition, closed_loop, drawn_letters, write, written_by
 from dln_jax.studies.arm.rivals import Rival
+from dln_jax.types import InputError
 
 EXACT = feed_forward(dynamics(two_link_arm().closed_form), learning_online.GAINS)
 
@@ -52,16 +53,20 @@ def test_references_at_another_speed_are_the_same_path(letters):
 
 def test_one_letter_identifies_the_arm_at_every_speed(letters, identified):
     fit = few_letters.fitted(identified, letters, ["s"], 1, 0)
-    for speed in few_letters.SPEEDS:
-        data = few_letters.faster(few_letters.select(letters, [2]), speed)
-        assert few_letters.torque_mse(identified, fit.parameters, data) < 1e-20
-    assert few_letters.share_outside(fit, data) > 0.5
+    at = {speed: few_letters.faster(few_letters.select(letters, [2]), speed) for speed in few_letters.SPEEDS}
+    assert max(few_letters.torque_mse(identified, fit.parameters, data) for data in at.values()) < 1e-20
+    assert few_letters.share_outside(fit, at[2.0]) > 0.5
+
+
+def test_torques_of_another_arm_are_refused(letters):
+    with pytest.raises(InputError, match="tau is not that of the published two-link arm"):
+        few_letters.at_speeds("mine", letters._replace(tau=1.1 * letters.tau), ["s"])
 
 
 def test_splits_have_the_given_test_letters_first_and_none_twice(letters):
     data = generators.characters(dt=0.2)
-    first, *others = few_letters.test_sets(data.label, ["e", "q", "v"], data, 4)
-    assert first == ["e", "q", "v"] and len(others) == 3
+    first, *others = few_letters.test_sets(data, ["e", "q", "v"], 4)
+    assert first == ["e", "q", "v"] and list(map(len, others)) == [3, 3, 3]
     assert len({letter for part in others for letter in part}) == sum(map(len, others))
 
 
