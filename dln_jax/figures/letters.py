@@ -70,7 +70,7 @@ def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
             if row == 0:
                 style.title(axes[row, column], f"letter {place + 1}: {letters[place]}")
         axes[row, 0].set_ylabel(
-            "\n".join(model.rsplit("-", 1)), fontsize=style.SMALL, rotation=0, ha="right", va="center"
+            "\n".join(model.replace("delan", "DeLaN").rsplit("-", 1)), fontsize=style.SMALL, rotation=0, ha="right", va="center"
         )
     _errors(below.subplots(), curves["errors"])
     return figure
@@ -99,6 +99,7 @@ def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None
     values = {model: 1e3 * np.asarray(runs, float) for model, runs in errors.items()}
     every = np.concatenate([each.ravel() for each in values.values()])
     top = 4 * every[np.isfinite(every)].max(initial=1.0)
+    axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
     places = 1 + np.arange(next(iter(values.values())).shape[1])
     for number, (model, each) in enumerate(values.items()):
         look: dict[str, Any] = {"color": style.colour(model), "markersize": 4}
@@ -114,6 +115,5 @@ def _errors(axis: Axes, errors: Mapping[str, Sequence[Sequence[float]]]) -> None
         axis.axhspan(top / 2, 2 * top, color="0.95", zorder=-1, linewidth=0)
         axis.text(1.0, top, " lost", transform=axis.get_yaxis_transform(), va="center", fontsize=style.SMALL)
         axis.set_ylim(top=2 * top)
-    axis.set(yscale="log", xlabel="letter, in the order of writing", ylabel="tip error, mm (rms)")
     axis.set_xticks(places)
     style.legend(axis, loc="center left", bbox_to_anchor=(1.0, 0.45))
