@@ -62,16 +62,16 @@ def written_letters(curves: Mapping[str, Any], *, title: str) -> Figure:
     shown = _shown(len(letters))
     figure = style.blank(height=0.78 * len(models) + 3.4)
     figure.suptitle(title, fontsize=style.TEXT)
-    above, below = np.ravel(figure.subfigures(2, 1, height_ratios=[0.78 * len(models) + 0.4, 3.0]))
+    grid = figure.add_gridspec(2, 1, height_ratios=[0.78 * len(models) + 0.4, 3.0])
+    above, below = (figure.add_subfigure(grid[row]) for row in range(2))
     axes = above.subplots(len(models), len(shown), squeeze=False)
     for row, model in enumerate(models):
         for column, place in enumerate(shown):
             _letter(axes[row, column], curves["wanted"][place], curves["paths"][model][place], style.colour(model))
             if row == 0:
                 style.title(axes[row, column], f"letter {place + 1}: {letters[place]}")
-        axes[row, 0].set_ylabel(
-            "\n".join(model.replace("delan", "DeLaN").rsplit("-", 1)), fontsize=style.SMALL, rotation=0, ha="right", va="center"
-        )
+        name = model.replace("delan", "DeLaN").rsplit("-", 1)
+        axes[row, 0].set_ylabel("\n".join(name), fontsize=style.SMALL, rotation=0, ha="right", va="center")
     _errors(below.subplots(), curves["errors"])
     return figure
 

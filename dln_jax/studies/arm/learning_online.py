@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.interpolate import CubicSpline
 
 from dln_jax.control import (
     Gains,
@@ -33,20 +32,16 @@ from dln_jax.control import (
 from dln_jax.control.tracking import feedback
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, from_arrays
-from dln_jax.data.splits import select
 from dln_jax.figures.letters import written_letters
 from dln_jax.learning.online import empty_replay, learn_online
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.model import Model, Parameters
 from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.studies.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
 from dln_jax.studies.arm.rivals import Rival, rivals
 from dln_jax.studies.case import Case, Findings
 from dln_jax.studies.report import Row
 
-RATE = 1000.0
-"""Hz, of the controller."""
-RECORDED = 25.0
-"""Hz, of the samples that are learned from, times the speed."""
 GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
 """N m/rad and N m s/rad."""
 LIMITS = np.array([25.0, 15.0])
@@ -114,16 +109,6 @@ def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
     return found
 
 
-class Motion(NamedTuple):
-    """A letter as the controller is given it."""
-
-    label: str
-    reference: Reference
-    """At the controller's rate; the arm stands still behind the letter, so that all letters have one length."""
-    samples: int
-    """Of the letter itself."""
-
-
 Law = Callable[[Parameters, Gains], Tracker]
 
 
@@ -161,13 +146,6 @@ def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Fi
     return Findings(rows, curves)
 
 
-def capacity(data: Trajectories, letters: int) -> int:
-    """Places for the recordings of any so many letters: one program for all conditions and seeds."""
-    starts = np.flatnonzero(np.diff(data.trajectory, prepend=-1))
-    seconds = np.maximum.reduceat(data.t, starts) - np.minimum.reduceat(data.t, starts)
-    return int(np.sort(np.ceil(RECORDED * seconds) + 1)[-letters:].sum())
-
-
 def written_by(
     drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int, places: int
 ) -> list[Written]:
@@ -190,28 +168,6 @@ def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
     rows.append(Row(case, "letters", float(len(every))))
     rows.append(Row(case, "share_saturated", float(np.mean([each.saturated for each in every]))))
     return rows
-
-
-def drawn_letters(data: Trajectories, count: int, seed: int, speed: float) -> list[Motion]:
-    """Different letters in an order that the seed draws."""
-    letters = np.unique(data.trajectory).tolist()
-    longest = max(len(reference(select(data, [index]), speed).q) for index in letters)
-    order = np.random.default_rng([seed, 2]).permutation(letters)[:count].tolist()
-    found = []
-    for index in order:
-        q, qd, qdd = reference(select(data, [index]), speed)
-        more = ((0, longest - len(q)), (0, 0))
-        padded = Reference(np.pad(q, more, mode="edge"), np.pad(qd, more), np.pad(qdd, more))
-        found.append(Motion(str(data.label[index]), padded, len(q)))
-    return found
-
-
-def reference(letter: Trajectories, speed: float = 1.0) -> Reference:
-    """A cubic spline through the angles of a letter, and its derivatives, at the controller's rate."""
-    seconds = letter.t - letter.t[0]
-    spline = CubicSpline(seconds, letter.q)
-    t = speed * np.arange(int(seconds[-1] / speed * RATE) + 1) / RATE
-    return Reference(spline(t), speed * spline(t, 1), speed**2 * spline(t, 2))
 
 
 class Driven(NamedTuple):

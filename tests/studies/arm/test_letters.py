@@ -17,7 +17,8 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.studies.arm import few_letters, learning_online
-from dln_jax.studies.arm.learning_online import CONDITIONS, Condition, closed_loop, drawn_letters, write, written_by
+from dln_jax.studies.arm.learning_online import CONDITIONS, Condition, closed_loop, write, written_by
+from dln_jax.studies.arm.motions import drawn_letters, reference
 from dln_jax.studies.arm.rivals import Rival
 from dln_jax.types import InputError
 
@@ -46,7 +47,7 @@ def test_dynamic_torque_grows_with_the_square_of_speed(letters):
 
 def test_references_at_another_speed_are_the_same_path(letters):
     letter = few_letters.select(letters, [0])
-    slow, fast = (learning_online.reference(letter, speed) for speed in (1.0, 2.0))
+    slow, fast = (reference(letter, speed) for speed in (1.0, 2.0))
     for power, (one, other) in enumerate(zip(slow, fast, strict=True)):
         np.testing.assert_allclose(other, 2.0**power * one[::2][: len(other)], atol=1e-10)
 
