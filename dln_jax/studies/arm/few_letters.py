@@ -82,7 +82,7 @@ def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings
     if not np.allclose(faster(data, 1.0).tau, data.tau, atol=1e-6):
         raise InputError(
             "tau is not that of the published two-link arm, whose torques at other speeds are to be predicted; "
-            "give letters of that arm, or leave --data out"
+            "give letters of that arm, or leave letters and speeds out (--only published,online)"
         )
     effort = QUICK if quick else Effort()
     run = partial(measure, name.split("/")[0], data, test_sets(data, test, effort.splits), effort, settings)
