@@ -1,7 +1,7 @@
 """From an energy to a controller, known or learned: tracking, regulators, swing-up, and the closed loop around them."""
 
 from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
-from dln_jax.control.closed_loop import Controller, Laboratory, Run, simulate, stateless, with_differences
+from dln_jax.control.closed_loop import Controller, Laboratory, Run, following, simulate, stateless, with_differences
 from dln_jax.control.delays import with_prediction
 from dln_jax.control.energy_shaping import (
     EnergyGains,
@@ -57,6 +57,7 @@ __all__ = [
     "feed_forward",
     "field_of",
     "first_plan",
+    "following",
     "friction_compensation",
     "gravity_compensation",
     "holding_controls",

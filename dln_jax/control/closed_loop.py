@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from dln_jax.control.finite import where_finite
 from dln_jax.control.state_space import Field
-from dln_jax.control.tracking import limited
+from dln_jax.control.tracking import Reference, Tracker, limited
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import InputError, require_positive
 
@@ -65,6 +65,29 @@ class Run(NamedTuple):
 def stateless(law: Callable[[Array], Array]) -> Controller:
     """A controller without a memory: y -> u."""
     return Controller((), lambda memory, t, y: (memory, law(y)))
+
+
+def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
+    """A law that follows a recorded reference, of measurements y = (q, qd).
+
+    The reference is the memory of the controller, so that runs along references of one length share a program.
+
+    Args:
+        law: such as `tracking.feed_forward`.
+        reference: q, qd and qdd [N, d] at the times k / rate; the last row applies to all later times.
+        rate: Hz.
+
+    Raises:
+        InputError: a rate that is not positive.
+    """
+    require_positive(rate=rate)
+
+    def act(reference: Reference, t: Array, y: Array) -> tuple[Reference, Array]:
+        number = jnp.clip(jnp.round(t * rate).astype(int), 0, len(reference.q) - 1)
+        q, qd = jnp.split(y, 2)
+        return reference, law(q, qd, Reference(*(jnp.asarray(each)[number] for each in reference)))
+
+    return Controller(reference, act)
 
 
 def with_differences(

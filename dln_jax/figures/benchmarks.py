@@ -89,7 +89,7 @@ def cost_points(
     figure, [[axis]] = style.figure(height=4.0)
     models, variants = (list(dict.fromkeys(name.split(", ")[half] for name in places)) for half in range(2))
     colours = {model: style.colour(model) for model in models}
-    ground = _exact_ground([height for _, height in places.values()], exact)
+    ground = exact_ground([height for _, height in places.values()], exact)
     drawn = {name: (place, max(height, ground)) for name, (place, height) in places.items()}
     ends: dict[str, tuple[float, float]] = {}
     for name, (place, height) in drawn.items():
@@ -106,7 +106,7 @@ def cost_points(
     axis.set(xlabel=x, ylabel=y)
     style.title(axis, title)
     if exact is not None:
-        _exact_band(axis, ground)
+        exact_band(axis, ground)
     style.legend(figure, *axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     label_ends(axis, ends, colours=colours)
     return figure
@@ -156,7 +156,7 @@ def error_against_time(curves: Mapping[str, Line]) -> Figure:
     parts = {name: name.split("/") for name in curves}
     datasets = list(dict.fromkeys(part[1] for part in parts.values()))
     figure, axes = style.figure(len(datasets), 1, height=2.5 * len(datasets) + 0.6, sharex=True)
-    ground = _exact_ground([error for _, errors in curves.values() for error in errors], EXACT)
+    ground = exact_ground([error for _, errors in curves.values() for error in errors], EXACT)
     for axis, dataset in zip(axes[:, 0], datasets, strict=True):
         front, ends, colours = [], {}, {}
         for name, (seconds, errors) in curves.items():
@@ -175,7 +175,7 @@ def error_against_time(curves: Mapping[str, Line]) -> Figure:
         _front(axis, front)
         axis.set(xscale="log", yscale="log", ylabel="test torque MSE, (N m)²")
         style.title(axis, dataset)
-        _exact_band(axis, ground)
+        exact_band(axis, ground)
         if axis is axes[0, 0]:
             for dash, face, label in (("-", "0.4", "Gauss-Newton, or one solve"), ("--", "white", "Adam")):
                 axis.plot([], [], dash, marker="o", color="0.4", markerfacecolor=face, label=label)
@@ -211,7 +211,7 @@ def _front(axis: Axes, points: list[tuple[float, float]]) -> None:
     axis.step(places, lowest, where="post", color="0.85", linewidth=6, zorder=0, label=FRONT)
 
 
-def _exact_ground(heights: Sequence[float], exact: float | None) -> float:
+def exact_ground(heights: Sequence[float], exact: float | None) -> float:
     """Where exact heights are drawn: two decades below the least of the others."""
     if exact is None:
         return 0.0
@@ -219,7 +219,7 @@ def _exact_ground(heights: Sequence[float], exact: float | None) -> float:
     return 1e-2 * min(inexact, default=1.0)
 
 
-def _exact_band(axis: Axes, ground: float) -> None:
+def exact_band(axis: Axes, ground: float) -> None:
     """Shades the strip around the ground, and names it in the place of the ticks that would lie in it."""
     bottom, top = ground / 10, ground * 10
     axis.axhspan(bottom, top, color="0.95", zorder=-1, linewidth=0)

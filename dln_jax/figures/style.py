@@ -32,13 +32,15 @@ MODELS: dict[str, tuple[str, str]] = {
     "black-box-hnn": (ORANGE, "v"),
     "trigonometric": (GREEN, "D"),
     "learned-tree": ("#117733", "d"),
+    "identified-arm": (GREEN, "D"),
     "feed-forward": (PURPLE, "X"),
     "separable-hnn": ("#B2182B", "^"),
     "pairwise-hnn": ("#882255", "P"),
     "polynomial-hamiltonian": ("#44AA99", "D"),
     "phase-network": ("#7E57A6", "X"),
     "differential-network": ("#332288", "o"),
-    **dict.fromkeys((TRUTH, "plant"), ("black", ".")),
+    **dict.fromkeys((TRUTH, "plant", "exact-model"), ("black", ".")),
+    "feedback-alone": (REFERENCE, "x"),
     "published": (REFERENCE, "x"),
 }
 """Colour and marker by name: Lagrangians are blue, Hamiltonians warm, linear models and trees green, others purple."""

@@ -25,6 +25,7 @@ from dln_jax.learning.growth import grow
 from dln_jax.learning.kernel import choose_kernel, fit_kernel
 from dln_jax.learning.linear import choose_degrees, fit_linear
 from dln_jax.learning.objectives import BOTH_WAYS, CANONICAL, FORWARD, TORQUE, Objective, objective_of
+from dln_jax.learning.online import empty_replay, learn_online, make_linear_refit, make_refit
 from dln_jax.learning.rates import match_linear
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "choose_degrees",
     "choose_kernel",
     "dynamics",
+    "empty_replay",
     "fit",
     "fit_friction",
     "fit_kernel",
@@ -53,6 +55,9 @@ __all__ = [
     "functions",
     "grow",
     "identity",
+    "learn_online",
+    "make_linear_refit",
+    "make_refit",
     "match_linear",
     "measured_motions",
     "motions",

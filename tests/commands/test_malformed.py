@@ -610,7 +610,7 @@ SCRIPTS = {
     "diffnet_report": (diffnet_report,),
     "simulate": (simulate,),
     "hnn_table": (hnn_table, "--tasks", "spring"),
-    "delan_report": (delan_report, "--data", "data.npz", "--test", "4"),
+    "delan_report": (delan_report, "--only", "published", "--data", "data.npz", "--test", "4"),
     "uncertainty_report": (uncertainty_report, "--splits", "1"),
 }
 

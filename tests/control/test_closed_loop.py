@@ -5,7 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Controller, Laboratory, simulate, stateless, with_differences
+from dln_jax.control import (
+    Controller,
+    Gains,
+    Laboratory,
+    Reference,
+    feed_forward,
+    field_of,
+    following,
+    simulate,
+    stateless,
+    with_differences,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes.pendulum import pendulum
 from dln_jax.types import InputError
 
 FIELD = lambda x, u: jnp.concatenate([x[1:], u])  # noqa: E731  a mass of 1 kg
@@ -74,3 +87,27 @@ def test_many_runs_are_one_program():
 def test_settings_out_of_range_are_one_line(settings, message):
     with pytest.raises(InputError, match=message):
         simulate(FIELD, COUNTING, [0.0, 0.0], **{**SETTINGS, **settings})
+
+
+def test_a_reference_of_held_accelerations_is_followed_exactly():
+    samples = 20
+    qdd = np.linspace(-1.0, 2.0, samples)[:, None]
+    qd = 0.01 * np.concatenate([np.zeros((1, 1)), np.cumsum(qdd, axis=0)[:-1]])
+    q = np.concatenate([np.zeros((1, 1)), np.cumsum(0.01 * qd + 0.5e-4 * qdd, axis=0)[:-1]])
+    law = lambda q, qd, wanted: wanted.qdd  # noqa: E731  the mass of 1 kg
+    run = simulate(FIELD, following(law, Reference(q, qd, qdd), rate=100.0), [0.0, 0.0], **SETTINGS)
+    np.testing.assert_allclose(run.x[:-1], np.hstack([q, qd]), atol=1e-14)
+
+
+def test_feed_forward_of_the_exact_model_errs_by_the_hold_alone():
+    """Torques held for a period lag by half of it: with the exact model the error is of first order in the period."""
+    plant = dynamics(pendulum().closed_form)
+    law, errors = feed_forward(plant, Gains(np.zeros(1), np.zeros(1))), []
+    for rate in (100.0, 200.0, 400.0):
+        t = np.arange(round(0.5 * rate) + 1)[:, None] / rate
+        wanted = Reference(np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t))
+        run = simulate(
+            field_of(plant), following(law, wanted, rate=rate), [0.0, 3.0], seconds=0.5, rate=rate, controls=1
+        )
+        errors.append(np.abs(np.asarray(run.x[:, 0]) - wanted.q[:, 0]).max())
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 1.0, atol=0.05)

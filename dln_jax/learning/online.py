@@ -1,0 +1,206 @@
+"""Learning while a robot works: samples accumulate in a replay, and a model is refitted to all of them.
+
+    for visit in learn_online(references, drive, refit, model.init(key), empty_replay(2000, 2)): ...
+
+A replay has a fixed capacity and empty places have weight zero, so that every refit of a growing data set is one
+compiled program. The refit minimises
+
+    sum over samples n and joints j of w_n (tau_hat_nj - tau_nj)² / variance of tau_j,   w_n = 1 for fitted samples
+
+with tau_hat the inverse dynamics of the model. Learning online with the model in the loop is the second experiment of
+Lutter, Ritter and Peters (2019, arXiv:1907.04490).
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.learning.engine.problem import better_of, no_best
+from dln_jax.learning.linear import design, unravelled
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers import least_squares, levenberg_marquardt
+from dln_jax.types import InputError, require_positive
+
+
+class Replay(NamedTuple):
+    """Samples recorded so far, in arrays of fixed size."""
+
+    q: Float[Any, "N d"]
+    qd: Float[Any, "N d"]
+    qdd: Float[Any, "N d"]
+    tau: Float[Any, "N d"]
+    fitted: Float[Any, " N"]
+    """1 for a sample that is fitted, else 0."""
+    held_out: Float[Any, " N"]
+    """1 for a sample that selects among the iterates of a refit, else 0."""
+
+    @property
+    def recorded(self) -> int:
+        """How many samples there are, fitted or held out."""
+        return int(np.count_nonzero(np.asarray(self.fitted) + np.asarray(self.held_out)))
+
+
+def empty_replay(capacity: int, d: int) -> Replay:
+    """A replay with places for `capacity` samples of d joints.
+
+    Raises:
+        InputError: a size that is not positive.
+    """
+    require_positive(capacity=capacity, d=d)
+    motion, weight = np.zeros((capacity, d)), np.zeros(capacity)
+    return Replay(motion, motion, motion, motion, weight, weight)
+
+
+def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
+    """The replay with one more recording, in its next empty places.
+
+    Args:
+        replay: what was recorded before.
+        q, qd, qdd, tau: the recording [n, d], in order of time.
+        blocks: of equal length that the recording is cut into; one in its middle is held out, unless samples are fewer.
+
+    Raises:
+        InputError: numbers that are not finite, arrays of other shapes, or more samples than places.
+    """
+    require_positive(blocks=blocks)
+    used, arrays = replay.recorded, tuple(np.asarray(each, float) for each in (q, qd, qdd, tau))
+    capacity, d = np.shape(replay.q)
+    samples = len(arrays[0])
+    if any(each.shape != (samples, d) for each in arrays):
+        shapes = ", ".join(str(each.shape) for each in arrays)
+        raise InputError(f"q, qd, qdd and tau have shapes {shapes}; expected the same [n, {d}] for each")
+    if not all(np.isfinite(each).all() for each in arrays):
+        raise InputError("the recording has numbers that are not finite; leave those samples out")
+    if used + samples > capacity:
+        raise InputError(f"the replay has {capacity - used} empty places for {samples} samples; make it larger")
+    places = slice(used, used + samples)
+    held_out = (np.arange(samples) * blocks // max(samples, 1) == blocks // 2) & (samples >= blocks > 1)
+    rows = (*arrays, 1.0 - held_out, held_out.astype(float))
+    return Replay(*(_with_rows(old, places, new) for old, new in zip(replay, rows, strict=True)))
+
+
+def _with_rows(array: Any, places: slice, rows: np.ndarray) -> np.ndarray:
+    copy = np.array(array)
+    copy[places] = rows
+    return copy
+
+
+Refit = Callable[[Parameters, Replay], Parameters]
+"""(parameters to start from, replay) -> parameters of the model fitted to the replay."""
+
+
+def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
+    """Refits by Levenberg-Marquardt in float64: one compiled program for all replays of one capacity.
+
+    Of the parameters after each round of iterations, the refit returns those with the lowest error on the held-out
+    samples, or on the fitted ones if none are held out.
+
+    Args:
+        model: parameters and energies in float64.
+        rounds: after each of which the parameters are judged.
+        iterations: of Levenberg-Marquardt in a round.
+
+    Raises:
+        InputError: a number that is not positive, or a model that is not float64.
+    """
+    require_positive(rounds=rounds, iterations=iterations)
+
+    def residual(parameters: Parameters, q: Array, qd: Array, qdd: Array, tau: Array, factor: Array) -> Array:
+        return (dynamics(model.energies(parameters)).inverse_dynamics(q, qd, qdd) - tau) * factor
+
+    @partial(jax.jit, compiler_options=quick_compilation())
+    def refit(parameters: Parameters, replay: Replay) -> Parameters:
+        unit = _scale(replay)
+        fitted, held_out = (jnp.sqrt(each)[:, None] / unit for each in (replay.fitted, replay.held_out))
+        judged = jnp.where(jnp.sum(replay.held_out) > 0, held_out, fitted)
+        samples = replay.q, replay.qd, replay.qdd, replay.tau
+
+        def one_round(carry: Any, number: Array) -> tuple[Any, None]:
+            state, best = carry
+            state = levenberg_marquardt.run(residual, state, (*samples, fitted), iterations)
+            errors = jax.vmap(residual, in_axes=(None, 0, 0, 0, 0, 0))(state.parameters, *samples, judged)
+            return (state, better_of(best, state.parameters, jnp.sum(errors**2), number)), None
+
+        start = levenberg_marquardt.init(parameters), no_best(parameters)
+        numbers = jnp.arange(1, rounds + 1, dtype=jnp.int32)
+        return jax.lax.scan(one_round, start, numbers)[0][1].parameters
+
+    return refit
+
+
+def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
+    """Refits a model that is linear in its parameters by one least-squares problem on all samples.
+
+    The parameters given are not used. Combinations of parameters that the replay leaves undetermined are zero (the
+    shortest solution, see `solvers.least_squares`).
+
+    Args:
+        model: linear in its parameters, such as `models.planar_chain` or `models.rigid_tree`.
+        negligible: as for `learning.linear.fit_linear`.
+    """
+    columns_of = design(model)
+
+    def refit(parameters: Parameters, replay: Replay) -> Parameters:
+        zero = jax.tree.map(jnp.zeros_like, parameters)
+        columns, _ = columns_of(zero, *(jnp.asarray(each) for each in replay[:3]))
+        used = np.asarray(replay.fitted + replay.held_out) > 0
+        unit = np.asarray(_scale(replay))
+        left = (np.asarray(columns)[used] / unit[:, None]).reshape(-1, np.shape(columns)[-1])
+        right = (np.asarray(replay.tau)[used] / unit).ravel()
+        return unravelled(least_squares.solve(left, right, negligible=negligible).x, parameters)
+
+    return refit
+
+
+def _scale(replay: Replay) -> Float[Array, " d"]:
+    """Standard deviation of each joint's torque in the replay; 1 for a torque that does not vary."""
+    weight = (replay.fitted + replay.held_out)[:, None]
+    count = jnp.maximum(jnp.sum(weight), 1.0)
+    mean = jnp.sum(weight * replay.tau, axis=0) / count
+    deviation = jnp.sqrt(jnp.sum(weight * (replay.tau - mean) ** 2, axis=0) / count)
+    return jnp.where(deviation > 0, deviation, 1.0)
+
+
+class Visit(NamedTuple):
+    """One reference, driven with the model as it was before, and what was learned from it."""
+
+    outcome: Any
+    """What the robot did."""
+    parameters: Parameters
+    """After the refit."""
+    replay: Replay
+
+
+def learn_online(
+    references: Iterable[Any],
+    drive: Callable[[Parameters, Any], tuple[Any, tuple[Any, Any, Any, Any]]],
+    refit: Refit,
+    parameters: Parameters,
+    replay: Replay,
+) -> Iterator[Visit]:
+    """Alternates driving the robot along a reference and refitting the model to all samples recorded so far.
+
+    Args:
+        references: in the order in which they are driven; what one is only `drive` knows.
+        drive: (parameters, reference) -> what happened, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
+        refit: from `make_refit` or `make_linear_refit`.
+        parameters: that drive the first reference.
+        replay: with places for all recordings.
+
+    Raises:
+        InputError: a recording that `appended` refuses.
+    """
+    for reference in references:
+        outcome, recording = drive(parameters, reference)
+        if len(recording[0]):
+            replay = appended(replay, *recording)
+            parameters = refit(parameters, replay)
+        yield Visit(outcome, parameters, replay)

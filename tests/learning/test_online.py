@@ -1,0 +1,139 @@
+"""Learning from a growing record: one program for all sizes, exact where the model is linear, and refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.datasets import generators
+from dln_jax.learning.online import (
+    Replay,
+    appended,
+    empty_replay,
+    learn_online,
+    make_linear_refit,
+    make_refit,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.lagrangian import make_delan
+from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError
+
+NEEDS = two_link_arm().needs
+BOUNDS = {"position_bound": 1.0, "rate_bound": 1.0, "acceleration_bound": 3.0}
+
+
+def recordings(count, samples=20):
+    data = generators.uniform(two_link_arm(), samples=count * samples, **BOUNDS)
+    arrays = (data.q, data.qd, data.qdd, data.tau)
+    return [tuple(each[n * samples : (n + 1) * samples] for each in arrays) for n in range(count)]
+
+
+def grown(capacity, parts):
+    replay = empty_replay(capacity, 2)
+    for part in parts:
+        replay = appended(replay, *part)
+    return replay
+
+
+def torque_error(model, parameters, part):
+    q, qd, qdd, tau = part
+    torque = jax.jit(lambda p, *x: jax.vmap(dynamics(model.energies(p)).inverse_dynamics)(*x))
+    return float(np.abs(np.asarray(torque(parameters, q, qd, qdd)) - tau).max())
+
+
+@pytest.fixture(scope="module")
+def network():
+    return make_delan(NEEDS, width=4, depth=1, dtype=jnp.float64)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return make_planar_chain(NEEDS, symmetric=False)
+
+
+@pytest.fixture(scope="module")
+def refit(network):
+    return make_refit(network, rounds=3, iterations=4)
+
+
+def test_growing_data_share_one_program_and_improve_the_model(network, refit):
+    first, second, third, test = recordings(4)
+    parameters = jax.jit(network.init)(jax.random.key(0))
+    replay, errors = empty_replay(100, 2), [torque_error(network, parameters, test)]
+    for part in (first, second, third):
+        replay = appended(replay, *part)
+        parameters = refit(parameters, replay)
+        errors.append(torque_error(network, parameters, test))
+    assert replay.recorded == 60
+    assert refit._cache_size() == 1
+    assert errors[-1] < 0.05 * errors[0]
+
+
+def test_contents_of_empty_places_have_no_effect(network, refit):
+    replay = grown(100, recordings(2))
+    rows = np.arange(100)[:, None] >= replay.recorded
+    other = Replay(*(np.where(rows, 0.3, each) for each in replay[:4]), replay.fitted, replay.held_out)
+    start = jax.jit(network.init)(jax.random.key(1))
+    for one, two in zip(*(jax.tree.leaves(refit(start, each)) for each in (replay, other)), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-8)
+
+
+def test_the_refit_returns_the_iterate_with_the_lowest_held_out_error(chain):
+    """Where held-out torques contradict the fitted ones, more rounds never make the held-out error larger."""
+    replay = grown(100, recordings(3, samples=10))
+    start = chain.init(jax.random.key(0))
+    held_out = np.flatnonzero(replay.held_out)
+    replay.tau[held_out] *= 0.5
+
+    def error(rounds):
+        parameters = make_refit(chain, rounds=rounds, iterations=1)(start, replay)
+        found = jax.vmap(dynamics(chain.energies(parameters)).inverse_dynamics)(*(x[held_out] for x in replay[:3]))
+        scale = replay.tau[: replay.recorded].std(axis=0)
+        return float(np.sum(((np.asarray(found) - replay.tau[held_out]) / scale) ** 2))
+
+    few, many = error(1), error(4)
+    assert many <= few * (1 + 1e-9)
+
+
+def test_a_linear_model_is_exact_after_one_recording():
+    (first, second, test), model = recordings(3), make_planar_chain(NEEDS._replace(friction=True), symmetric=False)
+    refit, replay, parameters = make_linear_refit(model), empty_replay(60, 2), model.init(jax.random.key(0))
+    assert torque_error(model, parameters, test) > 1
+    for part in (first, second):
+        replay = appended(replay, *part)
+        parameters = refit(parameters, replay)
+        assert torque_error(model, parameters, test) < 1e-11
+    np.testing.assert_allclose(parameters.viscous, 0, atol=1e-11)
+
+
+def test_one_block_of_each_recording_is_held_out():
+    replay = grown(50, recordings(2))
+    np.testing.assert_array_equal(np.flatnonzero(replay.held_out), [10, 11, 30, 31])
+    np.testing.assert_array_equal(replay.fitted[:40] + replay.held_out[:40], 1)
+    assert not replay.fitted[40:].any() and not replay.held_out[40:].any()
+    assert not appended(empty_replay(5, 2), *(x[:3] for x in recordings(1)[0])).held_out.any()
+
+
+def test_recordings_that_do_not_fit_are_refused():
+    (part,), replay = recordings(1), empty_replay(30, 2)
+    with pytest.raises(InputError, match="10 empty places for 20 samples"):
+        appended(appended(replay, *part), *part)
+    with pytest.raises(InputError, match="not finite"):
+        appended(replay, *part[:3], np.full_like(part[3], np.nan))
+    with pytest.raises(InputError, match=r"\(20, 1\).*expected the same \[n, 2\]"):
+        appended(replay, *part[:3], part[3][:, :1])
+    with pytest.raises(InputError, match="capacity"):
+        empty_replay(0, 2)
+
+
+def test_each_reference_is_driven_with_what_was_learned_before():
+    (part,) = recordings(1, samples=5)
+    nothing = tuple(each[:0] for each in part)
+    drive = lambda parameters, reference: (parameters, part if reference == "long" else nothing)  # noqa: E731
+    refit = lambda parameters, replay: parameters + replay.recorded  # noqa: E731
+    visits = list(learn_online(["long", "short", "long"], drive, refit, 0, empty_replay(12, 2)))
+    assert [visit.outcome for visit in visits] == [0, 5, 5]
+    assert [visit.parameters for visit in visits] == [5, 5, 15]
+    assert visits[-1].replay.recorded == 10
