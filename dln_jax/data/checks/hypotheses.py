@@ -6,6 +6,7 @@ robot's file gives a narrower one (`tree`). One fault at a time is taken, the be
 with the log repaired.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from jaxtyping import Float
 
 from dln_jax.data.checks import evidence
 from dln_jax.data.checks.delays import away_from_ends, vertex
-from dln_jax.data.checks.energies import SCALES, covariance, friction_columns
+from dln_jax.data.checks.energies import SCALES, Parts, covariances, friction_columns
 from dln_jax.data.checks.evidence import Explanation, Prior
 from dln_jax.data.schema import Trajectories
 
@@ -23,7 +24,7 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Of the blocks, which have to agree."""
 BETTER = 0.8
-"""Of the unexplained variance, below which a sign or an order has to bring it."""
+"""Of the unexplained variance of the joints concerned, below which a sign or an order has to bring it."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
@@ -156,8 +157,8 @@ def any_energy(joints: tuple[str, ...]) -> Build:
     def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
         del gravity  # any
         sizes = _sizes(states[2], tau)
-        parts = covariance(states, states, joints, sizes)
-        return Prior(np.zeros(tau.size), [parts.kinetic, parts.potential], friction(states[1]))
+        parts = [part for each in covariances(states, states, joints, sizes) for part in each]
+        return Prior(np.zeros(tau.size), parts, friction(states[1]))
 
     return build
 
@@ -214,7 +215,7 @@ def _better(
     for trial in chosen:
         explained = _explained(trial, build)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
-        if decisive(now, explained, limit):
+        if decisive(now, explained, limit, _concerned(log, trial)):
             found.append((float(explained.densities.sum()), trial, explained))
     if not found:
         return None
@@ -225,24 +226,37 @@ def _better(
 def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
     """The few of many faults that are likelier than the log, by fewer samples and rough weights."""
 
-    def density(trial: Log) -> float:
-        few = -(-len(trial.rows) * len(trial.order) // SCANNED)
-        rough = trial._replace(rows=trial.rows[::few])
-        return float(_explained(rough, build, iterations=ROUGHLY).densities.sum())
-
     if not trials:
         return []
+    few = -(-len(log.rows) * len(log.order) // SCANNED)
+    log = log._replace(rows=log.rows[::few])
+    states = log.states()
+
+    @functools.cache
+    def prior(order: tuple[int, ...]) -> Prior:
+        return build(states, log._replace(order=order).torques(), log.gravity)
+
+    def density(trial: Log) -> float:
+        tau = trial._replace(rows=log.rows).torques()
+        return float(evidence.explain(prior(trial.order), tau, iterations=ROUGHLY).densities.sum())
+
     now, densities = density(log), np.array([density(trial) for trial in trials])
     return [trials[place] for place in np.argsort(densities)[::-1][:CANDIDATES] if densities[place] > now]
 
 
-def decisive(now: Explanation, other: Explanation, limit: float) -> bool:
-    """Whether another explanation is better beyond doubt, and by so much that it matters."""
+def _concerned(log: Log, trial: Log) -> np.ndarray:
+    """Joints whose torques have another sign or column in a trial; all of them if it is about time, or the base."""
+    concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
+    return concerned if concerned.any() else np.ones(len(concerned), bool)
+
+
+def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndarray) -> bool:
+    """Whether another explanation is better beyond doubt, and by so much that it matters to these joints."""
     gains = other.densities - now.densities
     return bool(
         gains.sum() > DECISIVE
         and np.mean(gains > 0) >= MOST_BLOCKS
-        and other.unexplained.mean() < limit * now.unexplained.mean()
+        and other.unexplained[:, joints].mean() < limit * now.unexplained[:, joints].mean()
     )
 
 
@@ -258,13 +272,21 @@ def _inertias(log: Log, now: Explanation) -> float:
         push[:, joint] = 1.0
         pushed = (chosen, np.zeros_like(chosen), push)
         sizes = _sizes(qdd, tau)
-        with_log = covariance(pushed, (q, qd, qdd), joints, sizes).kinetic
-        alone = covariance(pushed, pushed, joints, sizes).kinetic
-        mean_with = now.weights[0] * with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
-        variance = now.weights[0] * alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
+        with_log = _kinetic(now, covariances(pushed, (q, qd, qdd), joints, sizes))
+        alone = _kinetic(now, covariances(pushed, pushed, joints, sizes))
+        mean_with = with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
+        variance = alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
         variance = max(float(variance - mean_with @ now.inverse @ mean_with), 1e-12 * float(variance))
         total += float(mean_with @ now.pull) / np.sqrt(variance)
     return total / np.sqrt(d)
+
+
+def _kinetic(now: Explanation, parts: list[Parts]) -> np.ndarray:
+    """Covariance of the torques of all kinetic energies, with their weights."""
+    total = np.zeros_like(parts[0].kinetic)
+    for weight, each in zip(now.weights[::2], parts, strict=False):
+        total += weight * each.kinetic
+    return total
 
 
 def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...]:
