@@ -24,7 +24,8 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Of the blocks, which have to agree."""
 BETTER = 0.8
-"""Of the unexplained variance of the joints concerned, below which a sign or an order has to bring it."""
+"""Of the unexplained variance, below which a sign or an order has to bring it: with a robot, of all joints, which its
+parameters bind together; without one, of those whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
@@ -128,7 +129,8 @@ def examine_torques(
         build: of priors.
         farthest: samples of delay that are tried.
         equations: that are taken, n d.
-        ambiguous: whether the prior allows negative inertias, so that the sign of all torques is to be found.
+        ambiguous: whether the prior is that of any robot: it allows negative inertias, so that the sign of all torques
+            is to be found, and binds joints together so little that a fault is judged by the joints that it concerns.
         faults: whether faults are looked for at all.
         others: more faults, as logs without them.
     """
@@ -142,7 +144,7 @@ def examine_torques(
     first = now = _explained(log, build)
     loss, likely = _late(log, build, now, farthest)
     for _ in range(MOST_FAULTS if faults else 0):
-        better = _better(log, build, now, farthest, others)
+        better = _better(log, build, now, farthest, others, alone=ambiguous)
         if better is None:
             break
         log, now = better
@@ -195,9 +197,9 @@ def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.n
 
 
 def _better(
-    log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]]
+    log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]], *, alone: bool
 ) -> tuple[Log, Explanation] | None:
-    """The log without its likeliest fault, if that is beyond doubt."""
+    """The log without its likeliest fault, if that is beyond doubt; `alone`: judged by the joints that it concerns."""
     d = len(log.order)
     flips = [log._replace(signs=np.where(np.arange(d) == joint, -log.signs, log.signs)) for joint in range(d)]
     exchanges = []
@@ -215,7 +217,7 @@ def _better(
     for trial in chosen:
         explained = _explained(trial, build)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
-        if decisive(now, explained, limit, _concerned(log, trial)):
+        if decisive(now, explained, limit, _concerned(log, trial) if alone else np.ones(d, bool)):
             found.append((float(explained.densities.sum()), trial, explained))
     if not found:
         return None
