@@ -17,7 +17,7 @@ import tyro
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
-from dln_jax.data.schema import needs_from_text
+from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.files import in_words, is_file, matches, read_json, write_json
 from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform

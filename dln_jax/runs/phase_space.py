@@ -25,7 +25,7 @@ from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, Sing
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, needs_from_option
 from dln_jax.command_line.scaled import mesh_of
-from dln_jax.data.schema import needs_from_json
+from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
 from dln_jax.figures import animations
 from dln_jax.figures.style import TRUTH

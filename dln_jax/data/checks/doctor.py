@@ -7,8 +7,9 @@ import numpy as np
 from dln_jax.data.checks.channels import check_channels
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.findings import Finding, told
-from dln_jax.data.checks.hypotheses import Torques, any_energy, examine_torques
+from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.recording import Recording, as_recording
+from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.checks.times import check_times
 from dln_jax.data.checks.torques import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
