@@ -10,6 +10,7 @@ import numpy as np
 from dln_jax.command_line.arguments import Unstated, refuse_given
 from dln_jax.data.checks import quick
 from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
@@ -99,13 +100,21 @@ def fitted_torque(found: Smoothed | None) -> str:
     return f"torques low-passed at {found.cutoff:.3g} Hz (measured ones scatter more)"
 
 
-def checked(given: Checked, data: Trajectories, path: Path, *, without: Collection[str] = ()) -> list[str]:
+def checked(
+    given: Checked,
+    data: Trajectories,
+    path: Path,
+    *,
+    robot: Robot | None = None,
+    without: Collection[str] = (),
+) -> list[str]:
     """What the quick part of `check_data` finds, a line each; none where nothing is found.
 
     Args:
         given: options; with a cut-off, what concerns the rates of the file only is left out.
         data: as they are in the file.
         path: of the file.
+        robot: whose file the log is compared with, if there is one.
         without: names of checks that say nothing to this command.
 
     Raises:
@@ -113,7 +122,7 @@ def checked(given: Checked, data: Trajectories, path: Path, *, without: Collecti
     """
     filtered = isinstance(given, Filtered) and given.cutoff is not None
     settled = {*without, *(FILTERED if filtered else ())}
-    found = [finding for finding in quick(data) if finding.check not in settled]
+    found = [finding for finding in quick(data, robot) if finding.check not in settled]
     if not found:
         return []
     more = f"python -m scripts.check_data --data {path}"

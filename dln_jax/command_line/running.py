@@ -17,7 +17,7 @@ from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
 from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
 from dln_jax.command_line.stored_arguments import with_stored_arguments, write_config
-from dln_jax.data.schema import needs_from_text
+from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform
 from dln_jax.scale.signs import USUAL, Limits

@@ -3,7 +3,8 @@
 Looks at rates, gaps and the order of times, units, signs, qd and qdd against q, delay between q and tau, saturation,
 steps of encoders, noise, unexcited joints and friction; with --robot also at gravity, gears, the order and limits of
 joints, and how well the motions determine the robot's parameters. Prints one page; the folder gets it as page.txt, the
-findings as findings.json, and a figure: spectra and cut-off, delay, and torque against velocity.
+findings as findings.json, and a figure: spectra and cut-off, delay, and torque against velocity. The exit status is 1
+if an error was found, and 0 if there are only warnings and notes.
 """
 
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ class Arguments(Folder, Drawn, Logged):
 
 
 def main(given: Arguments) -> None:
-    """Examines, prints and writes."""
+    """Examines, prints and writes; exits with status 1 if an error was found."""
     recording = read(given.data, rate=given.rate, units=given.units)
     if given.robot is None:
         refuse_given(given, ["hold"], "for joints of --robot")
@@ -51,6 +52,8 @@ def main(given: Arguments) -> None:
         if given.figures:
             write_figure(folder / "log.png", log_figure(examined))
         print(f"folder: {folder}")
+    if any(finding.severity == "error" for finding in examined.findings):
+        raise SystemExit(1)
 
 
 def metrics(examined: Examination) -> dict[str, Any]:

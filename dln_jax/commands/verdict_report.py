@@ -23,7 +23,7 @@ from dln_jax.runs.identification_task import Options
 from dln_jax.studies.case import Case, Findings, measure_and_publish
 from dln_jax.studies.report import Row, expect
 from dln_jax.studies.robots.faulty_logs import FAULTS, Arrays, random_arm, rough_file, sound_log
-from dln_jax.types import require_positive, require_seed
+from dln_jax.types import InputError, require_positive, require_seed
 
 JOINTS = (2, 3, 4, 6)
 """Of the arms, one after the other."""
@@ -74,15 +74,22 @@ def verdict_of(seed: int, fault: str | None) -> str:
     with tempfile.TemporaryDirectory(prefix="dln_jax-") as name:
         folder = Path(name)
         (folder / "arm.xml").write_text(mjcf(rough_file(arm, seed)))
-        return identified(folder, log)["level"]
+        return identified(folder, log, accepted=fault is not None)["level"]
 
 
-def identified(folder: Path, log: Arrays) -> dict[str, str]:
-    """The verdict on a log, with reason and remedy, by the robot's file arm.xml in the folder."""
+def identified(folder: Path, log: Arrays, *, accepted: bool) -> dict[str, str]:
+    """The verdict on a log, with reason and remedy, by the robot's file arm.xml in the folder.
+
+    Logs that are `accepted` are fitted although the check of the log finds errors; others are then refused.
+    """
     np.savez(folder / "log.npz", **log)
     options = Options(
-        robot=folder / "arm.xml", data=folder / "log.npz", out=folder / "run", uncertainty=False, figures=False
-    )
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(FitRefused):
-        run(options, "identify")
+        robot=folder / "arm.xml", data=folder / "log.npz", out=folder / "run", uncertainty=False, figures=False,
+        accept_log=accepted,
+    )  # fmt: skip
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(FitRefused):
+            run(options, "identify")
+    except InputError as error:
+        return {"level": "refused", "reason": str(error), "remedy": ""}
     return read_json(folder / "run" / "config.json", remedy="measure again")["chosen"]["verdict"]

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from dln_jax.data.robots import joint_names, opened, parsed
+from dln_jax.data.robot_xml import parsed
+from dln_jax.data.robots import joint_names, opened
 from dln_jax.data.urdf import MOVING
 from dln_jax.files import write_bytes
 from dln_jax.mechanics.trees.description import Tree

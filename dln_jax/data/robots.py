@@ -16,23 +16,15 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.joint_limits import check_limits, velocity_limits
+from dln_jax.data.robot_xml import MOST_JOINTS, parsed
 from dln_jax.data.urdf import link_inertias, require_joints, without_inertias
-from dln_jax.files import is_file
 from dln_jax.mechanics.trees.description import Tree, make_tree
 from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 INSTALL = "pip install 'dln-jax[robot]'"
-LARGEST = 64 * 2**20
-"""Bytes of a file."""
 LARGEST_NUMBER = 1e20
 """In SI units."""
-MOST_JOINTS = 200
-MOST_ELEMENTS = 20_000
-DEEPEST = 3 * MOST_JOINTS
-"""Elements within each other: an MJCF file nests a body, perhaps in a frame, for each joint."""
-REPEATING = ("replicate", "composite", "flexcomp")
-"""Elements of MJCF that stand for many."""
 
 
 class Robot(NamedTuple):
@@ -49,34 +41,6 @@ class Robot(NamedTuple):
     """N m or N, of the motors."""
     velocity_limits: Any = np.inf
     """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
-
-
-class _Elements(ET.TreeBuilder):
-    """Builds elements, and refuses more of them than any robot has, which MuJoCo would compile for minutes."""
-
-    depth = count = 0
-
-    def start(self, tag: Any, attrs: Any, /) -> ET.Element:
-        self.depth, self.count = self.depth + 1, self.count + 1
-        if self.depth > DEEPEST:
-            raise InputError(f"its elements are nested more than {DEEPEST} deep; expected the file of a robot")
-        if self.count > MOST_ELEMENTS:
-            raise InputError(f"it has more than {MOST_ELEMENTS:,} elements; expected the file of one robot")
-        if tag in REPEATING and _whole(attrs.get("count", "0")) > MOST_JOINTS:
-            raise InputError(f"<{tag}> repeats {attrs['count']:.20} times; expected at most {MOST_JOINTS}")
-        return super().start(tag, attrs)
-
-    def end(self, tag: Any, /) -> ET.Element:
-        self.depth -= 1
-        return super().end(tag)
-
-
-def _whole(text: str) -> float:
-    """The largest of the whole numbers in an attribute, infinite where they are none."""
-    try:
-        return max(map(float, text.split()), default=0.0)
-    except ValueError:
-        return np.inf
 
 
 class _Link(NamedTuple):
@@ -146,32 +110,6 @@ def _matching(hold: Mapping[str, float] | Sequence[str], names: Sequence[str]) -
             raise InputError(f"there is no joint '{pattern}' to hold; it has {', '.join(names)}")
         found |= dict.fromkeys(matching, float(position))
     return found
-
-
-def parsed(path: Path) -> ET.Element:
-    """The outer element of a URDF or MJCF file, comments included; errors as `read_robot`."""
-    if not is_file(path):
-        raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
-    try:
-        size = path.stat().st_size
-        if size > LARGEST:
-            raise InputError(
-                f"{path} has {size >> 20} MiB; expected a URDF or MJCF file of at most {LARGEST >> 20} MiB"
-            )
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file that you may read") from None
-    if b"<!ENTITY" in content.replace(b"\0", b""):  # in UTF-16 too
-        raise InputError(f"{path}: it defines entities, which can grow without bound; expected plain XML")
-    try:
-        root = ET.fromstring(content, ET.XMLParser(target=_Elements(insert_comments=True)))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except (ET.ParseError, LookupError, ValueError) as error:  # the last two of encodings that Python does not know
-        raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
-    if root.tag not in ("robot", "mujoco"):
-        raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")
-    return root
 
 
 def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any, Any]:

@@ -1,28 +1,24 @@
 """Parameters of bodies that exist: least squares over positive definite pseudo-inertias and positive coefficients.
 
-A body has the pseudo-inertia J = L (E Eᵀ) Lᵀ, where J_0 = L Lᵀ is that of its known value (L upper triangular) and E is
-upper triangular with the exponentials of four numbers on its diagonal and six numbers above it: the log-Cholesky
-parametrisation of Rucker and Wensing (RA-L 2022), relative to what is known, so that no coordinate has a unit. Armature
-and friction are c = c_0 exp(z). These numbers minimise
+A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is that of its known value and M is symmetric and positive
+definite: relative to what is known, so that no coordinate has a unit. Armature and friction are c = c_0 exp(z). These
+numbers minimise
 
-    sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
+    F = sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
-D(J | J_0) = tr(J J_0⁻¹) - log det(J J_0⁻¹) - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020). In
-these coordinates it is a sum of ten squares, and so made for Gauss-Newton; it depends on no frame. The data are one
-triangle: an iteration takes some P³ operations, whatever N is.
+D(J | J_0) = tr M - log det M - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020); it depends on no
+frame. In M the sum is convex and D is the barrier of the bodies that exist, so that F is minimised as interior-point
+methods do (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's method with a regularisation that falls
+to the one that was asked for. The data are one triangle: an iteration takes some P³ operations, whatever N is.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from dln_jax.compilation import quick_compilation
 from dln_jax.identification.columns import Columns
 from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inertia
-from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
 
 REGULARISATION = 1.0
@@ -32,7 +28,18 @@ SMALLEST = 1e-6
 """Least eigenvalue of a known pseudo-inertia, relative to its largest; where it is smaller, it is raised to it."""
 UNKNOWN_SHARE = 0.01
 """Of all torque, what a coefficient that is known as zero is first taken to explain."""
+FALL = 5.0
+"""Factor by which the regularisation falls from one minimum to the next."""
+CENTRED = 0.1
+"""Newton's decrement, in units of the regularisation, at which a minimum counts as reached on the way."""
+TOLERANCE = 1e-10
+"""Newton's decrement, the decrease of F that is expected of another iteration, relative to 1 + F, at which to stop."""
 _ABOVE = np.triu_indices(4, 1)
+_BASIS = np.array(
+    [np.outer(row, row) for row in np.eye(4)]
+    + [(np.outer(a, b) + np.outer(b, a)) / np.sqrt(2) for a, b in zip(*np.eye(4)[np.array(_ABOVE)], strict=True)]
+)
+"""Orthonormal basis of the symmetric matrices [10, 4, 4]."""
 
 
 class ConsistentFit(NamedTuple):
@@ -42,7 +49,9 @@ class ConsistentFit(NamedTuple):
     divergence: Float[np.ndarray, " bodies"]
     """D(J | J_0) of each body that there is."""
     iterations: int
-    status: levenberg_marquardt.Status
+    """Of Newton's method, in all."""
+    converged: bool
+    """Whether another iteration would change nothing that counts; else the iterations were used up."""
 
 
 def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
@@ -72,8 +81,8 @@ def fit_consistent(
     *,
     regularisation: float = REGULARISATION,
     smallest: float = SMALLEST,
-    iterations: int = 300,
-    improvement: float = 1e-10,
+    iterations: int = 500,
+    tolerance: float = TOLERANCE,
 ) -> ConsistentFit:
     """The consistent parameters of least error, from those known.
 
@@ -86,8 +95,8 @@ def fit_consistent(
         regularisation: dimensionless; what a unit of divergence counts, in squares of the noise. Positive, since the
             data never determine all.
         smallest: as for `nearest_body`.
-        iterations: of Levenberg-Marquardt, at most.
-        improvement: relative decrease of the sum at which to stop.
+        iterations: of Newton's method, at most.
+        tolerance: of the decrease that is still to be had, relative to 1 + F.
 
     Raises:
         InputError: a regularisation that is not positive, or a body without mass.
@@ -96,66 +105,109 @@ def fit_consistent(
     kinds = np.array(columns.kinds)
     inertial, positive, signed = (np.flatnonzero(kinds == kind) for kind in ("inertia", "positive", "signed"))
     inertial = inertial.reshape(-1, 10)[known[inertial].reshape(-1, 10).any(axis=1)]
-    bodies = [nearest_body(theta, smallest=smallest) for theta in known[inertial]]
     lengths = np.linalg.norm(triangle[:, :-1], axis=0)
     typical = np.linalg.norm(triangle[:, -1]) / np.where(lengths > 0, lengths, np.inf)
     typical = np.where(typical > 0, typical, 1.0)
-    coefficients = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
-    factors = np.array([_upper_factor(pseudo_inertia(body)) for body in bodies]).reshape(-1, 4, 4)
-
-    def theta_of(x: dict[str, Array]) -> Array:
-        relative = jax.vmap(_upper)(x["bodies"])
-        roots = jnp.asarray(factors) @ relative
-        inertias = jax.vmap(lambda root: body_of_pseudo_inertia(root @ root.T))(roots)
-        theta = jnp.zeros(len(kinds))
-        theta = theta.at[inertial].set(inertias)
-        theta = theta.at[positive].set(coefficients * jnp.exp(x["coefficients"]))
-        return theta.at[signed].set(known[signed] + typical[signed] * x["signed"])
-
-    A, b = jnp.asarray(triangle[:, :-1]), jnp.asarray(triangle[:, -1])
-
-    def residual(x: dict[str, Array], _: Array) -> Array:
-        departure = jax.vmap(_divergence_roots)(x["bodies"]).ravel()
-        changes = jnp.sqrt(0.5) * x["coefficients"]
-        return jnp.concatenate([A @ theta_of(x) - b, jnp.sqrt(regularisation) * jnp.concatenate([departure, changes])])
-
-    with jax.enable_x64(True):
-        start: dict[str, Any] = {
-            "bodies": jnp.zeros((len(bodies), 10)),
-            "coefficients": jnp.zeros(len(positive)),
-            "signed": jnp.zeros(len(signed)),
-        }
-        once = (jnp.zeros(1),)  # one sample, with all residuals
-        solve = jax.jit(
-            lambda state: levenberg_marquardt.run(residual, state, once, iterations, improvement=improvement),
-            compiler_options=quick_compilation(),
-        )
-        state = solve(levenberg_marquardt.init(start))
-        theta = np.asarray(theta_of(state.parameters))
-        roots = jax.vmap(_divergence_roots)(state.parameters["bodies"])
-    return ConsistentFit(
-        theta,
-        np.sum(np.asarray(roots) ** 2, axis=1),
-        int(state.iteration),
-        levenberg_marquardt.Status(int(state.status)),
-    )
+    start = np.zeros(len(kinds))
+    start[positive] = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
+    start[signed] = known[signed]
+    # Directions of theta: ten for each body, then those of the coefficients, then those of what has either sign.
+    maps = []
+    for places in inertial:
+        J = pseudo_inertia(nearest_body(known[places], smallest=smallest))
+        start[places], factor = np.asarray(body_of_pseudo_inertia(J)), np.linalg.cholesky(J)
+        maps.append(_rows(places, len(kinds)).T @ _bodies(factor @ _BASIS @ factor.T))
+    maps += [_rows(positive, len(kinds)).T * start[positive], _rows(signed, len(kinds)).T * typical[signed]]
+    problem = _Problem(triangle[:, :-1] @ np.hstack(maps), triangle[:, :-1] @ start - triangle[:, -1], len(inertial))
+    x, done, converged = _minimum(problem, len(positive), regularisation, iterations, tolerance)
+    M, _, _ = problem.parts(x, len(positive))
+    theta = start + np.hstack(maps) @ problem.directions(x, len(positive))
+    return ConsistentFit(theta, _divergences(M), done, converged)
 
 
-def _upper_factor(J: np.ndarray) -> np.ndarray:
-    """L upper triangular with J = L Lᵀ."""
-    return np.linalg.cholesky(J[::-1, ::-1])[::-1, ::-1]
+class _Problem(NamedTuple):
+    """Residuals A y + r of y = (M - 1 of each body in the basis, exp(z) - 1, what has either sign)."""
+
+    A: np.ndarray
+    r: np.ndarray
+    bodies: int
+
+    def parts(self, x: np.ndarray, coefficients: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """M [B, 4, 4], z, and what has either sign."""
+        numbers, z, signed = np.split(x, [10 * self.bodies, 10 * self.bodies + coefficients])
+        return np.eye(4) + np.einsum("bk,kij->bij", numbers.reshape(-1, 10), _BASIS), z, signed
+
+    def directions(self, x: np.ndarray, coefficients: int) -> np.ndarray:
+        """y of the unknowns x, of which z are logarithms."""
+        y, z = x.copy(), slice(10 * self.bodies, 10 * self.bodies + coefficients)
+        y[z] = np.expm1(x[z])
+        return y
+
+    def value(self, x: np.ndarray, coefficients: int, weight: float) -> float:
+        """F; infinite where a body does not exist."""
+        M, z, _ = self.parts(x, coefficients)
+        if (M.size and np.linalg.eigvalsh(M).min() <= 0) or z.max(initial=0.0) > 100:
+            return np.inf
+        errors = self.A @ self.directions(x, coefficients) + self.r
+        return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
+
+    def newton(self, x: np.ndarray, coefficients: int, weight: float) -> tuple[np.ndarray, float]:
+        """Newton's step as a least-squares problem, whose solution is stable, and its decrement."""
+        M, z, signed = self.parts(x, coefficients)
+        errors = self.A @ self.directions(x, coefficients) + self.r
+        scale = np.concatenate([np.ones(10 * self.bodies), np.exp(z), np.ones(len(signed))])
+        slopes = self.A * scale
+        rows, right = [slopes], [-errors]
+        for body, each in enumerate(M):
+            C = np.linalg.cholesky(each)
+            inner = np.linalg.solve(C, np.linalg.solve(C, _BASIS).transpose(0, 2, 1))
+            block = np.zeros((16, len(x)))
+            block[:, 10 * body : 10 * body + 10] = inner.reshape(10, 16).T
+            rows.append(np.sqrt(weight / 2) * block)
+            right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(4)).ravel())
+        # The second derivative of exp(z) counts where it is positive, which keeps the step one of descent.
+        place = 10 * self.bodies + np.arange(coefficients)
+        bend = np.sqrt(weight / 2 + np.maximum(slopes[:, place].T @ errors, 0.0))
+        rows.append(bend[:, None] * _rows(place, len(x)))
+        right.append(-weight / 2 * z / bend)
+        system = np.concatenate(rows)
+        step = np.linalg.lstsq(system, np.concatenate(right), rcond=None)[0]
+        return step, float(np.sum((system @ step) ** 2))
 
 
-def _upper(numbers: Array) -> Array:
-    """E [4, 4] of ten numbers."""
-    return jnp.diag(jnp.exp(numbers[:4])).at[_ABOVE].set(numbers[4:])
+def _minimum(
+    problem: _Problem, coefficients: int, regularisation: float, iterations: int, tolerance: float
+) -> tuple[np.ndarray, int, bool]:
+    """The unknowns of least F, iterations, and whether they suffice."""
+    x = np.zeros(problem.A.shape[1])
+    weight = max(regularisation, problem.value(x, coefficients, 0.0) / max(1, len(x)))
+    for done in range(iterations):
+        step, decrement = problem.newton(x, coefficients, weight)
+        now, last = problem.value(x, coefficients, weight), weight == regularisation
+        if last and decrement <= tolerance * (1 + now):
+            return x, done, True
+        length = 1.0
+        while problem.value(x + length * step, coefficients, weight) > now - 1e-4 * length * decrement:
+            length /= 2
+            if length < 1e-12:
+                # Rounding hides what is left of F; that is an end if it is below what the sum resolves.
+                return x, done, last and decrement <= 1e-8 * (1 + now)
+        x = x + length * step
+        if not last and decrement <= CENTRED * weight:
+            weight = max(regularisation, weight / FALL)
+    return x, iterations, False
 
 
-def _divergence_roots(numbers: Array) -> Array:
-    """Ten numbers whose squares sum to tr(E Eᵀ) - log det(E Eᵀ) - 4."""
-    a = numbers[:4]
-    near = jnp.abs(a) < 1e-3
-    away = jnp.where(near, 1.0, a)
-    series = jnp.sqrt(2.0) * a * (1 + a / 3 + a**2 / 9)
-    roots = jnp.where(near, series, jnp.sign(a) * jnp.sqrt(jnp.expm1(2 * away) - 2 * away))
-    return jnp.concatenate([roots, numbers[4:]])
+def _divergences(M: np.ndarray) -> np.ndarray:
+    """tr M - log det M - 4 of each."""
+    return np.trace(M, axis1=1, axis2=2) - np.linalg.slogdet(M)[1] - 4
+
+
+def _bodies(J: np.ndarray) -> np.ndarray:
+    """Ten numbers of each pseudo-inertia, as columns."""
+    return np.stack([np.asarray(body_of_pseudo_inertia(each)) for each in J], axis=1)
+
+
+def _rows(places: np.ndarray, count: int) -> np.ndarray:
+    """Rows of the identity matrix."""
+    return np.eye(count)[places]

@@ -7,7 +7,6 @@ import numpy as np
 from dln_jax.data.schema import Trajectories
 from dln_jax.identification.base import Determinacy
 from dln_jax.identification.identify import Identification
-from dln_jax.solvers.levenberg_marquardt import Status
 
 STILL = 0.01
 """rad or m: a joint that moves by less does not move."""
@@ -81,10 +80,10 @@ def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) 
     ]
     if friction and found.consistent is None:
         lines.append(f"negative, which no joint is: {', '.join(friction)}; ask for consistent parameters")
-    if found.consistent is not None and found.consistent.status == Status.RUNNING:
+    if found.consistent is not None and not found.consistent.converged:
         lines.append(
-            f"bodies that exist still came closer to the data after {found.consistent.iterations} iterations; "
-            "the table shows how close they are"
+            f"the search for bodies that exist did not converge in {found.consistent.iterations} iterations; closer "
+            "ones may exist"
         )
     return lines
 

@@ -81,7 +81,7 @@ def read(given: Options) -> Recorded:
     rubbing = bool(needs.friction or needs.joint_friction)
     cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
     settled = (*["split"] * cut, *["friction"] * rubbing)
-    found = [] if given.data is None else checked(given, data, given.data, without=settled)
+    found = [] if given.data is None else checked(given, data, given.data, robot=robot, without=settled)
     filtered = smoothed(given, data)
     said = [*preparation(data, filtered), *found]
     if filtered is not None:

@@ -77,13 +77,17 @@ def say(judged: Judged) -> None:
 def refuse(judged: Judged, task: Task, given: Options) -> None:
     """Raises `FitRefused` for a model that must not be used.
 
-    A network whose training the user's own limit cut short is no failure of the command.
+    There is one exception: a network whose training ended at the user's own --steps or --seconds may be trained on. The
+    command then says so and succeeds.
     """
     if judged.verdict is None or judged.verdict.level != "refused":
         return
     if task.solver is None or (given.steps is None and given.seconds is None):
         raise FitRefused(judged.verdict)
-    print("warning: training ended at the limit that you set; give it more --steps or --seconds")
+    print(
+        "warning: refused, but training ended at your own --steps or --seconds, so the exit status is 0; "
+        "train longer before you use this model"
+    )
 
 
 def _nmse(found: HeldOut) -> float:

@@ -36,7 +36,7 @@ from dln_jax.zoo.descriptions import Description, build, describe
 IDENTIFIED = tuple(law for law in LAWS if law != "load")
 """Laws that forces are linear in the coefficients of."""
 NO_FRICTION = "none"
-SETTLED = ("split", "friction")
+SETTLED = ("split", "friction", "condition")
 """Checks of a log that the robot's file and this command answer."""
 MOST_SAMPLES = 4_000
 """Of which the shapes of friction are found."""
@@ -125,7 +125,7 @@ def prepare(given: Options) -> Case:
     if "tau" in data.estimated:
         raise InputError(f"{given.data}: the data have no tau; identification takes measured torques")
     found = smoothed(given, data)
-    said = (*preparation(data, found), *checked(given, data, given.data, without=SETTLED))
+    said = (*preparation(data, found), *checked(given, data, given.data, robot=robot, without=SETTLED))
     labels = [label.strip() for label in given.test.split(",")] if given.test else None
     if found is not None:
         labels = labels and labels_of_parts(found.data, labels)

@@ -10,7 +10,6 @@ from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_met
 from dln_jax.models.rigid_tree import RigidTreeParameters
 from dln_jax.runs.identification_additions import Predict
 from dln_jax.runs.identification_task import Case
-from dln_jax.solvers.levenberg_marquardt import Status
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 """Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
@@ -82,9 +81,10 @@ def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, t
     if mine <= 2 * free + WORSE:
         return Verdict("good", "")
     level = "refused" if mine > free + IMPOSSIBLE else "doubtful"
-    unfinished = found.consistent.status == Status.RUNNING
     reason = f"bodies that exist have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
-    reason += f", after {found.consistent.iterations} iterations without an end" if unfinished else ""
+    reason += (
+        f", not converged after {found.consistent.iterations} iterations" if not found.consistent.converged else ""
+    )
     remedy = "check the signs and units of tau and the robot's file: no robot has such torques"
     return Verdict(level, reason, remedy)
 

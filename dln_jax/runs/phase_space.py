@@ -11,7 +11,7 @@ import numpy as np
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder, write_config
 from dln_jax.command_line.scaled import mesh_of
-from dln_jax.data.schema import needs_from_json
+from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.verdict import FitRefused

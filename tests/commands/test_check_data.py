@@ -49,6 +49,16 @@ def test_a_log_is_examined(log, tmp_path, capsys):
     assert "not there" not in refused(capsys, check_data, "--data", tmp_path / "none.npz")
 
 
+def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, capsys):
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
+    with pytest.raises(SystemExit) as exit_:
+        command(check_data, "--data", tmp_path / "degrees.npz", "--out", tmp_path / "check")
+    assert exit_.value.code == 1
+    assert "error: q of joint 1 goes to" in (tmp_path / "check" / "page.txt").read_text()
+    assert {each.name for each in (tmp_path / "check").iterdir()} >= {"findings.json", "metrics.json", "log.png"}
+
+
 def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, tmp_path, capsys):
     errors = {}
     for name, options in (("raw", []), ("filtered", ["--cutoff", "auto"])):

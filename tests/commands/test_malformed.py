@@ -40,6 +40,7 @@ from dln_jax.commands import (
 )
 from dln_jax.data import archive, functions, meshes, schema
 from dln_jax.data.splits import split
+from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, restore, store
 from dln_jax.learning.engine.problem import Progress
@@ -341,7 +342,7 @@ ANY_JSON = st.recursive(
 @given(st.dictionaries(st.sampled_from(Needs._fields), ANY_JSON) | ANY_JSON)
 def test_any_json_states_needs_or_is_refused(stated):
     try:
-        assert hash(schema.needs_from_json(stated)) is not None
+        assert hash(needs_from_json(stated)) is not None
     except InputError as error:
         assert "\n" not in str(error)
 

@@ -44,14 +44,13 @@ def test_tracking_is_held_against_true_parameters():
 
 
 def test_some_faults_of_logs_are_found_and_a_sound_log_has_none():
-    drawn = log_checks._Drawn()
     for number in (1, 6):
-        log = drawn.log(number, repeats=number == 1)
+        log = log_checks.drawn(number, repeats=number == 1)
         assert log_checks.false_findings(log, None) == []
     assert log_checks.false_findings(log, log.robot) == []
     for kind in ("swapped-columns", "flipped-sign", "saturated-torque", "rates-exchanged"):
         fault, checks, given = log_checks.FAULTS[kind]
-        assert set(checks) & set(log_checks.planted(drawn.log(1, repeats=False), fault, given, 0)), kind
+        assert set(checks) & set(log_checks.planted(log_checks.drawn(1, repeats=False), fault, given, 0)), kind
 
 
 def test_blocks_count_by_the_whole_logs_variance():

@@ -10,6 +10,7 @@ import pytest
 from dln_jax.data import schema
 from dln_jax.data.schema import time_derivative
 from dln_jax.data.splits import PER_SAMPLE, merged, select, split
+from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.double_pendulum import double_pendulum
@@ -127,7 +128,7 @@ def test_friction_of_joints_is_stated_in_a_file_and_older_needs_have_none(tmp_pa
     schema.save(tmp_path / "data.npz", data)
     assert schema.load(tmp_path / "data.npz").needs == needs
     older = {"joints": ["revolute"], "gravity": True, "friction": False, "actuation": None}
-    assert schema.needs_from_json(older) == Needs(("revolute",))
+    assert needs_from_json(older) == Needs(("revolute",))
 
 
 def test_absent_rates_are_estimated_to_second_order_and_never_across_trajectories():

@@ -1,6 +1,7 @@
 """What is wrong with a log before it is learned from: findings in one line each, with what to do about them.
 
-`quick(data)` is cheap and knows no robot; `examine(recording, robot)` is all of it, and what `check_data` prints.
+`quick(data, robot)` looks at few torques, as commands that train do; `examine(recording, robot)` is what `check_data`
+prints.
 """
 
 from dln_jax.data.checks.doctor import Examination, examine, quick

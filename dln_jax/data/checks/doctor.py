@@ -7,8 +7,9 @@ import numpy as np
 from dln_jax.data.checks.channels import check_channels
 from dln_jax.data.checks.derivatives import check_derivatives
 from dln_jax.data.checks.findings import Finding, told
-from dln_jax.data.checks.hypotheses import Torques, any_energy, examine_torques
+from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.recording import Recording, as_recording
+from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.checks.times import check_times
 from dln_jax.data.checks.torques import check_degrees, check_torques
 from dln_jax.data.checks.tree import OnTree, against_tree
@@ -22,8 +23,10 @@ from dln_jax.types import InputError
 FARTHEST = 0.1
 """s, of a delay between q and tau that is looked for; at most `MOST_SHIFTS` samples."""
 MOST_SHIFTS = 20
-EQUATIONS, FEWER = 1000, 300
-"""Torques, over all joints, by which faults are looked for, and the same where it must be quick."""
+EQUATIONS = 1000
+"""Torques, over all joints, by which faults are looked for."""
+FEWER, FEWER_EACH = 300, 100
+"""The same where it must be quick: at least so many, and so many of each joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
 """Findings beside which torques are not examined without a robot."""
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
@@ -45,9 +48,14 @@ class Examination(NamedTuple):
     """Of each encoder, rad or m [d]; zero where there are none."""
 
 
-def quick(data: Trajectories) -> list[Finding]:
-    """Findings without a robot's description, in about a second."""
-    return examine(as_recording(data), equations=FEWER).findings
+def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
+    """Findings by fewer torques, in a few seconds; arguments as `examine`."""
+    return examine(as_recording(data), robot, equations=quick_equations(data.degrees_of_freedom)).findings
+
+
+def quick_equations(d: int) -> int:
+    """Torques, over all of d joints, by which `quick` looks for faults."""
+    return max(FEWER, FEWER_EACH * d)
 
 
 def examine(recording: Recording, robot: Robot | None = None, *, equations: int = EQUATIONS) -> Examination:

@@ -6,7 +6,10 @@ The robot is not known, but its torques have a Lagrangian T(q, qd) - V(q), one f
 
 products of kernels of single angles, the torques d/dt dT/dqd - dT/dq + dV/dq are jointly Gaussian, and their covariance
 is a closed form (the construction of Giacomuzzo et al., arXiv 2310.06585). It contains every tree of rigid bodies with
-revolute joints. Friction, viscous, dry on two scales, and an offset, is added to each joint by itself.
+revolute joints. Most arms are chains whose columns run from the base to the tip: the energy of a body then depends on
+the joints below it alone, and its kinetic energy not on the first joint. Energies of that form have weights of their
+own, so that few samples suffice where they fit, and those of any energy remain where they do not. Friction, viscous,
+dry on two scales, and an offset, is added to each joint by itself.
 """
 
 from collections.abc import Sequence
@@ -19,6 +22,10 @@ STRONGEST = 0.5
 """Dependence of the energies on the angle of the joint with the largest forces; 1 would be a pure cosine."""
 WEAKEST = 0.03
 """The same of joints with far smaller forces."""
+OF_BODY = 0.7
+"""Dependence of a body's energies on the angle of each joint that moves it."""
+MOST_BODIES = 8
+"""Bodies of a chain that have energies of their own; in a longer one, every second or third."""
 LENGTH = 2.0
 """Ranges of a prismatic joint, over which energies change."""
 SCALES = (0.02, 0.3)
@@ -42,18 +49,42 @@ class _Kernel(NamedTuple):
     """e_i = k_i'' / k_i - h_i²."""
 
 
-def covariance(
+def covariances(
     states: Sequence[np.ndarray], others: Sequence[np.ndarray], joints: Sequence[str], sizes: np.ndarray
-) -> Parts:
-    """Covariances of torques without friction; `states` and `others` are q, qd, qdd [n, d], `sizes` [d] of inertias.
+) -> list[Parts]:
+    """Covariances of torques without friction: those of any energy, then those of the bodies of a chain.
 
-    The potential's has unit variance of V; the kinetic one takes W = diag(sizes).
+    Args:
+        states, others: q, qd and qdd [n, d].
+        joints: kind of each.
+        sizes: of inertias [d]: W = diag(sizes) for any energy, and their mean for each body, whatever moves it.
     """
     relative = np.sqrt(sizes / sizes.max())
     ranges = np.maximum(np.ptp(states[0], axis=0), 1e-9)
     strength = np.clip(STRONGEST * relative, WEAKEST, STRONGEST)
-    kinetic = _kernel(states[0], others[0], joints, strength, ranges, power=2)
-    potential = _kernel(states[0], others[0], joints, strength, ranges, power=1)
+    place = np.arange(len(sizes))
+    found = [_covariance(states, others, joints, ranges, (strength, strength), sizes)]
+    for body in np.unique(np.linspace(0, place[-1], min(len(place), MOST_BODIES)).round()):
+        below = place <= body
+        turned = np.where(below, OF_BODY, 0.0)
+        moved = np.where(place > 0, turned, 0.0)
+        found.append(_covariance(states, others, joints, ranges, (moved, turned), below * sizes.mean()))
+    return found
+
+
+def _covariance(
+    states: Sequence[np.ndarray],
+    others: Sequence[np.ndarray],
+    joints: Sequence[str],
+    ranges: np.ndarray,
+    strengths: tuple[np.ndarray, np.ndarray],
+    sizes: np.ndarray,
+) -> Parts:
+    """Of one energy; `strengths` [d] of the kinetic and the potential one are zero where it ignores a coordinate."""
+    kinetic, potential = (
+        _kernel(states[0], others[0], joints, strength, ranges, power)
+        for strength, power in zip(strengths, (2, 1), strict=True)
+    )
     n, m, d = potential.slope.shape
     of_potential = -potential.value[..., None, None] * _hessian(potential)
     return Parts(
@@ -69,7 +100,7 @@ def _kernel(
     turning = np.array([kind == "revolute" for kind in joints])
     base = 1 + strength * np.cos(difference)
     first, second = -strength * np.sin(difference) / base, -strength * np.cos(difference) / base
-    length = LENGTH * ranges
+    length = np.where(strength > 0, LENGTH * ranges, np.inf)
     logarithm = np.where(turning, power * np.log(base / (1 + strength)), -0.5 * (difference / length) ** 2)
     slope = np.where(turning, power * first, -difference / length**2)
     bend = np.where(turning, power * (second - first**2), -1 / length**2)

@@ -16,6 +16,8 @@ from jaxtyping import Float
 ITERATIONS = 12
 """Steps to the largest likelihood, which needs no more than a digit of the weights."""
 BLOCKS = 10
+WEIGHED = 300
+"""Torques by which weights are found, at most; predictions take all."""
 
 
 class Prior(NamedTuple):
@@ -46,32 +48,11 @@ class Explanation(NamedTuple):
 def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = ITERATIONS) -> Explanation:
     """The weights of largest likelihood, and how well each block is predicted from the others."""
     n, d = tau.shape
-    y = tau.ravel() - prior.mean
-    sizes = tau.var(axis=0)
-    joint = np.tile(np.arange(d), n)
-    noise = np.tile(np.maximum(sizes, 1e-12 * sizes.max()), n)
-    weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
-    count, factors = len(prior.parts), len(prior.columns)
-
-    def covariance() -> np.ndarray:
-        K = np.diag(weights[count + factors :][joint] * noise)
-        for weight, part in zip(weights, prior.parts, strict=False):
-            K += weight * part
-        for weight, columns in zip(weights[count:], prior.columns, strict=False):
-            K += weight * (columns @ columns.T)
-        return K
-
-    for _ in range(iterations):
-        inverse = _inverse(covariance())
-        pull = inverse @ y
-        slopes = [(pull @ part @ pull, np.sum(inverse * part)) for part in prior.parts]
-        for columns in prior.columns:
-            slopes.append((np.sum((columns.T @ pull) ** 2), np.sum(columns * (inverse @ columns))))
-        own = pull**2 * noise, np.diag(inverse) * noise
-        slopes += [(own[0][joint == each].sum(), own[1][joint == each].sum()) for each in range(d)]
-        weights = weights * np.array([np.sqrt(fit / max(size, 1e-300)) for fit, size in slopes])
-        weights[count + factors :] = np.maximum(weights[count + factors :], 1e-7)
-    inverse = _inverse(covariance())
+    few = np.arange(n * d).reshape(n, d)[:: -(-n * d // WEIGHED)].ravel()
+    sizes = np.maximum(tau.var(axis=0), 1e-12 * tau.var(axis=0).max())
+    y, noise = tau.ravel() - prior.mean, np.tile(sizes, n)
+    weights = _likeliest(_of(prior, few), y[few], noise[few], d, iterations)
+    inverse = _inverse(_covariance(prior, weights, noise, d))
     pull = inverse @ y
     densities, unexplained = [], []
     for block in blocks_of(n, d):
@@ -79,8 +60,41 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
         own = inverse[np.ix_(block, block)]
         error = np.linalg.solve(own, pull[block])
         densities.append(0.5 * np.linalg.slogdet(own)[1] - 0.5 * error @ own @ error)
-        unexplained.append(np.mean(error.reshape(-1, d) ** 2, axis=0) / np.maximum(sizes, 1e-300))
+        unexplained.append(np.mean(error.reshape(-1, d) ** 2, axis=0) / np.maximum(tau.var(axis=0), 1e-300))
     return Explanation(weights, inverse, pull, np.array(densities), np.array(unexplained))
+
+
+def _of(prior: Prior, chosen: np.ndarray) -> Prior:
+    """The prior of some of the torques."""
+    square = np.ix_(chosen, chosen)
+    return Prior(
+        prior.mean[chosen], [part[square] for part in prior.parts], [columns[chosen] for columns in prior.columns]
+    )
+
+
+def _likeliest(prior: Prior, y: np.ndarray, noise: np.ndarray, d: int, iterations: int) -> np.ndarray:
+    """Weights of parts, columns and noise [w], whose likelihood grows with each iteration."""
+    weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
+    for _ in range(iterations):
+        inverse = _inverse(_covariance(prior, weights, noise, d))
+        pull = inverse @ y
+        slopes = [(pull @ part @ pull, np.vdot(inverse, part)) for part in prior.parts]
+        for columns in prior.columns:
+            slopes.append((np.sum((columns.T @ pull) ** 2), np.vdot(columns, inverse @ columns)))
+        own = (pull**2 * noise).reshape(-1, d), (np.diag(inverse) * noise).reshape(-1, d)
+        slopes += zip(*(each.sum(axis=0) for each in own), strict=True)
+        weights = weights * np.array([np.sqrt(fit / max(size, 1e-300)) for fit, size in slopes])
+        weights[-d:] = np.maximum(weights[-d:], 1e-7)
+    return weights
+
+
+def _covariance(prior: Prior, weights: np.ndarray, noise: np.ndarray, d: int) -> np.ndarray:
+    K = np.diag(np.tile(weights[-d:], len(noise) // d) * noise)
+    for weight, part in zip(weights, prior.parts, strict=False):
+        K += weight * part
+    for weight, columns in zip(weights[len(prior.parts) :], prior.columns, strict=False):
+        K += weight * columns @ columns.T
+    return K
 
 
 def blocks_of(n: int, d: int) -> list[np.ndarray]:

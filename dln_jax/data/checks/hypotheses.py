@@ -6,6 +6,7 @@ robot's file gives a narrower one (`tree`). One fault at a time is taken, the be
 with the log repaired.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,8 +15,9 @@ from jaxtyping import Float
 
 from dln_jax.data.checks import evidence
 from dln_jax.data.checks.delays import away_from_ends, vertex
-from dln_jax.data.checks.energies import SCALES, covariance, friction_columns
+from dln_jax.data.checks.energies import SCALES, Parts, covariances
 from dln_jax.data.checks.evidence import Explanation, Prior
+from dln_jax.data.checks.repaired import Build, Log, sizes_of
 from dln_jax.data.schema import Trajectories
 
 DECISIVE = 15.0
@@ -23,7 +25,8 @@ DECISIVE = 15.0
 MOST_BLOCKS = 0.8
 """Of the blocks, which have to agree."""
 BETTER = 0.8
-"""Of the unexplained variance, below which a sign or an order has to bring it."""
+"""Of the unexplained variance, below which a sign or an order has to bring it: with a robot, of all joints, which its
+parameters bind together; without one, of those whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
@@ -35,42 +38,6 @@ INERTIAS = 8
 """Configurations at which the sign of inertias is looked at."""
 NEGATIVE = -5.0
 """Standard deviations of the sum over joints, below which inertias are negative."""
-
-States = tuple[np.ndarray, np.ndarray, np.ndarray]
-Build = Callable[[States, np.ndarray, np.ndarray | None], Prior]
-"""(q, qd, qdd [n, d]), torques [n, d], gravity [3] or `None` for what is usual -> the prior of those torques."""
-
-
-class Log(NamedTuple):
-    """A log, and the faults that are repaired in it."""
-
-    data: Trajectories
-    rows: np.ndarray
-    """Samples that are looked at [n]."""
-    signs: Float[np.ndarray, " d"]
-    """-1 for torques that have the wrong sign."""
-    order: tuple[int, ...]
-    """Columns of tau that belong to the joints."""
-    delay: float = 0.0
-    """Samples by which torques are late."""
-    speed: float = 1.0
-    """Times the speed that t states, with which the joints moved."""
-    gravity: np.ndarray | None = None
-    """m/s² [3], where it is another than stated."""
-
-    def states(self) -> States:
-        """At the times of the rows, or a part of a sample earlier if torques are late."""
-        whole = int(np.floor(-self.delay))
-        part, first = -self.delay - whole, self.rows + whole
-
-        def at(values: np.ndarray) -> np.ndarray:
-            return (1 - part) * values[first] + part * values[first + 1]
-
-        return at(self.data.q), self.speed * at(self.data.qd), self.speed**2 * at(self.data.qdd)
-
-    def torques(self, shift: int = 0) -> np.ndarray:
-        """Of the joints, with their signs, so many samples later."""
-        return self.data.tau[self.rows + shift][:, list(self.order)] * self.signs
 
 
 class Torques(NamedTuple):
@@ -127,7 +94,8 @@ def examine_torques(
         build: of priors.
         farthest: samples of delay that are tried.
         equations: that are taken, n d.
-        ambiguous: whether the prior allows negative inertias, so that the sign of all torques is to be found.
+        ambiguous: whether the prior is that of any robot: it allows negative inertias, so that the sign of all torques
+            is to be found, and binds joints together so little that a fault is judged by the joints that it concerns.
         faults: whether faults are looked for at all.
         others: more faults, as logs without them.
     """
@@ -141,42 +109,13 @@ def examine_torques(
     first = now = _explained(log, build)
     loss, likely = _late(log, build, now, farthest)
     for _ in range(MOST_FAULTS if faults else 0):
-        better = _better(log, build, now, farthest, others)
+        better = _better(log, build, now, farthest, others, alone=ambiguous)
         if better is None:
             break
         log, now = better
     if ambiguous and _inertias(log, now) < NEGATIVE:
         log = log._replace(signs=-log.signs)
     return Torques(first, log, now, np.arange(-farthest, farthest + 1.0), loss, likely, *_friction(log, build, now))
-
-
-def any_energy(joints: tuple[str, ...]) -> Build:
-    """The prior without a robot: torques of any kinetic and potential energy, and friction."""
-
-    def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
-        del gravity  # any
-        sizes = _sizes(states[2], tau)
-        parts = covariance(states, states, joints, sizes)
-        return Prior(np.zeros(tau.size), [parts.kinetic, parts.potential], friction(states[1]))
-
-    return build
-
-
-def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:
-    """Columns [n d, 4] of each joint's friction."""
-    own = friction_columns(qd, np.maximum(qd.std(axis=0), 1e-12))
-    n, d, count = own.shape
-    found = []
-    for joint in range(d):
-        columns = np.zeros((n, d, count))
-        columns[:, joint] = own[:, joint]
-        found.append(columns.reshape(n * d, count))
-    return found
-
-
-def _sizes(qdd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    found = tau.std(axis=0) / np.maximum(qdd.std(axis=0), 1e-12)
-    return np.maximum(found, 1e-3 * max(float(found.max()), 1e-300))
 
 
 def _explained(log: Log, build: Build, iterations: int = evidence.ITERATIONS) -> Explanation:
@@ -194,9 +133,9 @@ def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.n
 
 
 def _better(
-    log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]]
+    log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]], *, alone: bool
 ) -> tuple[Log, Explanation] | None:
-    """The log without its likeliest fault, if that is beyond doubt."""
+    """The log without its likeliest fault, if that is beyond doubt; `alone`: judged by the joints that it concerns."""
     d = len(log.order)
     flips = [log._replace(signs=np.where(np.arange(d) == joint, -log.signs, log.signs)) for joint in range(d)]
     exchanges = []
@@ -214,7 +153,7 @@ def _better(
     for trial in chosen:
         explained = _explained(trial, build)
         limit = LESS_LATE if trial.delay != log.delay else BETTER
-        if decisive(now, explained, limit):
+        if decisive(now, explained, limit, _concerned(log, trial) if alone else np.ones(d, bool)):
             found.append((float(explained.densities.sum()), trial, explained))
     if not found:
         return None
@@ -225,24 +164,37 @@ def _better(
 def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
     """The few of many faults that are likelier than the log, by fewer samples and rough weights."""
 
-    def density(trial: Log) -> float:
-        few = -(-len(trial.rows) * len(trial.order) // SCANNED)
-        rough = trial._replace(rows=trial.rows[::few])
-        return float(_explained(rough, build, iterations=ROUGHLY).densities.sum())
-
     if not trials:
         return []
+    few = -(-len(log.rows) * len(log.order) // SCANNED)
+    log = log._replace(rows=log.rows[::few])
+    states = log.states()
+
+    @functools.cache
+    def prior(order: tuple[int, ...]) -> Prior:
+        return build(states, log._replace(order=order).torques(), log.gravity)
+
+    def density(trial: Log) -> float:
+        tau = trial._replace(rows=log.rows).torques()
+        return float(evidence.explain(prior(trial.order), tau, iterations=ROUGHLY).densities.sum())
+
     now, densities = density(log), np.array([density(trial) for trial in trials])
     return [trials[place] for place in np.argsort(densities)[::-1][:CANDIDATES] if densities[place] > now]
 
 
-def decisive(now: Explanation, other: Explanation, limit: float) -> bool:
-    """Whether another explanation is better beyond doubt, and by so much that it matters."""
+def _concerned(log: Log, trial: Log) -> np.ndarray:
+    """Joints whose torques have another sign or column in a trial; all of them if it is about time, or the base."""
+    concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
+    return concerned if concerned.any() else np.ones(len(concerned), bool)
+
+
+def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndarray) -> bool:
+    """Whether another explanation is better beyond doubt, and by so much that it matters to these joints."""
     gains = other.densities - now.densities
     return bool(
         gains.sum() > DECISIVE
         and np.mean(gains > 0) >= MOST_BLOCKS
-        and other.unexplained.mean() < limit * now.unexplained.mean()
+        and other.unexplained[:, joints].mean() < limit * now.unexplained[:, joints].mean()
     )
 
 
@@ -257,14 +209,22 @@ def _inertias(log: Log, now: Explanation) -> float:
         push = np.zeros_like(chosen)
         push[:, joint] = 1.0
         pushed = (chosen, np.zeros_like(chosen), push)
-        sizes = _sizes(qdd, tau)
-        with_log = covariance(pushed, (q, qd, qdd), joints, sizes).kinetic
-        alone = covariance(pushed, pushed, joints, sizes).kinetic
-        mean_with = now.weights[0] * with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
-        variance = now.weights[0] * alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
+        sizes = sizes_of(qdd, tau)
+        with_log = _kinetic(now, covariances(pushed, (q, qd, qdd), joints, sizes))
+        alone = _kinetic(now, covariances(pushed, pushed, joints, sizes))
+        mean_with = with_log.reshape(INERTIAS, d, -1)[:, joint].mean(axis=0)
+        variance = alone.reshape(INERTIAS, d, INERTIAS, d)[:, joint, :, joint].mean()
         variance = max(float(variance - mean_with @ now.inverse @ mean_with), 1e-12 * float(variance))
         total += float(mean_with @ now.pull) / np.sqrt(variance)
     return total / np.sqrt(d)
+
+
+def _kinetic(now: Explanation, parts: list[Parts]) -> np.ndarray:
+    """Covariance of the torques of all kinetic energies, with their weights."""
+    total = np.zeros_like(parts[0].kinetic)
+    for weight, each in zip(now.weights[::2], parts, strict=False):
+        total += weight * each.kinetic
+    return total
 
 
 def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...]:

@@ -4,7 +4,8 @@ import numpy as np
 
 from dln_jax.data.checks.channels import TURNS
 from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.checks.hypotheses import Torques, any_energy, examine_torques
+from dln_jax.data.checks.hypotheses import Torques, examine_torques
+from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.schema import Trajectories
 
 TRUSTED = 0.8

@@ -8,9 +8,10 @@ import numpy as np
 from dln_jax.data.checks.delays import away_from_ends
 from dln_jax.data.checks.evidence import Prior
 from dln_jax.data.checks.findings import Finding, named
-from dln_jax.data.checks.hypotheses import Build, Log, States, Torques, examine_torques
-from dln_jax.data.checks.hypotheses import friction as friction_of
+from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.joints import better_order, limits, named_order, parameters_of, regressor_of
+from dln_jax.data.checks.repaired import Build, Log, States
+from dln_jax.data.checks.repaired import friction as friction_of
 from dln_jax.data.checks.torques import check_torques
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories

@@ -31,7 +31,7 @@ MEASURES: dict[str, dict[str, Callable[[bool], Findings]]] = {
     "preparation": {"encoders": before_fitting.encoders, "excitation": before_fitting.excitation},
     "logs": {
         "sound": functools.partial(log_checks.sound, with_robot=False),
-        "faulty": log_checks.faulty,
+        **{kind: functools.partial(log_checks.faulty, kind=kind) for kind in log_checks.FAULTS},
         "sound-with-robot": functools.partial(log_checks.sound, with_robot=True),
     },
     "speed": {"seven-axis": speed.speed},

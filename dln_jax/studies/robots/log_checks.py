@@ -3,9 +3,10 @@
 Arms have random frames and two to seven joints, some of them branched, and there is the Panda; they move from point to
 point, wait, and shake. Torques have noise, friction with a Stribeck curve, or neither; encoders have steps and noise. A
 fault that no log without its robot can show (a tilted base, torques in mN m, a wrong clock without measured rates) is
-looked for with the robot, all others without.
+looked for with the robot, all others without. Checks are those of commands that train, by few torques.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,19 +15,17 @@ import numpy as np
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data import schema
-from dln_jax.data.checks import as_recording, examine
+from dln_jax.data.checks import quick
 from dln_jax.data.robots import Robot
 from dln_jax.mechanics import trees
 from dln_jax.scenes.panda import panda
 from dln_jax.studies.case import Findings
-from dln_jax.studies.report import Row, expect
+from dln_jax.studies.report import expect
 
 SOUND, FAULTY, QUICK = 60, 10, 6
 """Logs without a fault, logs of each kind of fault, and those without a fault where it is to be quick."""
 SEED = 20_000
 """Of the reported logs; thresholds were found on other arms, motions and seeds."""
-EQUATIONS = 300
-"""Torques per examination, as in the commands that train."""
 FALSE_ALARMS, FOUND = 0.02, 0.9
 """To reach."""
 STATEMENTS = ("split", "condition", "unexcited", "raw-differences", "gaps", "jitter", "quantisation", "rates")
@@ -201,45 +200,39 @@ FAULTS: Mapping[str, tuple[_Fault, tuple[str, ...], str]] = {
 """What each does to a log, the findings that name it, and what is given beside t, q and tau."""
 
 
-def sound(quick: bool, *, with_robot: bool) -> Findings:
+def sound(few: bool, *, with_robot: bool) -> Findings:
     """The share of sound logs with a false finding."""
-    count, name = QUICK if quick else SOUND, "with-robot" if with_robot else "without-robot"
-    drawn, found = _Drawn(), []
+    count, name = QUICK if few else SOUND, "with-robot" if with_robot else "without-robot"
+    found = []
     for number in range(count):
-        log = drawn.log(number, repeats=number % 2 == 1)
+        log = drawn(number, repeats=number % 2 == 1)
         found.append(bool(false_findings(log, log.robot if with_robot else None)))
     words = f"of {count} sound logs with a false error or warning; every other log repeats rows"
     row = expect(f"log-checks/sound-{name}", "false_alarms", words, np.mean(found), FALSE_ALARMS)
     return Findings([row], {name: [float(each) for each in found]})
 
 
-def faulty(quick: bool) -> Findings:
-    """The share of logs with each fault in which it is found and named."""
-    count, drawn = 1 if quick else FAULTY, _Drawn()
-    rows: list[Row] = []
-    curves: dict[str, list[float]] = {}
-    for place, (kind, (fault, checks, given)) in enumerate(FAULTS.items()):
-        found = []
-        for number in range(count):
-            log = drawn.log(1000 + 100 * place + number, repeats=False)
-            found.append(any(finding in checks for finding in planted(log, fault, given, number)))
-        words = f"of {count} logs, by {checks[0]}" + (" with the robot" if given in ("robot", "tilted") else "")
-        rows.append(expect(f"log-checks/{kind}", "found", words, np.mean(found), FOUND, at_least=True))
-        curves[kind] = [float(each) for each in found]
-    return Findings(rows, curves)
+def faulty(few: bool, *, kind: str) -> Findings:
+    """The share of logs with a fault in which it is found and named."""
+    count, found = 1 if few else FAULTY, []
+    fault, checks, given = FAULTS[kind]
+    for number in range(count):
+        log = drawn(1000 + 100 * list(FAULTS).index(kind) + number, repeats=False)
+        found.append(any(finding in checks for finding in planted(log, fault, given, number)))
+    words = f"of {count} logs, by {checks[0]}" + (" with the robot" if given in ("robot", "tilted") else "")
+    row = expect(f"log-checks/{kind}", "found", words, np.mean(found), FOUND, at_least=True)
+    return Findings([row], {kind: [float(each) for each in found]})
 
 
-class _Drawn:
-    """Arms and their logs by number; arms are kept, because their programs take long to compile."""
+def drawn(number: int, *, repeats: bool) -> Simulated:
+    """The log of a number."""
+    return simulate(_arm(SEED + (number // 6) % 2, 2 + number % 6), SEED + number, repeats=repeats)
 
-    def __init__(self) -> None:
-        self.arms: dict[tuple[int, int], _Arm] = {}
 
-    def log(self, number: int, *, repeats: bool) -> Simulated:
-        key = kind, d = (number // 6) % 2, 2 + number % 6
-        if key not in self.arms:
-            self.arms[key] = random_arm(SEED + kind, d)
-        return simulate(self.arms[key], SEED + number, repeats=repeats)
+@functools.cache
+def _arm(seed: int, d: int) -> _Arm:
+    """A random arm; arms are kept, because their programs take long to compile."""
+    return random_arm(seed, d)
 
 
 def false_findings(log: Simulated, robot: Robot | None) -> list[str]:
@@ -266,5 +259,4 @@ def planted(log: Simulated, fault: _Fault, given: str, seed: int) -> list[str]:
 
 
 def _checks(arrays: Arrays, robot: Robot | None) -> list[str]:
-    examined = examine(as_recording(schema.from_arrays(arrays)), robot, equations=EQUATIONS)
-    return [finding.check for finding in examined.findings if finding.severity != "note"]
+    return [finding.check for finding in quick(schema.from_arrays(arrays), robot) if finding.severity != "note"]

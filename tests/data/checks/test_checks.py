@@ -7,7 +7,9 @@ import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.checks import as_recording, examine, page, quick, read
-from dln_jax.data.checks.energies import STRONGEST, WEAKEST, covariance
+from dln_jax.data.checks.energies import OF_BODY, STRONGEST, WEAKEST, covariances
+from dln_jax.data.checks.evidence import Explanation
+from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.robots import Robot
 from dln_jax.datasets import generators
 from dln_jax.mechanics import trees
@@ -289,26 +291,38 @@ def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     assert on_tree.torques.log.speed == pytest.approx(1.25, rel=0.03)
 
 
-def test_covariance_of_torques_is_that_of_an_energy():
-    """The closed form equals derivatives of the energies' covariance by JAX."""
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_covariance_of_torques_is_that_of_an_energy(place):
+    """The closed forms equal derivatives of the energies' covariance by JAX: of any energy, then of two bodies.
+
+    The first body is moved by the first joint alone; no kinetic energy of a body depends on the first joint's angle.
+    """
     random, joints, sizes = np.random.default_rng(0), ("revolute", "prismatic"), np.array([1.0, 0.4])
     states, others = (tuple(random.normal(size=(2, 2)) for _ in range(3)) for _ in range(2))
-    found = covariance(states, others, joints, sizes)
-    strength = np.clip(STRONGEST * np.sqrt(sizes), WEAKEST, STRONGEST)
+    found = covariances(states, others, joints, sizes)[place]
+    of_any = np.clip(STRONGEST * np.sqrt(sizes), WEAKEST, STRONGEST)
+    kinetic_strength, potential_strength, weights = (
+        (of_any, of_any, sizes),
+        (np.zeros(2), OF_BODY * np.array([1.0, 0.0]), 0.7 * np.array([1.0, 0.0])),
+        (OF_BODY * np.array([0.0, 1.0]), OF_BODY * np.ones(2), 0.7 * np.ones(2)),
+    )[place]
     ranges = np.ptp(states[0], axis=0)
 
-    def kernel(q, other, power):
+    def kernel(q, other, strength, power):
         turning = ((1 + strength[0] * jnp.cos(q[0] - other[0])) / (1 + strength[0])) ** power
-        return turning * jnp.exp(-0.5 * ((q[1] - other[1]) / (2 * ranges[1])) ** 2)
+        return turning * (jnp.exp(-0.5 * ((q[1] - other[1]) / (2 * ranges[1])) ** 2) if strength[1] else 1.0)
 
     def torque(energy, q, qd, qdd):
         return jax.jvp(jax.grad(energy, 1), (q, qd), (qd, qdd))[1] - jax.grad(energy)(q, qd)
 
     def kinetic(state, other):
         def by_state(p, v):
-            return torque(lambda q, u: kernel(q, p, 2) * (u * sizes @ v) ** 2, *state)
+            return torque(lambda q, u: kernel(q, p, kinetic_strength, 2) * (u * weights @ v) ** 2, *state)
 
         return jnp.stack([torque(lambda p, v, i=i: by_state(p, v)[i], *other) for i in range(2)])
+
+    def potential(q, p):
+        return kernel(q, p, potential_strength, 1)
 
     with jax.enable_x64(True):
         for a in range(2):
@@ -316,8 +330,31 @@ def test_covariance_of_torques_is_that_of_an_energy():
                 state, other = ([jnp.asarray(x[k]) for x in xs] for xs, k in ((states, a), (others, b)))
                 block = (slice(2 * a, 2 * a + 2), slice(2 * b, 2 * b + 2))
                 assert found.kinetic[block] == pytest.approx(np.asarray(kinetic(state, other)), abs=1e-12)
-                potential = jax.jacfwd(jax.grad(lambda q, p: kernel(q, p, 1)), 1)(state[0], other[0])
-                assert found.potential[block] == pytest.approx(np.asarray(potential), abs=1e-12)
+                expected = jax.jacfwd(jax.grad(potential), 1)(state[0], other[0])
+                assert found.potential[block] == pytest.approx(np.asarray(expected), abs=1e-12)
+
+
+def test_a_repair_is_judged_by_the_joints_that_it_concerns():
+    """One joint of seven that is predicted twice as well counts, although the mean over all hardly falls."""
+    before = np.full((10, 7), 0.6)
+    after = before.copy()
+    after[:, 3] = 0.3
+    now, other = (
+        Explanation(None, None, None, each, share)
+        for each, share in ((np.zeros(10), before), (np.full(10, 4.0), after))
+    )
+    assert decisive(now, other, 0.8, np.arange(7) == 3)
+    assert not decisive(now, other, 0.8, np.arange(7) == 2) and not decisive(now, other, 0.8, np.ones(7, bool))
+
+
+def test_quick_checks_use_the_robot_where_there_is_one(clean):
+    """A base that is tilted is seen by the robot's file only; rough masses in it are no fault of the log."""
+    data = schema.from_arrays(without(["qd"], clean))
+    tilted = arm(gravity=(0.0, 9.81 * np.sin(0.4), -9.81 * np.cos(0.4)))
+    assert [each.check for each in quick(data, tilted) if each.severity == "error"] == ["gravity"]
+    rough = arm()
+    rough = rough._replace(tree=rough.tree._replace(inertias=np.array([[1.3], [0.7], [1.2]]) * rough.tree.inertias))
+    assert [each for each in quick(data, rough) if each.severity == "error"] == []
 
 
 def test_a_file_that_is_none_is_refused(tmp_path):
