@@ -71,7 +71,6 @@ def run(
     jax.config.update("jax_enable_x64", True)
     with as_one_line(prog, None):
         description = sys.modules[main.__module__].__doc__
-        refuse_moved(arguments)
         try:
             whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
         finally:
@@ -180,13 +179,6 @@ def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
     if hasattr(given, "resume") and getattr(given, "continues", True) and (folder / CONFIG).is_file():
         return f"interrupted; continue with: {command} --out {folder} --resume"
     return f"interrupted; {folder} is incomplete"
-
-
-def refuse_moved(arguments: type) -> None:
-    """Raises `InputError` for an option that has become a command; a class of arguments has them as `MOVED`."""
-    for option, where in getattr(arguments, "MOVED", {}).items():
-        if any(word.partition("=")[0] == option for word in sys.argv[1:]):
-            raise InputError(f"{option} is a command of its own now: {where}")
 
 
 def require_possible(given: Any) -> None:
@@ -312,8 +304,6 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     # What another release had and nobody gave decides nothing.
     stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
     for key, value in stored.items():
-        if where := getattr(arguments, "MOVED", {}).get(f"--{key}"):
-            raise InputError(f"{path}: a run with --{key}, which is a command of its own now: {where}; train it again")
         if key not in expected:
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
         if not matches(value, hints[key]):
