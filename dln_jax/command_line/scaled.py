@@ -78,7 +78,7 @@ def remedy_of(given: Any) -> str:
     """What a user does after a process was lost."""
     if not (hasattr(given, "resume") and getattr(given, "continues", True)):
         return "start all processes again"
-    return f"continue from the last checkpoint in {given.out} with --resume in all processes"
+    return f"continue from the last checkpoint in {getattr(given, 'out', '--out')} with --resume in all processes"
 
 
 def end_at_once(code: int) -> NoReturn:
