@@ -58,7 +58,7 @@ class Scaled:
     processor makes any number, whose work then goes side by side."""
     processes: Unstated[int] = None
     """Processes, on one host or several, that are one run: start the same command in each, with --coordinator and
-    --process-id (default: the tasks of a Slurm step, else 1)."""
+    --process-id (default: the tasks of srun or mpirun, else 1)."""
     coordinator: Unstated[str] = None
     """host:port of process 0, with a free port, which all processes can reach."""
     process_id: Unstated[int] = None

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dln_jax.scale.worker import progressed, reporting
-
 SECONDS_BETWEEN_LINES = 5.0
 ROOM_FOR_RATE = 110
 """Columns of a terminal from which there is room for the rate beside the count, the time left and the text."""
@@ -18,21 +16,8 @@ ROOM_FOR_RATE = 110
 def progress(
     total: int, unit: str = "steps", *, console: Console | None = None
 ) -> Iterator[Callable[[int, str], None]]:
-    """Yields `show(done, text)`, also a sign of progress to whoever watches this process.
-
-    Count, text and time left are whole at 80 columns, and the bar takes what is over.
-    """
-    with reporting(), _shown(total, unit, console or Console()) as shown:
-
-        def show(done: int, text: str) -> None:
-            progressed()
-            shown(done, text)
-
-        yield show
-
-
-@contextmanager
-def _shown(total: int, unit: str, console: Console) -> Iterator[Callable[[int, str], None]]:
+    """Yields `show(done, text)`: count, text and time left are whole at 80 columns, and the bar takes what is over."""
+    console = console or Console()
     if console.is_terminal:
         columns = [
             MofNCompleteColumn(),

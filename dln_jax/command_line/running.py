@@ -15,12 +15,20 @@ import tyro
 
 from dln_jax.command_line import compilation_cache
 from dln_jax.command_line.arguments import choice, own_first, parse
-from dln_jax.command_line.scaled import copied_folder, in_processes, is_first, place_in, wait_for_all
+from dln_jax.command_line.scaled import (
+    copied_folder,
+    end_at_once,
+    is_first,
+    joined,
+    membership_in,
+    remedy_of,
+    wait_for_all,
+)
 from dln_jax.command_line.stored_arguments import with_stored_arguments, write_config
 from dln_jax.data.stated_needs import needs_from_text
 from dln_jax.metrics.verdict import FitRefused
 from dln_jax.scale.devices import unusable_platform
-from dln_jax.scale.signs import USUAL, Limits
+from dln_jax.scale.processes import JOINING, ProcessLost, losses_named
 from dln_jax.scenes.registry import SCENES
 from dln_jax.sizes import require_magnitude, require_within
 from dln_jax.time_limit import IMPORTED, counting_from
@@ -40,26 +48,25 @@ def run(
     *,
     prog: str,
     from_shell: bool = False,
-    limits: Limits = USUAL,
+    joining: int = JOINING,
 ) -> None:
     """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, a refused fit 1,
-    an interrupt 130.
+    a lost process 3, an interrupt 130.
 
     `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs;
-    `limits` are those of several processes, of which each works in a child.
+    `joining`, how many seconds several processes wait for each other to be started.
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
     with as_one_line(prog, None):
         description = sys.modules[main.__module__].__doc__
-        refuse_moved(arguments)
         try:
             whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
         finally:
             sys.stdout.flush()  # the help, perhaps to somebody who has gone
         given = whole.own
         require_possible(given)
-        place = place_in(given)
+        member = membership_in(given)
         if getattr(given, "resume", False):
             given = with_stored_arguments(given)
         before = compilation_cache.compilation() if from_shell else None
@@ -68,27 +75,37 @@ def run(
     began = IMPORTED if from_shell else time.perf_counter()
 
     def work(given: Arguments) -> None:
-        with as_one_line(prog, given), counting_from(began):
+        with as_one_line(prog, given), losses_named(remedy_of(given)), counting_from(began):
             main(given)
             if before and (line := compilation_cache.summary(before, unkept)):
                 print(line)
             sys.stdout.flush()
 
-    if place is None:
+    if member is None:
         work(given)
         return
-    with as_one_line(prog, given):
-        raise SystemExit(in_processes(work, given, place, limits))
+    try:
+        with as_one_line(prog, given):
+            given = joined(member, given, seconds=joining)
+        work(given)
+    except SystemExit as stop:
+        end_at_once(stop.code if isinstance(stop.code, int) else 1)
 
 
 @contextlib.contextmanager
 def as_one_line(prog: str, given: Any) -> Iterator[None]:
-    """Turns mistakes into one line and status 2, as what the machine lacks; a refused fit is 1, an interrupt 130."""
+    """Turns mistakes, and what the machine lacks, into one line and status 2.
+
+    A refused fit is 1, a lost process 3, an interrupt 130.
+    """
     try:
         yield
     except FitRefused as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
+    except ProcessLost as error:
+        _say(f"error: {error}")
+        raise SystemExit(3) from None
     except InputError as error:
         raise _refusal(str(error)) from None
     except MemoryError as error:
@@ -153,13 +170,6 @@ def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
     if hasattr(given, "resume") and getattr(given, "continues", True) and (folder / CONFIG).is_file():
         return f"interrupted; continue with: {command} --out {folder} --resume"
     return f"interrupted; {folder} is incomplete"
-
-
-def refuse_moved(arguments: type) -> None:
-    """Raises `InputError` for an option that has become a command; a class of arguments has them as `MOVED`."""
-    for option, where in getattr(arguments, "MOVED", {}).items():
-        if any(word.partition("=")[0] == option for word in sys.argv[1:]):
-            raise InputError(f"{option} is a command of its own now: {where}")
 
 
 def require_possible(given: Any) -> None:

@@ -2,27 +2,27 @@
 
 import contextlib
 import dataclasses
+import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn
 
 import jax
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from dln_jax.command_line.options import Scaled
 from dln_jax.files import PARTIAL
 from dln_jax.scale import processes
+from dln_jax.scale.meeting import Membership
 from dln_jax.scale.mesh import batch_mesh
-from dln_jax.scale.places import Place, place_of
-from dln_jax.scale.signs import Limits
 from dln_jax.types import InputError
 
 SEEN_BY_USERS = ("figures", "low_latency")
 """What the first process alone does."""
-
-Arguments = TypeVar("Arguments")
 
 
 def mesh_of(given: Scaled) -> Mesh | None:
@@ -37,50 +37,56 @@ def mesh_of(given: Scaled) -> Mesh | None:
     return batch_mesh(1 if alone and given.devices is None else given.devices)
 
 
-def place_in(given: Any) -> Place | None:
-    """This process's place among several, `None` where it is alone; it has the devices that a command asks for.
+def membership_in(given: Any) -> Membership | None:
+    """How this process joins others, `None` where it is alone; a processor has the devices that a command asks for.
 
     Raises:
-        InputError: what is given, or what Slurm says, is no place, or no folder that all processes see is named.
+        InputError: the options, or the cluster's variables, are no membership, or name no folder for all processes.
     """
     if not isinstance(given, Scaled):
         return None
     processes.host_devices(given.devices)
-    place = place_of(given.processes, given.coordinator, given.process_id)
-    if place is not None and getattr(given, "out", None) is None:
-        raise InputError("several processes meet beside their run's folder; name one that all hosts see, by --out")
-    return place
+    member = processes.membership(given.processes, given.coordinator, given.process_id)
+    if member is not None and getattr(given, "out", None) is None:
+        raise InputError("several processes share their run's folder; name one that all hosts see, by --out")
+    return member
 
 
-def in_processes(work: Callable[[Arguments], None], given: Arguments, place: Place, limits: Limits) -> int:
-    """Does `work` in all processes of a command, and gives the exit status; errors as `processes.start`."""
-    of_all: Any = given
-    out = of_all.out.absolute()
-    here = {"processes": place.processes, "coordinator": place.coordinator, "process_id": place.process}
-    if place.process:
-        here |= {name: False for name in SEEN_BY_USERS if hasattr(given, name)}
-    resumable = hasattr(given, "resume") and getattr(given, "continues", True)
-    arguments = {
-        key: str(value) if isinstance(value, Path) else value
-        for key, value in dataclasses.asdict(of_all).items()
-        if key not in (*here, *SEEN_BY_USERS, "out")
+def joined(member: Membership, given: Any, *, seconds: int) -> Any:
+    """Joins the other processes of a command, and gives the arguments of this one; errors as `processes.join`."""
+    own = {"processes", "coordinator", "process_id", "out", *SEEN_BY_USERS}
+    shared = {
+        key: str(v) if isinstance(v, Path) else v for key, v in dataclasses.asdict(given).items() if key not in own
     }
-    # What is left there by a child that was ended goes with its parent.
-    with tempfile.TemporaryDirectory(prefix="dln_jax-") as left:
+    _keep_standard_output_to_python()
+    processes.join(member, {f"--{key.replace('_', '-')}": value for key, value in shared.items()}, seconds=seconds)
+    here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
+    if jax.process_index():
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  to the process's end
+        here |= {name: False for name in SEEN_BY_USERS if hasattr(given, name)}
+    return dataclasses.replace(given, **here)
 
-        def work_here() -> None:
-            tempfile.tempdir = left
-            work(dataclasses.replace(of_all, **here))
 
-        return processes.start(
-            work_here,
-            place,
-            out.with_name(f"{out.name}.processes"),
-            arguments,
-            devices=of_all.devices,
-            remedy="continue with --resume in all" if resumable else "start them again",
-            limits=limits,
-        )
+def _keep_standard_output_to_python() -> None:
+    """Drops what libraries print past Python: gloo states every connection on standard output."""
+    sys.stdout.flush()
+    sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  to the process's end
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def remedy_of(given: Any) -> str:
+    """What a user does after a process was lost."""
+    if not (hasattr(given, "resume") and getattr(given, "continues", True)):
+        return "start all processes again"
+    return f"continue from the last checkpoint in {getattr(given, 'out', '--out')} with --resume in all processes"
+
+
+def end_at_once(code: int) -> NoReturn:
+    """Ends this process without waiting for the others, as JAX's own shutdown does."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(code)
 
 
 def is_first(given: Any) -> bool:
@@ -91,7 +97,7 @@ def is_first(given: Any) -> bool:
 def wait_for_all(given: Any) -> None:
     """Waits until all processes are here."""
     if (getattr(given, "processes", None) or 1) > 1:
-        processes.wait_for_all(mesh_of(given))
+        multihost_utils.sync_global_devices("all are here")
 
 
 @contextlib.contextmanager

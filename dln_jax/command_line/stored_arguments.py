@@ -109,8 +109,6 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     # What another release had and nobody gave decides nothing.
     stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
     for key, value in stored.items():
-        if where := getattr(arguments, "MOVED", {}).get(f"--{key}"):
-            raise InputError(f"{path}: a run with --{key}, which is a command of its own now: {where}; train it again")
         if key not in expected:
             raise InputError(f"{path}: {key!r:.40} is no argument of this release; {remedy}")
         if not matches(value, hints[key]):

@@ -4,7 +4,7 @@ The grid is for example 'width=8,16 seed=0:10 data=a.npz,b.npz': values by comma
 without b, and all combinations of them. Options are checked before anything starts. A sweep's folder gets a folder for
 each job, table.csv with all their metrics, sweep.json and sweep.png: error against seconds, and the best by validation
 alone. Jobs that fail are listed with their one line, and the exit status is 1; --resume does only what is not done.
-here and slurm need the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
+slurm needs the extra [sweep], ray the extra [ray]; hosts must share the sweep's folder.
 """
 
 import importlib
@@ -36,7 +36,7 @@ class Arguments(Resumable):
     """Options that all jobs have: 'steps=500 figures=no test=e,q,v'; a comma is part of the value."""
     where: Unstated[Literal["here", "slurm", "ray", "later"]] = None
     """What runs the jobs: processes on this machine, an array of the Slurm cluster, Ray, or what you have: later only
-    writes the jobs (default: here)."""
+    writes the jobs' lines (default: here)."""
     jobs: Unstated[int] = None
     """Jobs at once (default: as many as there are cores; of Slurm, what it allows). Times are those beside others."""
     gpus: Unstated[int] = None
@@ -79,7 +79,7 @@ def main(given: Arguments) -> None:
     plan(name, arguments, grid, fixed, Path())  # refused before there is a folder
     with command_folder(given, "sweep") as folder:
         jobs = plan(name, arguments, grid, fixed, folder.absolute())
-        if not sweep(jobs, name, asked, folder.absolute()):
+        if not sweep(jobs, asked, folder.absolute()):
             raise SystemExit(1)
 
 

@@ -7,7 +7,7 @@ the embedded letters; a run folder gets what train_delan writes. Motions without
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from dln_jax.data import schema
 from dln_jax.runs.dynamics import run
@@ -18,8 +18,6 @@ from dln_jax.types import InputError
 @dataclass(frozen=True)
 class Arguments(Options):
     """What to train on, how, and where the results go."""
-
-    MOVED: ClassVar = {"--task": "train_hnn_task --task NAME, and train_hnn_pixels for pixels"}
 
     model: Literal["structured-hnn", "black-box-hnn"] = "structured-hnn"
     """What is learned."""

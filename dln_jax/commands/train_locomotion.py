@@ -8,7 +8,7 @@ each other are what compare_locomotion trains.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 from dln_jax.command_line.arguments import refuse_given
 from dln_jax.command_line.options import Drawn, Resumable, Scaled
@@ -25,8 +25,6 @@ UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
 @dataclass(frozen=True)
 class Arguments(Options, Resumable, Drawn, Scaled):
     """What to train, how, and where the results go."""
-
-    MOVED: ClassVar = {"--compare": "compare_locomotion"}
 
     method: Literal["gradient", "evolution", "ppo"] = "gradient"
     """How to learn; what ppo has learned is not stored on its way, so that it cannot be resumed."""

@@ -1,7 +1,7 @@
 """From options to a differential network's task: the samples of a function, and how it is trained on them."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -31,8 +31,6 @@ SHARE_OF_DATA = 0.75
 @dataclass(frozen=True)
 class Options(Resumable, Drawn, Scaled):
     """What to train on, how, and where the results go."""
-
-    MOVED: ClassVar = {"--table": "diffnet_table"}
 
     function: Annotated[str, choice((*NAMED, "FILE.npz"))] = "sin"
     """sin, cos_sin, or the path of an npz file with x [N, n], y [N, m], optional dy [N, m, n] and d2y [N, m, n, n]."""

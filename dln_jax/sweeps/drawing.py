@@ -1,6 +1,6 @@
 """What of a sweep is drawn: which options are colours and markers, and which runs are points."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
@@ -38,7 +38,7 @@ def drawn(
     shown_by = [name for name in found[0].job.values if name not in (*over, *(PROBLEM if panels else ()))]
     colour, marker = (*shown_by, "", "")[:2]
 
-    def point(values: dict[str, str], seconds: float, error: float, **flags: bool) -> Point:
+    def point(values: Mapping[str, str], seconds: float, error: float, **flags: bool) -> Point:
         looks = [shown(values[name]) if name else "" for name in (colour, marker)]
         return Point(seconds, error, *looks, problem=", ".join(problem_of(values)) if panels else "", **flags)
 

@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.files import is_file, read_json
-from dln_jax.sweeps.plan import Job
-from dln_jax.sweeps.status import Status, status_of
+from dln_jax.sweeps.job import METRICS, Job, Status, status_of
 from dln_jax.types import InputError
 
-METRICS = "metrics.json"
 VALIDATION = ("validation_error", "validation_loss", "validation")
 ERRORS = ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_mean")
 SECONDS = ("train_seconds", "learning_seconds", "identify_seconds")

@@ -1,21 +1,23 @@
-"""A sweep from its jobs to its table: what is not done is run, and everything is shown."""
+"""A sweep from its jobs to its table: what is not done is run, and everything is compared."""
 
-from collections.abc import Sequence
+import shlex
+import time
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from dln_jax.command_line.progress import progress
-from dln_jax.files import write_figure
+from dln_jax.files import write_figure, write_json
 from dln_jax.sweeps.drawing import drawn, undone
-from dln_jax.sweeps.engines import Engine, run_all
-from dln_jax.sweeps.here import cores, here
-from dln_jax.sweeps.on_ray import ray
-from dln_jax.sweeps.plan import Job, write_jobs
+from dln_jax.sweeps.executors import Submit, cores, here, ray, slurm
+from dln_jax.sweeps.job import STATUS, Job, status_of
 from dln_jax.sweeps.results import ERRORS, Entry, Names, best_of, entries, groups, names_in, require_known
-from dln_jax.sweeps.slurm import slurm
-from dln_jax.sweeps.status import status_of
 from dln_jax.sweeps.tables import print_groups, print_jobs, write_tables
+
+SECONDS_BETWEEN_LOOKS = 0.2
+LATER = "jobs.sh"
+"""File in the sweep's folder with the line of each job, for --where later."""
 
 
 class Asked(NamedTuple):
@@ -36,44 +38,70 @@ class Asked(NamedTuple):
         return self.at_once or (None if self.where == "slurm" else self.gpus or cores())
 
 
-def sweep(jobs: Sequence[Job], command: str, asked: Asked, folder: Path) -> bool:
+def sweep(jobs: Sequence[Job], asked: Asked, folder: Path) -> bool:
     """Runs the jobs that are not done, prints and writes what came of all; whether all are done.
 
     Raises:
         InputError: what runs the jobs is missing, or refuses them; or no job has a metric that was asked for.
         KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
     """
-    if asked.where == "later":
-        write_jobs(jobs, command)
-        print(f"{len(jobs)} jobs; each is done by: python -m dln_jax.sweeps.work {folder}/jobs/NUMBER/job.json")
-        print(f"and the table is made by: --out {folder} --resume --where here")
-        return True
     left = [job for job in jobs if status_of(job.folder).state != "done"]
+    if asked.where == "later":
+        (folder / LATER).write_text("".join(f"{shlex.join(job.line(job.folder / 'run'))}\n" for job in left))
+        print(f"{len(left)} jobs, a line each in {folder / LATER}, to be run from {Path.cwd()}")
+        print(f"the table is made by: --out {folder} --resume --where here")
+        return True
     if left:
-        before = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
+        done = f", {len(jobs) - len(left)} are done" if len(left) < len(jobs) else ""
         beside = "an array of the cluster" if asked.beside is None else f"{asked.beside} at once"
-        with engine_of(asked, folder, len(left)) as engine, progress(len(left), "jobs") as show:
-            write_jobs(jobs, command)
-            print(f"{command}: {len(left)} of {len(jobs)} jobs{before}; {asked.where}, {beside}", flush=True)
-            run_all(engine, [job.path for job in left], lambda over, bad: show(over, f"{bad} not done" if bad else ""))
+        with executor_of(asked, folder) as submit, progress(len(left), "jobs") as show:
+            print(f"{jobs[0].command}: {len(left)} of {len(jobs)} jobs{done}; {asked.where}, {beside}", flush=True)
+            run(left, submit, lambda over, bad: show(over, f"{bad} not done" if bad else ""))
     found = entries(jobs)
     require_known(found, metric=asked.metric, error=asked.error)
     names = names_in(found, asked.metric, asked.error, largest=asked.largest)
     best, of = best_of(found, names), groups(found, asked.over, names)
-    write_tables(folder, found, best, of, names, command=command, where=asked.where, at_once=asked.beside)
+    write_tables(folder, found, best, of, names, command=jobs[0].command, where=asked.where, at_once=asked.beside)
     if figure := drawn(found, best, of, asked.over, names, beside=asked.beside):
         write_figure(folder / "sweep.png", figure)
-    print_jobs(found, best, names, title=f"{command}, {len(jobs)} jobs")
+    print_jobs(found, best, names, title=f"{jobs[0].command}, {len(jobs)} jobs")
     if asked.over:
         print_groups(of, names, asked.over)
     conclude(found, best, names, folder)
     return all(entry.status.state == "done" for entry in found)
 
 
-def engine_of(asked: Asked, folder: Path, jobs: int) -> AbstractContextManager[Engine]:
+def run(jobs: Sequence[Job], submit: Submit, report: Callable[[int, int], None] = lambda over, bad: None) -> None:
+    """Runs jobs by any executor until all are over, and stores of each that ended without a word that it was killed.
+
+    Args:
+        jobs: a job is a function without arguments, which an executor calls wherever its folder is seen.
+        submit: jobs -> futures, which have `done()` and `cancel()`: `lambda jobs: [pool.submit(job) for job in jobs]`.
+        report: called with how many are over, and how many of them are not done.
+    """
+    for job in jobs:
+        job.folder.mkdir(parents=True, exist_ok=True)
+        status = status_of(job.folder)
+        write_json(job.folder / STATUS, status._replace(state="missing", line="")._asdict())
+    waiting = list(zip(jobs, submit(jobs), strict=True))
+    bad = 0
+    try:
+        while waiting:
+            time.sleep(SECONDS_BETWEEN_LOOKS)
+            over = [(job, future) for job, future in waiting if future.done()]
+            waiting = [each for each in waiting if each not in over]
+            bad += sum(_closed(job, future) != "done" for job, future in over)
+            report(len(jobs) - len(waiting), bad)
+    except BaseException:
+        for _, future in waiting:
+            future.cancel()
+        raise
+
+
+def executor_of(asked: Asked, folder: Path) -> AbstractContextManager[Submit]:
     """What runs the jobs; errors as it is entered."""
     if asked.where == "slurm":
-        return slurm(folder, jobs, asked.beside, asked.slurm)
+        return slurm(folder, asked.beside, asked.slurm)
     at_once = asked.beside or 1
     return ray(at_once, asked.gpus) if asked.where == "ray" else here(at_once, asked.gpus)
 
@@ -96,3 +124,15 @@ def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder
         print(undone(found), *(f"  {', '.join(jobs)} {line}" for line, jobs in wrong.items()), sep="\n")
         print(f"--out {folder} --resume does them again")
     print(f"sweep: {folder}")
+
+
+def _closed(job: Job, future: object) -> str:
+    """The state of a job whose future is done; one that has not stored its end was killed."""
+    status = status_of(job.folder)
+    if status.state in ("missing", "running"):
+        word = getattr(future, "state", "")  # of Slurm, such as OUT_OF_MEMORY
+        how = "did not start" if status.state == "missing" else "ended without a word"
+        line = f"{how} ({word})" if isinstance(word, str) and word else how
+        status = status._replace(state="killed", line=line)
+        write_json(job.folder / STATUS, status._asdict())
+    return status.state

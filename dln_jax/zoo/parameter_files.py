@@ -20,8 +20,6 @@ from dln_jax.types import InputError
 MODEL = "model"
 """Name of the file pair in a run's folder that holds the trained model."""
 SCHEMA_VERSION = 2
-READ = (1, SCHEMA_VERSION)
-"""Versions that this release reads."""
 REMEDY = "restore the file or train again"
 
 
@@ -83,10 +81,8 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
         raise InputError(f"{path}: no such file; give the folder of a run that has written one")
     manifest = read_json(path, remedy=REMEDY)
     version, file_name = manifest.get("schema_version"), manifest.get("tensor_file")
-    if type(version) is not int or version not in READ:
-        raise InputError(
-            f"{path}: schema version {reprlib.repr(version)}; this release reads {READ[0]} and {READ[1]}; {REMEDY}"
-        )
+    if type(version) is not int or version != SCHEMA_VERSION:
+        raise InputError(f"{path}: schema version {reprlib.repr(version)}; expected {SCHEMA_VERSION}; {REMEDY}")
     if not isinstance(file_name, str) or Path(file_name).name != file_name:
         raise InputError(f"{path}: tensor_file is {reprlib.repr(file_name)}, expected a name in that folder; {REMEDY}")
     tensors = manifest.get("tensors")

@@ -20,7 +20,6 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.models.uncertainty import Uncertainty, outside, predictive
 from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
-from dln_jax.zoo import older
 from dln_jax.zoo.descriptions import OWN, Description, build
 from dln_jax.zoo.differential_network import Derivatives, FunctionModel
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, require_fitting, save_tree
@@ -182,7 +181,7 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
             names the line to add.
     """
     directory = Path(directory)
-    description, old = read_description(directory)
+    description = read_description(directory)
     if description.get("precision") == "f64":
         require_double_precision(str(directory))
     try:
@@ -190,25 +189,17 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
     except InputError as error:
         raise InputError(f"{directory / MODEL}.json: {error}") from None
     like = jax.eval_shape(model.init, jax.random.key(0))
-    parameters = load_tree(directory, MODEL, older.stored_types(like) if old else like)
+    parameters = load_tree(directory, MODEL, like)
     parameters = jax.tree.map(lambda leaf, as_built: leaf.astype(as_built.dtype), parameters, like)
     return Run(model, parameters, description, load_uncertainty(directory))
 
 
-def read_description(directory: Path) -> tuple[Description, bool]:
-    """The description in a run's folder, in the words of this release, and whether an older one wrote it.
-
-    Raises:
-        InputError: there is none.
-    """
-    manifest = load_manifest(directory, MODEL)
-    description, old = manifest.get("model"), manifest["schema_version"] == older.VERSION
+def read_description(directory: Path) -> Description:
+    """The description in a run's folder; `InputError` if there is none."""
+    description = load_manifest(directory, MODEL).get("model")
     if not isinstance(description, dict):
         raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
-    try:
-        return (older.upgraded(description) if old else description), old
-    except InputError as error:
-        raise InputError(f"{directory / MODEL}.json: {error}") from None
+    return description
 
 
 def compiled(functions: Functions, dtype: Any) -> Functions:

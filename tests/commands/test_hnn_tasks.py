@@ -260,10 +260,8 @@ def test_what_a_task_does_not_take_is_one_line(positions, capsys):
         assert not (positions.parent / f"none-{number}").exists()
 
 
-def test_what_was_an_option_of_train_hnn_names_its_command(positions, capsys):
+def test_options_and_models_of_other_commands_are_refused(positions, capsys):
     cases = [
-        (("--task", "spring"), "--task is a command of its own now: train_hnn_task --task NAME, and train_hnn_pixels"),
-        (("--task=pixels", "--steps", "3"), "train_hnn_pixels for pixels"),
         (("--model", "baseline"), "invalid choice 'baseline'"),
         (("--trajectories", "5"), "Unrecognized options: --trajectories"),
     ]

@@ -176,7 +176,6 @@ MISTAKES = {
         "y has numbers of up to",
     ),
     "mark in dy": ({"dy": np.full((60, 2, 3), 1e200)}, [], "dy has numbers of up to"),
-    "table": (None, ["--table", "--seed", "1"], "--table is a command of its own now: diffnet_table"),
 }
 
 

@@ -4,9 +4,12 @@ import contextlib
 import csv
 import json
 import os
+import shlex
 import signal
+import subprocess
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,89 +20,84 @@ from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.figures.sweeps import Point, error_against_seconds
 from dln_jax.scenes.registry import scene_named
-from dln_jax.sweeps import engines, work
 from dln_jax.sweeps import sweep as course
-from dln_jax.sweeps.engines import Engine
-from dln_jax.sweeps.status import Status, status_of, write_status
-from dln_jax.types import InputError
+from dln_jax.sweeps.executors import here
+from dln_jax.sweeps.job import Job, Status, status_of
 
 WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
 """Validation errors of pretended trainings; seeds add to them."""
 
 
-def trained(line):
-    """Pretends to be a command: its test error is least where its validation is worst."""
-    given = dict(word.removeprefix("--").split("=", 1) for word in line[1:] if "=" in word)
-    width, seed = given["width"], int(given["seed"])
-    out = os.path.join(given["out"], "")
-    os.makedirs(out, exist_ok=True)
-    with open(out + "config.json", "w") as config:
-        config.write("{}")
-    print(f"training of width {width}")
-    if width == "8" and seed == 1 and "--resume" not in line:
-        os.write(2, b"error: the loss stopped being finite\n")
-        return 2
+class Over:
+    """A future that is done."""
+
+    state = "OUT_OF_MEMORY"
+
+    def done(self):
+        return True
+
+
+def trained(job, resumed):
+    """Pretends to be a run of a job: its test error is smallest where its validation error is largest."""
+    width, seed = job.values["width"], int(job.values["seed"])
+    before = status_of(job.folder)
+    if before.attempt and not job.resumes:
+        before = before._replace(run=f"run-{before.attempt + 1}")
+    run = job.folder / before.run
+    run.mkdir(exist_ok=True)
+    (run / "config.json").write_text("{}")
+    status = Status("running", attempt=before.attempt + 1, run=before.run)
+    if width == "8" and seed == 1 and not resumed:
+        return status._replace(state="failed", line="the loss stopped being finite")
+    if width == "2" and seed == 1 and not resumed:
+        return status
     validation = WIDTHS[width] * (1 + seed)
-    with open(out + "metrics.json", "w") as metrics:
-        json.dump(
-            {"validation_error": validation, "torque_mse": 1e-7 / validation, "train_seconds": 1.0 + seed}, metrics
-        )
-    return 0
-
-
-@pytest.fixture(autouse=True)
-def no_logger_of_submitit(monkeypatch):
-    """It would keep the stream of the test that imports it."""
-    monkeypatch.setenv("SUBMITIT_LOG_LEVEL", "NOCONFIG")
+    metrics = {"validation_error": validation, "torque_mse": 1e-7 / validation, "train_seconds": 1.0 + seed}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    return status._replace(state="done")
 
 
 @pytest.fixture
-def engine(monkeypatch):
-    """Jobs one after the other in this process; the first time that of width 2 and seed 1 is killed as it begins."""
+def executor(monkeypatch):
+    """Jobs one after the other; the first time one fails, and one is killed as it begins."""
     begun = []
 
-    def start(paths):
-        for path in paths:
-            values = json.loads(path.read_text())["values"]
-            begun.append(values)
-            if values == {"width": "2", "seed": "1"} and begun.count(values) == 1:
-                write_status(path.parent, Status("running", attempt=1, run="run"))
-                continue
-            with contextlib.suppress(SystemExit):
-                work.Work()(str(path))
-        return paths
+    def submit(jobs):
+        for job in jobs:
+            begun.append(job.values)
+            status = trained(job, resumed=begun.count(job.values) > 1)
+            (job.folder / "status.json").write_text(json.dumps(status._asdict()))
+        return [Over() for _ in jobs]
 
-    monkeypatch.setattr(work, "exit_code", trained)
-    monkeypatch.setattr(engines, "SECONDS_BETWEEN_LOOKS", 0.0)
-    made = Engine(start, lambda path: "OUT_OF_MEMORY", lambda paths: None, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
+    monkeypatch.setattr(course, "SECONDS_BETWEEN_LOOKS", 0.0)
+    monkeypatch.setattr(course, "executor_of", lambda asked, folder: contextlib.nullcontext(submit))
     return begun
 
 
 @pytest.mark.parametrize("option", ["metric", "error"])
-def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, engine, capfd, option):
+def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, executor, capfd, option):
     out = tmp_path / "sweep"
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
     said = capfd.readouterr().err
     assert stop.value.code == 2 and not (out / "table.csv").exists()
     assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in said
-    begun = len(engine)
+    begun = len(executor)
     command(sweep, "--out", out, "--resume", f"--{option}", "torque_mse")
-    assert len(engine) == begun == 2 and (out / "table.csv").is_file()
+    assert len(executor) == begun == 2 and (out / "table.csv").is_file()
 
 
-def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, engine, capfd):
+def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, executor, capfd):
     out = tmp_path / "sweep"
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0:3", "--fixed", "steps=3", "--out", out)
     said = capfd.readouterr().out
-    assert stop.value.code == 1 and len(engine) == 9
+    assert stop.value.code == 1 and len(executor) == 9
     found = json.loads((out / "sweep.json").read_text())
     states = [job["state"] for job in found["jobs"]]
     assert states == ["done", "killed", *["done"] * 5, "failed", "done"]
     assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in said
-    assert "0007 failed: the loss stopped being finite" in said and "training of width" not in said
+    assert "0007 failed: the loss stopped being finite" in said
     assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
     # Validation chooses, and the test errors are such that it is the worst of them.
     (best,) = [job["values"] for job in found["jobs"] if job["best"]]
@@ -114,7 +112,7 @@ def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, engine, c
     assert of["2"]["done"] == 2 and of["2"]["medians"]["validation_error"] == pytest.approx(np.median([3e-3, 9e-3]))
 
     command(sweep, "--out", out, "--resume", "--best", "largest")
-    assert engine[9:] == [{"width": "2", "seed": "1"}, {"width": "8", "seed": "1"}]
+    assert executor[9:] == [{"width": "2", "seed": "1"}, {"width": "8", "seed": "1"}]
     found = json.loads((out / "sweep.json").read_text())
     assert {job["state"] for job in found["jobs"]} == {"done"}
     (best,) = [job for job in found["jobs"] if job["best"]]
@@ -122,27 +120,36 @@ def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, engine, c
     # What was begun was continued, in its folder.
     assert status_of(out / "jobs" / "0007")[:4] == ("done", "", 2, "run")
     command(sweep, "--out", out, "--resume")
-    assert len(engine) == 11
+    assert len(executor) == 11
 
 
-def test_jobs_for_later_are_done_by_anything(tmp_path, engine, capsys):
+def test_jobs_for_later_are_done_by_anything(tmp_path, executor, capsys):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=2,4 seed=0", "--where", "later", "--out", out)
-    assert "python -m dln_jax.sweeps.work" in capsys.readouterr().out and not (out / "sweep.json").exists()
-    for path in sorted((out / "jobs").glob("*/job.json")):
-        assert work.perform(path) == 0
+    assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
+    lines = [shlex.split(line) for line in (out / "jobs.sh").read_text().splitlines()]
+    for width, line in zip(("2", "4"), lines, strict=True):
+        assert line[1:4] == ["-m", "dln_jax", "train_delan"] and f"--width={width}" in line
+        run = Path(line[-1].removeprefix("--out="))
+        run.mkdir(parents=True)
+        (run / "metrics.json").write_text(json.dumps({"validation_error": WIDTHS[width]}))
     command(sweep, "--out", out, "--resume", "--where", "here")
-    assert not engine and "best by validation_error: width=4" in capsys.readouterr().out
+    assert not executor and "best by validation_error: width=4" in capsys.readouterr().out
 
 
-def test_what_cannot_be_continued_is_begun_anew(tmp_path, engine):
+def test_a_job_is_not_done_twice_and_continues_where_its_command_can(tmp_path):
+    """With a command that is no training: what it prints and how it ends is what a job stores."""
+    job = Job(tmp_path / "0", "check_data", ("--data=none.npz",), {}, resumes=False, directory=tmp_path)
+    (job.folder / "run").mkdir(parents=True)  # of somebody else
     for attempt in (1, 2):
-        with contextlib.suppress(SystemExit):
-            command(sweep, "--grid", "width=8 seed=1", "--out", tmp_path / "sweep", *["--resume"] * (attempt - 1))
-        (job,) = (tmp_path / "sweep" / "jobs").iterdir()
-        stored = json.loads((job / "job.json").read_text())
-        (job / "job.json").write_text(json.dumps(stored | {"resumes": False}))
-    assert status_of(job).run == "run-2"
+        job()
+        status = status_of(job.folder)
+        assert (status.state, status.attempt, status.run) == ("failed", attempt, "run-1")
+        assert "none.npz" in status.line and "none.npz" in (job.folder / "output.txt").read_text()
+    (job.folder / "status.json").unlink()
+    (job.folder / "run" / "metrics.json").write_text("{}")
+    job()
+    assert not (job.folder / "status.json").exists()
 
 
 STATUS = {
@@ -157,44 +164,31 @@ STATUS = {
 
 
 @pytest.mark.parametrize("damage", STATUS)
-def test_a_status_that_is_not_a_job_s_own_is_refused(tmp_path, engine, capsys, damage):
+def test_a_status_that_is_not_a_job_s_own_is_refused(tmp_path, executor, capsys, damage):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=4 seed=0", "--out", out)
     path = out / "jobs" / "0000" / "status.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **STATUS[damage]}))
     assert "status.json" in refused(capsys, sweep, "--out", out, "--resume")
-    assert not (tmp_path / "X").exists() and len(engine) == 1
+    assert not (tmp_path / "X").exists() and len(executor) == 1
 
 
-def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, engine):
+def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, executor):
     out = tmp_path / "sweep"
     command(sweep, "--grid", "width=4 seed=0", "--out", out)
     for run in (out / "jobs" / "0000" / "run").iterdir():
         run.unlink()
     command(sweep, "--out", out, "--resume")
-    assert len(engine) == 2
+    assert len(executor) == 2
 
 
-@pytest.mark.parametrize(
-    "change", [{"arguments": "x"}, {"arguments": [1]}, {"command": 3}, {"folder": "/nowhere"}], ids=str
-)
-def test_a_damaged_job_is_refused(tmp_path, engine, capsys, change):
-    out = tmp_path / "sweep"
-    command(sweep, "--grid", "width=4 seed=0", "--where", "later", "--out", out)
-    path = out / "jobs" / "0000" / "job.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    assert "job.json" in refused(capsys, sweep, "--out", out, "--resume", "--where", "here")
-    with pytest.raises(InputError, match=r"job\.json"):
-        work.perform(path)
-
-
-def test_the_best_is_of_each_problem(tmp_path, engine):
+def test_the_best_is_of_each_problem(tmp_path, executor):
     for name in "ab":
         (tmp_path / name).touch()
     command(
         sweep,
         "--grid",
-        f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0:2",
+        f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0:4:2",
         "--over",
         "seed,width",
         "--out",
@@ -205,18 +199,35 @@ def test_the_best_is_of_each_problem(tmp_path, engine):
     assert [group["jobs"] for group in found["groups"]] == [4, 4]
 
 
-def test_an_interrupt_ends_the_jobs(tmp_path, engine, monkeypatch, capsys):
-    stopped = []
+def test_an_interrupt_cancels_the_jobs(tmp_path, executor, monkeypatch, capsys):
+    cancelled = []
 
-    def interrupted(handle):
-        raise KeyboardInterrupt
+    class Future:
+        def done(self):
+            raise KeyboardInterrupt
 
-    made = Engine(list, interrupted, stopped.extend, at_once=2)
-    monkeypatch.setattr(course, "engine_of", lambda asked, folder, jobs: contextlib.nullcontext(made))
+        def cancel(self):
+            cancelled.append(self)
+
+    submit = contextlib.nullcontext(lambda jobs: [Future() for _ in jobs])
+    monkeypatch.setattr(course, "executor_of", lambda asked, folder: submit)
     with pytest.raises(SystemExit) as stop:
         command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
     assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
-    assert [path.parent.name for path in stopped] == ["0000", "0001"]
+    assert len(cancelled) == 3
+
+
+def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
+    """And leaves jobs that are not begun."""
+    jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
+    with pytest.raises(KeyboardInterrupt), here(1, 0) as submit:
+        futures = submit(jobs)
+        until = time.monotonic() + 60
+        while status_of(jobs[0].folder).state != "running" and time.monotonic() < until:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert futures[0].done() and futures[1].cancelled()
+    assert status_of(jobs[0].folder)[:2] == ("killed", "interrupted") and not jobs[1].folder.exists()
 
 
 MISTAKES = [
@@ -239,14 +250,14 @@ def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, c
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("where", "package", "extra"), [("here", "submitit", "sweep"), ("ray", "ray", "ray")])
-def test_an_engine_that_is_missing_is_named(where, package, extra, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("where", "package", "extra"), [("slurm", "submitit", "sweep"), ("ray", "ray", "ray")])
+def test_an_executor_that_is_missing_is_named(where, package, extra, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, package, None)
     line = refused(capsys, sweep, "--grid", "width=8", "--where", where, "--out", tmp_path / "s")
     assert f"pip install 'dln-jax[{extra}]'" in line and not (tmp_path / "s").exists()
 
 
-def test_another_grid_is_refused(tmp_path, engine, capsys):
+def test_another_grid_is_refused(tmp_path, executor, capsys):
     command(sweep, "--grid", "width=2 seed=0", "--out", tmp_path / "s")
     line = refused(capsys, sweep, "--grid", "width=4 seed=0", "--out", tmp_path / "s", "--resume")
     assert "was started with grid = width=2 seed=0" in line
@@ -263,14 +274,16 @@ def test_the_figure_shows_every_run_and_rings_the_best():
 
 
 def kill_as_it_begins(job):
-    """SIGKILL to a job's process as soon as it says that it runs."""
+    """SIGKILL to a job's command as soon as it runs."""
     until = time.monotonic() + 60
-    while time.monotonic() < until and (status := status_of(job)).state != "running":
-        time.sleep(0.002)
-    os.kill(status.process, signal.SIGKILL)
+    found = ""
+    while time.monotonic() < until and not found:
+        found = subprocess.run(["pgrep", "-f", f"out={job}"], capture_output=True, text=True).stdout
+        time.sleep(0.01)
+    os.kill(int(found.split()[0]), signal.SIGKILL)
 
 
-@pytest.mark.parametrize(("where", "package"), [("here", "submitit"), ("ray", "ray")])
+@pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
 def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
     """One is done, one fails, and one is killed from outside."""
     pytest.importorskip(package)
