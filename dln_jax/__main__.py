@@ -1,21 +1,26 @@
 """The commands from the shell: `dln-jax NAME ...`, or `python -m dln_jax NAME ...`."""
 
 import ast
+import difflib
 import importlib
 import importlib.util
 import os
 import sys
 from pathlib import Path
 
-from dln_jax.commands import command_names
+from dln_jax.commands import COMMANDS
+
+REPORTS = "scripts.reports.commands"
+"""Package of the commands that measure the project, which a checkout has and the wheel has not."""
 
 
-def command(name: str, prog: str) -> None:
+def command(name: str, prog: str, *, package: str = "dln_jax.commands") -> None:
     """Runs one command with the arguments of this process.
 
     Args:
-        name: of a module in `dln_jax.commands`.
+        name: of a module in `package`.
         prog: what the user typed to get here, for help and for messages.
+        package: where the command is.
     """
     # Factorisations here are small: OpenBLAS's threads spin while they wait for each other, which took 4 to 20
     # times the processor time of one thread in a step of 560 tetrahedra. Read as SciPy is imported; what is set stays.
@@ -24,7 +29,7 @@ def command(name: str, prog: str) -> None:
     try:
         from dln_jax.command_line.running import run
 
-        module = importlib.import_module(f"dln_jax.commands.{name}")
+        module = importlib.import_module(f"{package}.{name}")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
@@ -32,33 +37,61 @@ def command(name: str, prog: str) -> None:
 
 
 def main() -> None:
-    """The command that the first argument names; without one, or with --help, what there is."""
+    """The command that the first argument names; without one, or with --help, a list of them."""
     prog = "dln-jax" if Path(sys.argv[0]).stem == "dln-jax" else "python -m dln_jax"
-    names = command_names()
-    given = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    words = sys.argv[1:]
+    if words[:1] == ["--version"]:
+        from importlib.metadata import version
+
+        print(f"dln-jax {version('dln-jax')}")
+        return
+    if words[:1] == ["report"]:
+        _choose(words[1:], f"{prog} report", REPORTS, report_names())
+    else:
+        _choose(words, prog, "dln_jax.commands", COMMANDS, "\nreport NAME, in a checkout, measures the project\n")
+
+
+def report_names() -> list[str]:
+    """Names of the reports of this checkout, sorted; none where there is no checkout."""
     try:
-        if given in ("-h", "--help"):
+        found = importlib.util.find_spec(REPORTS)
+    except ModuleNotFoundError:
+        found = None
+    places = [] if found is None else found.submodule_search_locations or []
+    return sorted(file.stem for place in places for file in Path(place).glob("[a-z]*.py"))
+
+
+def _choose(words: list[str], prog: str, package: str, names: list[str], more: str = "") -> None:
+    """Runs the command that the first word names, or lists what there is."""
+    if not names:
+        print("error: reports are part of the project's checkout, not of the installed package", file=sys.stderr)
+        raise SystemExit(2)
+    first = words[0] if words else "--help"
+    try:
+        if first in ("-h", "--help"):
             print(f"usage: {prog} COMMAND [OPTIONS]\n\n{prog} COMMAND --help states units and defaults\n\ncommands:")
             width = max(map(len, names))
             for name in names:
-                print(f"  {name:{width}}  {first_line(name)}")
-            sys.stdout.flush()
+                print(f"  {name:{width}}  {first_line(name, package)}")
+            print(more, end="", flush=True)
             return
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
-    name = given.replace("-", "_")
+    name = first.replace("-", "_")
     if name not in names:
-        print(f"error: '{given:.80}' is no command; choose from {', '.join(names)}".replace("\n", " "), file=sys.stderr)
+        like = difflib.get_close_matches(name, names, n=1)
+        remedy = f"did you mean {like[0]}?" if like else f"choose from {', '.join(names)}"
+        print(f"error: '{first:.80}' is no command; {remedy}".replace("\n", " "), file=sys.stderr)
         raise SystemExit(2)
-    del sys.argv[1]
-    command(name, f"{prog} {name}")
+    del sys.argv[1 : len(sys.argv) - len(words) + 1]
+    command(name, f"{prog} {name}", package=package)
 
 
-def first_line(name: str) -> str:
-    """What a command says that it does."""
+def first_line(name: str, package: str = "dln_jax.commands") -> str:
+    """What a command's first line states that it does."""
     # Read and not imported: some commands take seconds to import.
-    specification = importlib.util.find_spec(f"dln_jax.commands.{name}")
+    specification = importlib.util.find_spec(f"{package}.{name}")
     source = Path(str(specification and specification.origin)).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 

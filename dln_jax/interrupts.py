@@ -24,7 +24,7 @@ def is_command() -> bool:
     """Whether this process was started as `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`, by no other."""
     words = sys.orig_argv
     package, _, name = words[words.index("-m") + 1 :][0].partition(".") if "-m" in words[:-1] else ("", "", "")
-    script = package == "scripts" and (Path(__file__).parent / "commands" / f"{name}.py").is_file()
+    script = package == "scripts" and (Path(__file__).parents[1] / "scripts" / f"{name}.py").is_file()
     return script or (package == "dln_jax" and not name) or Path(sys.argv[0]).stem == "dln-jax"
 
 

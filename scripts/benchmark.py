@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("benchmark", "python -m scripts.benchmark")
+command("benchmark", "python -m scripts.benchmark", package="scripts.reports.commands")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("delan_derivatives_report", "python -m scripts.delan_derivatives_report")
+command("delan_derivatives_report", "python -m scripts.delan_derivatives_report", package="scripts.reports.commands")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("softbody_report", "python -m scripts.softbody_report")
+command("softbody_report", "python -m scripts.softbody_report", package="scripts.reports.commands")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("stability", "python -m scripts.stability")
+command("stability", "python -m scripts.stability", package="scripts.reports.commands")

@@ -1,3 +1,3 @@
 from dln_jax.__main__ import command
 
-command("uncertainty_report", "python -m scripts.uncertainty_report")
+command("uncertainty_report", "python -m scripts.uncertainty_report", package="scripts.reports.commands")

@@ -14,10 +14,11 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-LIBRARY = Path(__file__).resolve().parent.parent / "dln_jax"
+ROOT = Path(__file__).resolve().parent.parent
 UNCHECKED = "dln_jax.deploy.c"
 """Its arrays have no shapes in their types, and an export calls it half a million times."""
-ROOMS = [".".join(path.relative_to(LIBRARY.parent).with_suffix("").parts) for path in LIBRARY.glob("**/*.py")]
+FILES = [*ROOT.glob("dln_jax/**/*.py"), *ROOT.glob("scripts/reports/**/*.py")]
+ROOMS = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES]
 ROOMS = [name.removesuffix(".__init__") for name in ROOMS if not name.startswith(UNCHECKED)]
 # A name stands for all below it.
 ROOMS = [name for name in ROOMS if not UNCHECKED.startswith(f"{name}.")]

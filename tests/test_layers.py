@@ -34,7 +34,6 @@ FLOORS = {
     "figures": 7,
     "locomotion": 8,
     "command_line": 8,
-    "studies": 9,
     "runs": 10,
     "sweeps": 11,
     "commands": 12,

@@ -17,6 +17,7 @@ from calls import command
 from conftest import CACHE, LEAST_SECONDS
 from interpreters import Program, interpreters
 
+from dln_jax.commands import COMMANDS
 from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
@@ -56,7 +57,9 @@ def commands(text):
 
 def script_and_arguments(words):
     assert words[:2] == ["python", "-m"] and words[2].startswith("scripts."), words
-    return importlib.import_module(f"dln_jax.commands.{words[2].removeprefix('scripts.')}"), words[3:]
+    name = words[2].removeprefix("scripts.")
+    package = "dln_jax.commands" if name in COMMANDS else "scripts.reports.commands"
+    return importlib.import_module(f"{package}.{name}"), words[3:]
 
 
 EVERY = [words for block in blocks("bash") for words in commands(block.text)]

@@ -1,10 +1,8 @@
-"""The commands, one file each: python -m dln_jax NAME."""
+"""The commands, one file each: `dln-jax NAME`."""
 
-import pkgutil
-
-__all__ = ["command_names"]
-
-
-def command_names() -> list[str]:
-    """Names of all commands, sorted."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+COMMANDS = [
+    *("check_data", "excite", "make_data", "identify", "train_delan", "train_hnn", "train_hnn_task"),
+    *("train_hnn_pixels", "train_diffnet", "swing_up", "train_value", "simulate", "train_locomotion"),
+    *("sweep", "export_c"),
+]
+"""Their names, in the order of work: data, models, control, soft bodies, many runs, deployment."""

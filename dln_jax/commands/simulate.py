@@ -29,6 +29,7 @@ from dln_jax.command_line.stored_arguments import stored_arguments
 from dln_jax.data import meshes
 from dln_jax.figures.soft_bodies import Moments, moments_figure
 from dln_jax.files import write_figure, write_json
+from dln_jax.metrics.report import conditions, write_report
 from dln_jax.precision import data_type
 from dln_jax.rollout import rollout
 from dln_jax.runs.results import print_numbers
@@ -41,7 +42,6 @@ from dln_jax.softbody.scene import Params, State
 from dln_jax.softbody.step import INTEGRATORS, Stepper
 from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
 from dln_jax.softbody.verdict import Info
-from dln_jax.studies.report import conditions, write_report
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 

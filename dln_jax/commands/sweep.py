@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 from dln_jax.command_line.arguments import Unstated, require_positive_if_given
 from dln_jax.command_line.options import Resumable
 from dln_jax.command_line.running import command_folder
-from dln_jax.commands import command_names
+from dln_jax.commands import COMMANDS
 from dln_jax.sweeps.grid import fixed_of, grid_of, pairs
 from dln_jax.sweeps.plan import closest, plan
 from dln_jax.sweeps.sweep import Asked, sweep
@@ -85,7 +85,7 @@ def main(given: Arguments) -> None:
 
 def arguments_of(command: str) -> type:
     """The dataclass of a command's arguments; `InputError` for a name that is none, or this one's."""
-    known = [name for name in command_names() if name != "sweep"]
+    known = [name for name in COMMANDS if name != "sweep"]
     if command not in known:
         like = closest(command, known)
         raise InputError(f"--command: there is no {command!r:.40}{like} (see python -m dln_jax --help)")

@@ -14,8 +14,8 @@ from dln_jax.command_line.arguments import choice
 from dln_jax.command_line.options import Drawn, Folder
 from dln_jax.command_line.running import command_folder
 from dln_jax.control.desktop_plants import NAMES
+from dln_jax.runs.learned_swing_ups import MODELS
 from dln_jax.runs.swing_up import asked, swing_up
-from dln_jax.studies.control.learned_swing_ups import MODELS
 
 
 @dataclass(frozen=True)

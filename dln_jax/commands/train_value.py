@@ -21,6 +21,7 @@ from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import command_folder
 from dln_jax.command_line.scaled import mesh_of
 from dln_jax.control.optimal.fitted import Iteration
+from dln_jax.control.optimal.plants import PLANTS, ValuePlant
 from dln_jax.files import finite, write_json
 from dln_jax.precision import with_float64
 from dln_jax.runs.results import print_numbers
@@ -39,7 +40,6 @@ from dln_jax.runs.values import (
     save_value,
     usual,
 )
-from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
 from dln_jax.types import InputError, require_positive, require_seed
 
 

@@ -48,7 +48,7 @@ class DesktopPlant(NamedTuple):
     substeps: int
     """Of the integrator in a sample, so many that stiction is resolved."""
     numbers: SwingUpNumbers
-    """Of its swing-up, chosen by the analytic model (`studies.control.swing_up_gains`)."""
+    """Of its swing-up, chosen by the analytic model (`scripts.reports.control.swing_up_gains`)."""
     position: float
     """Standard deviation of the driven coordinate where runs start, m or rad."""
 

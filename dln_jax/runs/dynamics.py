@@ -24,9 +24,9 @@ from dln_jax.runs.dynamics_task import Task, task_of
 from dln_jax.runs.dynamics_training import cross_validated, train
 from dln_jax.runs.dynamics_uncertainty import store_uncertainty
 from dln_jax.runs.dynamics_verdict import refuse, say
+from dln_jax.runs.low_latency_calls import low_latency_metrics
 from dln_jax.runs.results import settings_of
 from dln_jax.scale.devices import device_lines
-from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load, save

@@ -12,8 +12,8 @@ from dln_jax.figures.training import training_curve
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.engine.checkpoint import Checkpoint, identity
 from dln_jax.models.latent_phase import Field
+from dln_jax.runs.hamiltonian import pixels as pixel_task
 from dln_jax.runs.results import OF_LOSSES, losses
-from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.types import require_seed
 from dln_jax.zoo.pictures import with_components
 from dln_jax.zoo.run import save

@@ -15,14 +15,14 @@ from dln_jax.data.stated_needs import needs_from_json
 from dln_jax.files import write_json
 from dln_jax.learning.engine.problem import Progress
 from dln_jax.metrics.verdict import FitRefused
+from dln_jax.runs.hamiltonian.choice import PAIRWISE
+from dln_jax.runs.hamiltonian.stages import gauge_of, in_velocities
+from dln_jax.runs.hamiltonian.tasks import MEASURED, REAL, Problem
+from dln_jax.runs.hamiltonian.training import Trained, stages_of, train
 from dln_jax.runs.phase_space_options import Options, prepare
 from dln_jax.runs.phase_space_results import draw, evaluate, line
 from dln_jax.runs.results import losses, print_numbers
 from dln_jax.scale.devices import device_lines
-from dln_jax.studies.hamiltonian.choice import PAIRWISE
-from dln_jax.studies.hamiltonian.stages import gauge_of, in_velocities
-from dln_jax.studies.hamiltonian.tasks import MEASURED, REAL, Problem
-from dln_jax.studies.hamiltonian.training import Trained, stages_of, train
 from dln_jax.time_limit import deadline, seconds_left
 from dln_jax.types import InputError
 from dln_jax.zoo.run import save

@@ -16,10 +16,10 @@ from dln_jax.command_line.optimisers import optimiser_named
 from dln_jax.command_line.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.command_line.running import needs_from_option
 from dln_jax.datasets.hamiltonian_tasks import PROTOCOLS
-from dln_jax.studies.hamiltonian.choice import HELMHOLTZ, PAIRWISE, POLYNOMIAL, choose_model, description_of
-from dln_jax.studies.hamiltonian.stages import LINEAR
-from dln_jax.studies.hamiltonian.tasks import MEASURED, TASKS, Problem, Stated, problem_of
-from dln_jax.studies.hamiltonian.training import MOTIONS, check, stages_of
+from dln_jax.runs.hamiltonian.choice import HELMHOLTZ, PAIRWISE, POLYNOMIAL, choose_model, description_of
+from dln_jax.runs.hamiltonian.stages import LINEAR
+from dln_jax.runs.hamiltonian.tasks import MEASURED, TASKS, Problem, Stated, problem_of
+from dln_jax.runs.hamiltonian.training import MOTIONS, check, stages_of
 from dln_jax.time_limit import seconds_left
 from dln_jax.types import InputError, require_seed
 from dln_jax.zoo.descriptions import build

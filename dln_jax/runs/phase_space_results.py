@@ -14,11 +14,11 @@ from dln_jax.files import write_figure
 from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.motion_verdict import judge_motions
 from dln_jax.metrics.verdict import Verdict
+from dln_jax.runs.hamiltonian.predictions import Seen, figure_of, measured_once, units_of
+from dln_jax.runs.hamiltonian.tasks import Problem
+from dln_jax.runs.hamiltonian.training import MOTIONS, RATES, Trained
+from dln_jax.runs.low_latency_calls import low_latency_metrics
 from dln_jax.runs.results import OF_LOSSES, one_step_metrics, unit_of
-from dln_jax.studies.hamiltonian.table import Seen, figure_of, measured_once, units_of
-from dln_jax.studies.hamiltonian.tasks import Problem
-from dln_jax.studies.hamiltonian.training import MOTIONS, RATES, Trained
-from dln_jax.studies.speed.low_latency_calls import low_latency_metrics
 from dln_jax.zoo.run import load
 
 GIF_FRAMES = 80

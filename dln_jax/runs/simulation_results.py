@@ -10,12 +10,12 @@ import numpy as np
 from dln_jax.figures.soft_bodies import Moments, energies_against_time, moments_figure
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure
+from dln_jax.metrics.report import Row
 from dln_jax.metrics.soft_body_energies import motion_energies
 from dln_jax.softbody.driven import Example, drive
 from dln_jax.softbody.mesh.mesh import Mesh, volumes
 from dln_jax.softbody.mesh.simplices import simplex_volumes
 from dln_jax.softbody.verdict import LARGEST_GROWTH, Info
-from dln_jax.studies.report import Row
 
 TITLES = {
     "beam": "beam: falls under its weight",

@@ -21,8 +21,8 @@ from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
 from dln_jax.files import write_figure, write_json
 from dln_jax.learning.recordings import STEPS
 from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.runs.learned_swing_ups import MODELS, Obtained, errors_along, obtain, test_motions
 from dln_jax.sizes import require_memory
-from dln_jax.studies.control.learned_swing_ups import MODELS, Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 

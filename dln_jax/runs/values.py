@@ -16,16 +16,16 @@ from jax import Array
 from jax.sharding import Mesh
 
 from dln_jax.control.balance import Law
+from dln_jax.control.optimal.evaluation import evaluate, starts
 from dln_jax.control.optimal.fitted import Iteration, Progress, fit_values
+from dln_jax.control.optimal.plant_fits import FITS, Fit
+from dln_jax.control.optimal.plants import PLANTS, ValuePlant
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, at_goal
 from dln_jax.control.optimal.residual import Stage, discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
 from dln_jax.files import matches
 from dln_jax.nn.activations import activation
-from dln_jax.studies.control.values.evaluation import evaluate, starts
-from dln_jax.studies.control.values.fits import FITS, Fit
-from dln_jax.studies.control.values.plants import PLANTS, ValuePlant
 from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
 

@@ -15,15 +15,17 @@ from typing import Annotated, ClassVar, Literal
 import pytest
 from rich.console import Console
 
-from dln_jax.__main__ import command, command_names, main
+from dln_jax.__main__ import REPORTS, command, main, report_names
 from dln_jax.command_line.arguments import Unstated, choice, names_in
 from dln_jax.command_line.progress import progress
 from dln_jax.command_line.running import interrupted, run
+from dln_jax.commands import COMMANDS
 from dln_jax.metrics.verdict import FitRefused, Verdict
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = command_names()
+PACKAGES = {**dict.fromkeys(COMMANDS, "dln_jax.commands"), **dict.fromkeys(report_names(), REPORTS)}
+"""Of every command, by name."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,12 @@ def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsy
     assert "None" not in text
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", PACKAGES)
 def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [name, "--help"])
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as stop:
-        command(name, name)
+        command(name, name, package=PACKAGES[name])
     text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
     assert stop.value.code == 0
     assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
@@ -102,7 +104,7 @@ def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
 )
 def test_only_a_command_that_continues_says_so(name, arguments, resumes, tmp_path):
     (tmp_path / CONFIG).touch()
-    given = importlib.import_module(f"dln_jax.commands.{name}").Arguments(**arguments)
+    given = importlib.import_module(f"{PACKAGES[name]}.{name}").Arguments(**arguments)
     assert ("--resume" in interrupted(name, given, tmp_path)) == resumes
 
 
@@ -193,7 +195,7 @@ def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypat
     main()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("usage: dln-jax COMMAND")
-    listed = [line.split(maxsplit=1) for line in lines[5:]]
+    listed = [line.split(maxsplit=1) for line in lines[5:-2]]
     assert [name for name, _ in listed] == COMMANDS and all(text.endswith(".") for _, text in listed)
     for nonsense in ("teapot", "", "../x", "a\nb", "x" * 5000, "--steps", "__init__"):
         monkeypatch.setattr(sys, "argv", ["dln-jax", nonsense])
@@ -202,6 +204,16 @@ def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypat
         line = capsys.readouterr().err
         assert stop.value.code == 2 and line.count("\n") == 1 and len(line) < 1000
         assert line.startswith("error: ") and "is no command; choose from" in line
+
+
+def test_a_name_that_is_nearly_right_is_suggested_and_reports_are_commands_of_a_checkout(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["dln-jax", "train-delen"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "did you mean train_delan?" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["dln-jax", "report"])
+    main()
+    assert "robot_report" in capsys.readouterr().out
 
 
 def test_a_list_that_nobody_reads_ends_without_a_word():
@@ -268,6 +280,6 @@ def test_refused_fit_ends_with_its_own_status(monkeypatch, capsys):
 
 def test_every_command_has_a_script():
     scripts = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem != "__init__")
-    assert scripts == COMMANDS
+    assert scripts == sorted(PACKAGES)
     for name in scripts:
-        assert f'command("{name}", "python -m scripts.{name}")' in (ROOT / "scripts" / f"{name}.py").read_text()
+        assert f'command("{name}", "python -m scripts.{name}"' in (ROOT / "scripts" / f"{name}.py").read_text()

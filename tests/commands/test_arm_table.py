@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import arm_table
 from dln_jax.data import schema
 from dln_jax.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
-from dln_jax.studies.arm import models as arm_models
-from dln_jax.studies.arm import table
-from dln_jax.studies.arm.table import states
-from dln_jax.studies.published import ARM
 from dln_jax.zoo.catalogue import CATALOGUE
+from scripts.reports.arm import models as arm_models
+from scripts.reports.arm import table
+from scripts.reports.arm.table import states
+from scripts.reports.commands import arm_table
+from scripts.reports.published import ARM
 
 NUMBERS = {
     **{f"{name}_mse": 1e-7 for name in ("torque", "inertial", "coriolis", "gravity", "torque_from_momenta")},

@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import benchmark
 from dln_jax.figures.benchmarks import EXACT, FRONT, cost_panels, cost_points
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.natural import lagrangian
 from dln_jax.metrics.latency import medians_in_turns, one_step
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.report import Row, markdown
 from dln_jax.models.lagrangian import make_delan
+from dln_jax.runs import low_latency_calls
+from dln_jax.runs.hamiltonian.tasks import Problem
 from dln_jax.scenes.chain import chain
-from dln_jax.studies.arm.models import described
-from dln_jax.studies.arm.table import letters, published_split
-from dln_jax.studies.case import Findings
-from dln_jax.studies.hamiltonian.tasks import Problem
-from dln_jax.studies.report import Row, markdown
-from dln_jax.studies.speed import costs as benchmark_costs
-from dln_jax.studies.speed import integrators as benchmark_integrators
-from dln_jax.studies.speed import low_latency_calls
-from dln_jax.studies.speed import one_step as benchmark_one_step
-from dln_jax.studies.speed.subjects import SUBJECTS
 from dln_jax.types import Needs
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import save
+from scripts.reports.arm.models import described
+from scripts.reports.arm.table import letters, published_split
+from scripts.reports.case import Findings
+from scripts.reports.commands import benchmark
+from scripts.reports.speed import costs as benchmark_costs
+from scripts.reports.speed import integrators as benchmark_integrators
+from scripts.reports.speed import one_step as benchmark_one_step
+from scripts.reports.speed.subjects import SUBJECTS
 
 
 def test_the_full_hessian_way_gives_the_same_torques(d=2):

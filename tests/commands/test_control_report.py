@@ -2,9 +2,9 @@
 
 from calls import refused
 
-from dln_jax.commands import control_report
-from dln_jax.studies.control.cases import SWING_UPS, cases
-from dln_jax.studies.control.energy_laws import success
+from scripts.reports.commands import control_report
+from scripts.reports.control.cases import SWING_UPS, cases
+from scripts.reports.control.energy_laws import success
 
 
 def test_an_unknown_subject_is_one_line(capsys, tmp_path, monkeypatch):

@@ -9,25 +9,27 @@ from motions import quick_motion
 from safetensors.numpy import load_file
 
 from dln_jax.command_line.stored_arguments import stored_arguments
-from dln_jax.commands import hnn_table, train_hnn, train_hnn_task
+from dln_jax.commands import train_hnn, train_hnn_task
 from dln_jax.data import schema
 from dln_jax.datasets import phase_samples
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.studies.case import Findings, rows_of
-from dln_jax.studies.hamiltonian import choice, measurements, stages, table
-from dln_jax.studies.hamiltonian import pixels as pixel_task
-from dln_jax.studies.hamiltonian import tasks as hnn_tasks
-from dln_jax.studies.hamiltonian import training as hnn_models
-from dln_jax.studies.hamiltonian.choice import description_of, models_of
-from dln_jax.studies.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
-from dln_jax.studies.hamiltonian.tasks import pieces, problem_of
-from dln_jax.studies.hamiltonian.training import RECIPES
-from dln_jax.studies.published import HAMILTONIAN
+from dln_jax.runs.hamiltonian import choice, measurements, stages
+from dln_jax.runs.hamiltonian import pixels as pixel_task
+from dln_jax.runs.hamiltonian import tasks as hnn_tasks
+from dln_jax.runs.hamiltonian import training as hnn_models
+from dln_jax.runs.hamiltonian.choice import description_of, models_of
+from dln_jax.runs.hamiltonian.tasks import pieces, problem_of
+from dln_jax.runs.hamiltonian.training import RECIPES
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
+from scripts.reports.case import Findings, rows_of
+from scripts.reports.commands import hnn_table
+from scripts.reports.hamiltonian import table
+from scripts.reports.hamiltonian.table import BOUNDS, TASKS, markdown, table_rows
+from scripts.reports.published import HAMILTONIAN
 
 MEASURED = {
     "spring": ("polynomial-hamiltonian",),

@@ -18,25 +18,15 @@ from hypothesis import strategies as st
 
 from dln_jax.command_line.stored_arguments import checked_arguments, stored_arguments
 from dln_jax.commands import (
-    arm_table,
-    benchmark,
-    compare_locomotion,
-    delan_report,
-    diffnet_report,
-    diffnet_table,
     export_c,
-    hnn_table,
     make_data,
     simulate,
-    softbody_report,
-    stability,
     train_delan,
     train_diffnet,
     train_hnn,
     train_hnn_pixels,
     train_hnn_task,
     train_locomotion,
-    uncertainty_report,
 )
 from dln_jax.data import archive, functions, meshes, schema
 from dln_jax.data.splits import split
@@ -48,6 +38,18 @@ from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import save
 from dln_jax.zoo.run_folder import CONFIG, LOCK
+from scripts.reports.commands import (
+    arm_table,
+    benchmark,
+    compare_locomotion,
+    delan_report,
+    diffnet_report,
+    diffnet_table,
+    hnn_table,
+    softbody_report,
+    stability,
+    uncertainty_report,
+)
 
 TRAJECTORIES = {
     "t": np.tile(np.arange(4.0), 5),

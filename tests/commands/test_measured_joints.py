@@ -14,8 +14,8 @@ from dln_jax.data.splits import hold_out
 from dln_jax.learning.measured_motions import motion
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.planar_chain import make_planar_chain
-from dln_jax.studies.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.studies.hamiltonian.training import VALIDATION_SHARE, second_problem
+from dln_jax.runs.hamiltonian.tasks import MEASURED, Stated, problem_of
+from dln_jax.runs.hamiltonian.training import VALIDATION_SHARE, second_problem
 from dln_jax.types import InputError, Needs
 from tests.calls import command, refused
 from tests.standard_errors import SURE, statistics

@@ -16,13 +16,10 @@ from calls import command, refused
 
 from dln_jax.command_line.stored_arguments import with_stored_arguments, write_config
 from dln_jax.commands import (
-    arm_table,
-    benchmark,
     check_data,
     excite,
     export_c,
     make_data,
-    scale_report,
     simulate,
     sweep,
     train_delan,
@@ -33,6 +30,7 @@ from dln_jax.commands import (
 )
 from dln_jax.runs.values import Family, family_of, load_value, plant_named, save_value
 from dln_jax.types import InputError
+from scripts.reports.commands import arm_table, benchmark, scale_report
 
 ROBOT = """<robot name="r"><link name="b"/><link name="l"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link><joint name="j" type="revolute">

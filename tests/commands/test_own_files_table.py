@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from dln_jax.commands import hnn_table
-from dln_jax.studies.case import rows_of
-from dln_jax.studies.hamiltonian.own_files import compared, own_markdown
+from scripts.reports.case import rows_of
+from scripts.reports.commands import hnn_table
+from scripts.reports.hamiltonian.own_files import compared, own_markdown
 from tests.calls import command, refused
 from tests.published_motions import published_arrays
 

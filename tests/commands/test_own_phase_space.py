@@ -11,10 +11,10 @@ from dln_jax import load
 from dln_jax.commands import train_hnn, train_hnn_task
 from dln_jax.mechanics.equations import flow
 from dln_jax.runs import phase_space, phase_space_options
-from dln_jax.studies.hamiltonian import recipes, training
-from dln_jax.studies.hamiltonian.choice import description_of
-from dln_jax.studies.hamiltonian.tasks import MEASURED, Stated, problem_of
-from dln_jax.studies.hamiltonian.training import train
+from dln_jax.runs.hamiltonian import recipes, training
+from dln_jax.runs.hamiltonian.choice import description_of
+from dln_jax.runs.hamiltonian.tasks import MEASURED, Stated, problem_of
+from dln_jax.runs.hamiltonian.training import train
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build
 from tests.calls import command, refused

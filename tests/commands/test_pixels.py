@@ -26,8 +26,8 @@ from dln_jax.models.latent_phase import LatentModel, LatentPhase, latent_field, 
 from dln_jax.models.model import Model
 from dln_jax.models.principal_components import compress, principal_components
 from dln_jax.precision import with_float64
+from dln_jax.runs.hamiltonian import pixels as pixel_task
 from dln_jax.scenes.scene import closed_form_forward_dynamics
-from dln_jax.studies.hamiltonian import pixels as pixel_task
 from dln_jax.types import InputError
 from dln_jax.zoo.run import load
 

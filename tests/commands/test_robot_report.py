@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from calls import refused
 
-from dln_jax.commands import robot_report
-from dln_jax.studies.robots import cases, log_checks
-from dln_jax.studies.robots.known_kinematics import rows_of_errors, rows_of_tracking
-from dln_jax.studies.robots.recorded_arm import rows_of
+from scripts.reports.commands import robot_report
+from scripts.reports.robots import cases, log_checks
+from scripts.reports.robots.known_kinematics import rows_of_errors, rows_of_tracking
+from scripts.reports.robots.recorded_arm import rows_of
 
 
 @pytest.mark.parametrize(

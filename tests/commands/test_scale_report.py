@@ -6,11 +6,11 @@ import json
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import scale_report
-from dln_jax.studies.case import Case, Findings
-from dln_jax.studies.scale import cases, hosts
-from dln_jax.studies.scale.turns import Layout, Measured, taken_in_turns, team, teams_of
 from dln_jax.types import InputError
+from scripts.reports.case import Case, Findings
+from scripts.reports.commands import scale_report
+from scripts.reports.scale import cases, hosts
+from scripts.reports.scale.turns import Layout, Measured, taken_in_turns, team, teams_of
 
 SLOW = hosts.Network(rate=8e6, latency=1e-2)
 """A byte takes a microsecond."""

@@ -5,10 +5,10 @@ import json
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import softbody_report
-from dln_jax.studies.case import named
-from dln_jax.studies.soft_bodies import SUBJECTS, cases
 from dln_jax.types import InputError
+from scripts.reports.case import named
+from scripts.reports.commands import softbody_report
+from scripts.reports.soft_bodies import SUBJECTS, cases
 
 # What test_minimise (modes), test_soft_body_identification (friction) and test_simulate (twists) assert.
 ELSEWHERE = ("modes", "coulomb", "twist")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import stability
 from dln_jax.metrics.misfit import velocity_misfit
-from dln_jax.studies.case import named
-from dln_jax.studies.report import expect
-from dln_jax.studies.stability import NAMES, cases
+from dln_jax.metrics.report import expect
 from dln_jax.types import InputError
+from scripts.reports.case import named
+from scripts.reports.commands import stability
+from scripts.reports.stability import NAMES, cases
 
 STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
 

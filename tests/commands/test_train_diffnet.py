@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 from calls import command, refused
 
-from dln_jax.commands import diffnet_report, diffnet_table, train_diffnet
+from dln_jax.commands import train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import checkpoint
 from dln_jax.learning.engine import fit as engine_fit
 from dln_jax.runs import function_task
 from dln_jax.runs import functions as function_runs
-from dln_jax.studies.differential_networks import one_pass, table
-from dln_jax.studies.published import DIFFERENTIAL_NETWORKS
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
 from dln_jax.zoo.run import load, save
+from scripts.reports.commands import diffnet_report, diffnet_table
+from scripts.reports.differential_networks import one_pass, table
+from scripts.reports.published import DIFFERENTIAL_NETWORKS
 
 SMALL = ("--samples", "200", "--width", "4")
 TINY = (*SMALL, "--steps", "4")

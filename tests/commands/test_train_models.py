@@ -21,9 +21,8 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.objectives import CANONICAL, TORQUE, objective_of
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem
-from dln_jax.runs import dynamics_growth
+from dln_jax.runs import dynamics_growth, low_latency_calls
 from dln_jax.scenes.pendulum import pendulum
-from dln_jax.studies.speed import low_latency_calls
 from dln_jax.zoo.descriptions import build, describe_for
 from dln_jax.zoo.run import load
 

@@ -1,6 +1,6 @@
 """The map of successes says each number, and sets own controllers apart."""
 
-from dln_jax.figures.robustness import shares
+from scripts.reports.figures.robustness import shares
 
 
 def test_each_plant_has_a_panel_with_its_numbers():

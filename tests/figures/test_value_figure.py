@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dln_jax.figures.values import value_figure
+from scripts.reports.figures.values import value_figure
 
 
 def test_panels_of_a_value():

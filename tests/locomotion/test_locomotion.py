@@ -14,7 +14,7 @@ from calls import refused
 from gymnasium.utils.env_checker import check_env
 from jax.sharding import Mesh
 
-from dln_jax.commands import compare_locomotion, train_locomotion
+from dln_jax.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.environment import CreatureEnvironment
@@ -29,6 +29,7 @@ from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
 from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.types import InputError
+from scripts.reports.commands import compare_locomotion
 
 EPISODE, WINDOW = 12, 6
 QUICK = GradientSettings(window=WINDOW, learning_rate=0.05, updates=4)

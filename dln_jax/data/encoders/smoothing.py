@@ -9,7 +9,7 @@
 
 Torques are left as they are by default: least squares average their noise away, while filtered torques of a model with
 dry friction belong to no state, see `filters`: on a simulated seven-axis arm they cost a factor of 1.6
-(`studies.encoder_data`).
+(`scripts.reports.encoder_data`).
 """
 
 from collections.abc import Sequence

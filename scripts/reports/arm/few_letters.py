@@ -1,0 +1,177 @@
+"""Torque errors on unseen letters: against the number of training letters, and at other speeds than the trained one.
+
+The offline experiments of Lutter, Ritter and Peters (2019, arXiv:1907.04490). All models are fitted to the same samples
+of the same letters by the same number of iterations, and selected by the same held-out samples. A letter at s times its
+speed is the motion (q, s qd, s² qdd), and its torque is the exact plant's.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import every, label_indices, partition_labels, select
+from dln_jax.learning.online import appended, empty_replay
+from dln_jax.mechanics import closed_form
+from dln_jax.metrics.errors import mean_square
+from dln_jax.metrics.report import Row
+from dln_jax.models.model import Parameters
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError
+from scripts.reports.arm.rivals import IDENTIFIED, Rival, rivals, size
+from scripts.reports.case import Case, Findings
+from scripts.reports.figures.letters import error_lines
+
+COUNTS, SPEEDS = (1, 2, 3, 5, 8), (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+ZERO, OUTSIDE = "torque_mean_square", "share_outside_training"
+THINNED = 2
+"""Every second sample is fitted, 12.5 a second; all samples of test letters are judged."""
+
+_exact = jax.jit(jax.vmap(partial(closed_form.inverse_dynamics, two_link_arm().closed_form)))
+
+
+class Effort(NamedTuple):
+    """How much is measured, and with how many iterations."""
+
+    splits: int = 3
+    """Sets of test letters: the published one first."""
+    seeds: int = 2
+    """Of each split; a seed draws the initial parameters and the order of the training letters."""
+    rounds: int = 8
+    """Of five iterations of Levenberg-Marquardt."""
+
+
+QUICK = Effort(splits=1, seeds=1, rounds=2)
+
+
+class Fit(NamedTuple):
+    """A rival fitted to some letters."""
+
+    parameters: Parameters
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    """Range of the fitted (q, qd, qdd); n = 6."""
+
+
+Settings = Mapping[str, tuple[int, float]]
+"""By name, a number of training letters and a speed."""
+
+
+def against_letters(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
+    """Errors against the number of training letters; `name` is that of the data, `test` the first test letters."""
+    most = _training_letters(data, test)
+    counts = {f"{count}-letters": (count, 1.0) for count in (*(each for each in COUNTS if each < most), most)}
+    return _case(f"{name}/letters", data, test, counts, quick, "training letters")
+
+
+def at_speeds(name: str, data: Trajectories, test: Sequence[str], *, quick: bool = False) -> Case:
+    """Errors at other speeds of the test letters, likewise, with all other letters for training."""
+    speeds = {f"speed-{speed:g}": (_training_letters(data, test), speed) for speed in SPEEDS}
+    return _case(f"{name}/speeds", data, test, speeds, quick, "speed of the test letters, times their own")
+
+
+def _training_letters(data: Trajectories, test: Sequence[str]) -> int:
+    return len(np.unique(data.trajectory)) - len(test)
+
+
+def _case(name: str, data: Trajectories, test: Sequence[str], settings: Settings, quick: bool, x: str) -> Case:
+    if not np.allclose(faster(data, 1.0).tau, data.tau, atol=1e-6):
+        raise InputError(
+            "tau is not that of the published two-link arm, whose torques at other speeds are to be predicted; "
+            "give letters of that arm, or leave letters and speeds out (--only published,online)"
+        )
+    effort = QUICK if quick else Effort()
+    run = partial(measure, name.split("/")[0], data, test_sets(data, test, effort.splits), effort, settings)
+    return Case(name, run, draw=partial(error_lines, x=x, zero="a guess of zero"))
+
+
+def test_sets(data: Trajectories, test: Sequence[str], splits: int) -> list[list[str]]:
+    """The given test letters, then groups of as many, in which no letter is twice."""
+    parts = max(2, len(np.unique(data.trajectory)) // len(test))
+    groups = [group[: len(test)] for group in partition_labels(data, parts) if set(group) != set(test)]
+    return [list(test), *groups][:splits]
+
+
+def measure(
+    name: str, data: Trajectories, splits: Sequence[Sequence[str]], effort: Effort, settings: Settings
+) -> Findings:
+    """Test errors of every rival in each setting, over splits and seeds."""
+    known, runs = rivals(rounds=effort.rounds), []
+    for test in splits:
+        for seed in range(effort.seeds):
+            runs.append(one_run(known, data, test, seed, settings))
+    rows = [Row(f"{each}/{name}", "parameters", float(size(rival))) for each, rival in known.items()]
+    for each in known:
+        for setting in settings:
+            case, values = f"{each}/{name}/{setting}", [run[setting][each] for run in runs]
+            rows.append(Row(case, "torque_mse_median", float(np.median(values)), "N^2 m^2"))
+            rows.append(Row(case, "torque_mse_worst", float(np.max(values)), "N^2 m^2"))
+    for setting in settings:
+        zero, outside = ([run[setting][quantity] for run in runs] for quantity in (ZERO, OUTSIDE))
+        rows.append(Row(f"data/{name}/{setting}", ZERO, float(np.median(zero)), "N^2 m^2"))
+        rows.append(Row(f"data/{name}/{setting}", OUTSIDE, float(np.median(outside))))
+    several = len({count for count, _ in settings.values()}) > 1
+    curves = {key: [[run[setting][key] for run in runs] for setting in settings] for key in (*known, ZERO, OUTSIDE)}
+    places = [count if several else speed for count, speed in settings.values()]
+    return Findings(rows, {"places": places, **curves})
+
+
+def one_run(
+    known: Mapping[str, Rival], data: Trajectories, test: Sequence[str], seed: int, settings: Settings
+) -> dict[str, dict[str, float]]:
+    """By setting: the torque MSE of each rival, the mean square of the torque, and the share outside the training."""
+    held_out, fits = select(data, label_indices(data, test)), {}
+    found: dict[str, dict[str, float]] = {}
+    for setting, (count, speed) in settings.items():
+        if count not in fits:
+            fits[count] = {each: fitted(rival, data, test, count, seed) for each, rival in known.items()}
+        faster_letters = faster(held_out, speed)
+        found[setting] = {
+            **{each: torque_mse(known[each], fit.parameters, faster_letters) for each, fit in fits[count].items()},
+            ZERO: mean_square(faster_letters.tau),
+            OUTSIDE: share_outside(fits[count][IDENTIFIED], faster_letters),
+        }
+    return found
+
+
+def fitted(rival: Rival, data: Trajectories, test: Sequence[str], count: int, seed: int) -> Fit:
+    """A rival fitted to `count` letters that are no test; fewer letters are the first of more."""
+    letters = np.setdiff1d(np.unique(data.trajectory), label_indices(data, test))
+    chosen = np.random.default_rng([seed, 1]).permutation(letters)[:count].tolist()
+    thin = every(data, THINNED)
+    replay = empty_replay(len(thin.t), data.degrees_of_freedom)
+    for index in chosen:
+        letter = select(thin, [index])
+        replay = appended(replay, letter.q, letter.qd, letter.qdd, letter.tau)
+    parameters = rival.refit(rival.start(seed), replay)
+    seen = states(select(thin, chosen))
+    return Fit(parameters, seen.min(axis=0), seen.max(axis=0))
+
+
+def states(data: Trajectories) -> Float[np.ndarray, "N n"]:
+    """(q, qd, qdd) of each sample."""
+    return np.hstack([data.q, data.qd, data.qdd])
+
+
+def faster(data: Trajectories, speed: float) -> Trajectories:
+    """The same paths at a multiple of their speed, with the torques of the exact plant."""
+    q, qd, qdd = data.q, speed * data.qd, speed**2 * data.qdd
+    return data._replace(
+        t=data.t / speed, qd=qd, qdd=qdd, tau=np.asarray(_exact(q, qd, qdd)), p=None, pd=None,
+        tau_inertial=None, tau_coriolis=None, tau_gravity=None,
+    )  # fmt: skip
+
+
+def torque_mse(rival: Rival, parameters: Parameters, data: Trajectories) -> float:
+    """Mean squared torque error, summed over joints."""
+    return mean_square(np.asarray(rival.torques(parameters, data.q, data.qd, data.qdd)) - data.tau)
+
+
+def share_outside(fit: Fit, data: Trajectories) -> float:
+    """Share of the samples of which an angle, a rate or an acceleration is beyond all that was fitted."""
+    now = states(data)
+    return float(np.mean(((now < fit.low) | (now > fit.high)).any(axis=1)))

@@ -1,0 +1,234 @@
+"""The arm learns its own dynamics while it writes: torques by the model that is being learned, and PD beside it.
+
+The online experiment of Lutter, Ritter and Peters (2019, arXiv:1907.04490), on the exact two-link arm:
+
+    tau_k = f(q*, qd*, qdd*; theta_i) + P (q* - q_k) + D (qd* - qd_k)      held for 1 ms, within +-25 and +-15 N m
+
+The parameters theta_0 are random. After each letter they are fitted to all samples recorded so far. No letter is
+written twice, so each error is that of a motion that the model has not seen.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control import (
+    Gains,
+    Laboratory,
+    Reference,
+    Run,
+    Tracker,
+    feed_forward,
+    field_of,
+    following,
+    simulate,
+    with_differences,
+)
+from dln_jax.control.tracking import feedback
+from dln_jax.data.encoders import smooth
+from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.learning.online import empty_replay, learn_online
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.report import Row
+from dln_jax.models.model import Model, Parameters
+from dln_jax.scenes.two_link_arm import two_link_arm
+from scripts.reports.arm.motions import RATE, RECORDED, Motion, capacity, drawn_letters
+from scripts.reports.arm.rivals import Rival, rivals
+from scripts.reports.case import Case, Findings
+from scripts.reports.figures.letters import written_letters
+
+GAINS = Gains(np.array([60.0, 30.0]), np.array([12.0, 5.0]))
+"""N m/rad and N m s/rad."""
+LIMITS = np.array([25.0, 15.0])
+"""N m."""
+CUTOFF = 50.0
+"""Hz, of the low-pass behind differences of noisy readings."""
+LOST = 1.0
+"""rad: a joint that is farther off is lost, and the run of that letter ends there."""
+
+
+class Condition(NamedTuple):
+    """Under what the arm writes."""
+
+    speed: float = 1.0
+    gains: float = 1.0
+    """Factor on P; its square root is that on D."""
+    encoder_noise: float = 0.0
+    """rad, standard deviation: with it, rates are differences of readings behind a low-pass."""
+
+
+CONDITIONS = {
+    "nominal": Condition(),
+    "low-gains": Condition(gains=0.1),
+    "double-speed": Condition(speed=2.0),
+    "noisy-encoders": Condition(encoder_noise=3e-4),
+}
+
+
+class Effort(NamedTuple):
+    """How much is measured."""
+
+    letters: int = 8
+    seeds: int = 3
+    """Of initial parameters and of the order of letters."""
+    rounds: int = 4
+    """Of five iterations of Levenberg-Marquardt, after each letter."""
+    conditions: tuple[str, ...] = tuple(CONDITIONS)
+
+
+QUICK = Effort(letters=2, seeds=1, rounds=1, conditions=("nominal",))
+
+
+class Written(NamedTuple):
+    """One letter as it was written."""
+
+    joint_error: float
+    """rad, root mean square over samples of the norm over joints; infinite for a letter that was lost."""
+    tip_error: float
+    """m, root mean square."""
+    saturated: float
+    """Share of the samples at a torque limit."""
+    path: np.ndarray
+    """Tip [N, 2], m, up to where it was lost."""
+    wanted: np.ndarray
+    """Tip of the whole letter, m."""
+
+
+def cases(name: str, data: Trajectories, *, quick: bool = False) -> list[Case]:
+    """One case for each condition."""
+    effort = QUICK if quick else Effort()
+    found = []
+    for condition in effort.conditions:
+        draw = partial(written_letters, title=f"{condition.replace('-', ' ')}, seed 0")
+        found.append(Case(f"{name}/online-{condition}", partial(measure, name, data, condition, effort), draw=draw))
+    return found
+
+
+Law = Callable[[Parameters, Gains], Tracker]
+
+
+def laws(learners: Mapping[str, Rival]) -> dict[str, Law]:
+    """Control laws by name, of parameters and gains; those that learn nothing do not use the parameters."""
+    exact = dynamics(two_link_arm().closed_form)
+    return {
+        "feedback-alone": lambda _, gains: partial(feedback, gains),
+        "exact-model": lambda _, gains: feed_forward(exact, gains),
+        **{name: partial(_by_model, rival.model) for name, rival in learners.items()},
+    }
+
+
+def _by_model(model: Model, parameters: Parameters, gains: Gains) -> Tracker:
+    return feed_forward(dynamics(model.energies(parameters)), gains)
+
+
+def measure(name: str, data: Trajectories, condition: str, effort: Effort) -> Findings:
+    """Tracking errors letter by letter: median and worst over seeds, of which a lost letter's is infinite."""
+    learners, under = rivals(rounds=effort.rounds), CONDITIONS[condition]
+    written: dict[str, list[list[Written]]] = {}
+    motions = [drawn_letters(data, effort.letters, seed, under.speed) for seed in range(effort.seeds)]
+    places = capacity(data, effort.letters)
+    for each, law in laws(learners).items():
+        drive = partial(write, closed_loop(law, under), under)
+        runs = [written_by(drive, learners.get(each), motions[seed], seed, places) for seed in range(effort.seeds)]
+        written[each] = runs
+    rows = [row for each, runs in written.items() for row in rows_of(f"{each}/{name}/{condition}", runs)]
+    curves = {
+        "letters": [motion.label for motion in motions[0]],
+        "wanted": [visit.wanted for visit in written["exact-model"][0]],
+        "paths": {each: [visit.path for visit in runs[0]] for each, runs in written.items()},
+        "errors": {each: [[visit.tip_error for visit in run] for run in runs] for each, runs in written.items()},
+    }
+    return Findings(rows, curves)
+
+
+def written_by(
+    drive: Callable, learner: Rival | None, motions: Sequence[Motion], seed: int, places: int
+) -> list[Written]:
+    """The letters one after the other, with a refit after each; without a learner nothing is learned."""
+    start, refit = ((), lambda parameters, _: parameters) if learner is None else (learner.start(seed), learner.refit)
+    replay = empty_replay(places, 2)
+    return [visit.outcome for visit in learn_online(motions, drive, refit, start, replay)]
+
+
+def rows_of(case: str, runs: Sequence[Sequence[Written]]) -> list[Row]:
+    """Errors of the first letter, the second and the last, and of all letters how many were lost or saturated."""
+    rows = []
+    for place, name in {0: "first", 1: "second", len(runs[0]) - 1: "last"}.items():
+        for quantity, unit in {"joint_error": "rad", "tip_error": "m"}.items():
+            values = [getattr(run[place], quantity) for run in runs]
+            rows.append(Row(case, f"{name}_{quantity}_median", float(np.median(values)), unit))
+            rows.append(Row(case, f"{name}_{quantity}_worst", float(np.max(values)), unit))
+    every = [each for run in runs for each in run]
+    rows.append(Row(case, "lost_letters", float(sum(np.isinf(each.joint_error) for each in every))))
+    rows.append(Row(case, "letters", float(len(every))))
+    rows.append(Row(case, "share_saturated", float(np.mean([each.saturated for each in every]))))
+    return rows
+
+
+class Driven(NamedTuple):
+    """A run of N samples along a reference."""
+
+    run: Run
+    qdd: Any
+    """rad/s² at the start of each sample [N, 2]."""
+    tip: Any
+    """m, of the arm and of the reference [N, 2]."""
+    wanted_tip: Any
+
+
+Loop = Callable[[Parameters, Reference, Array], Driven]
+"""(parameters, reference, key of the noise) -> the run along it."""
+
+
+def closed_loop(law: Law, condition: Condition) -> Loop:
+    """The exact arm under a law, compiled: all parameters and letters share the program."""
+    gains = Gains(condition.gains * GAINS.proportional, condition.gains**0.5 * GAINS.derivative)
+    noisy = condition.encoder_noise > 0
+    laboratory = Laboratory(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
+    arm = two_link_arm()
+    assert arm.tip is not None
+    field, tip = field_of(dynamics(arm.closed_form)), jax.vmap(arm.tip)
+
+    @jax.jit
+    def run(parameters: Parameters, wanted: Reference, key: Array) -> Driven:
+        controller = following(law(parameters, gains), wanted, rate=RATE)
+        if noisy:
+            controller = with_differences(controller, 2, rate=RATE, cutoff=CUTOFF)
+        start = jnp.concatenate([wanted.q[0], wanted.qd[0]])
+        seconds, about = len(wanted.q) / RATE, {"rate": RATE, "controls": 2, "laboratory": laboratory, "key": key}
+        done = simulate(field, controller, start, seconds=seconds, **about)
+        x = done.x[:-1]
+        return Driven(done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]), tip(wanted.q))
+
+    return run
+
+
+def write(loop: Loop, condition: Condition, parameters: Parameters, motion: Motion) -> tuple[Written, tuple]:
+    """One letter, and what is recorded of it: exact states, or readings of the encoders behind a filter."""
+    driven = jax.tree.map(np.asarray, loop(parameters, motion.reference, jax.random.key(motion.samples)))
+    run, off = driven.run, driven.run.x[:-1, :2] - motion.reference.q
+    lost = np.flatnonzero(~(np.abs(off[: motion.samples]).max(axis=1) <= LOST))
+    end = int(lost[0]) if len(lost) else motion.samples
+    step = round(RATE / (RECORDED * condition.speed))
+    q, qd = np.hsplit(run.x[:end], 2)
+    recording = tuple(each[:end:step] for each in (q, qd, driven.qdd, run.u))
+    if condition.encoder_noise > 0:
+        recording = _filtered(run.t[:end], run.y[:end], run.u[:end], step)
+    errors = [np.sqrt(np.mean(np.sum(each[:end] ** 2, axis=1))) for each in (off, driven.tip - driven.wanted_tip)]
+    joint_error, tip_error = (np.inf if len(lost) else float(each) for each in errors)
+    saturated = float(np.mean((np.abs(run.u[: max(end, 1)]) >= LIMITS).any(axis=1)))
+    return Written(joint_error, tip_error, saturated, driven.tip[:end], driven.wanted_tip[: motion.samples]), recording
+
+
+def _filtered(t: np.ndarray, q: np.ndarray, tau: np.ndarray, step: int) -> tuple[np.ndarray, ...]:
+    """What `data.encoders.smooth` makes of readings; nothing of less than half a second."""
+    if len(t) < RATE / 2:
+        return (np.zeros((0, 2)),) * 4
+    log = from_arrays({"t": t, "q": q, "tau": tau, "trajectory": np.zeros(len(t), int)})
+    data = smooth(log, decimate=step).data
+    return data.q, data.qd, data.qdd, data.tau

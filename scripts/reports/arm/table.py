@@ -1,0 +1,203 @@
+"""The table of the arm: every model on both published data sets and on further splits of the letters.
+
+Each number stands beside the published one, and structured models beside the true plant's prediction time.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import Split, partition_labels, select, split
+from dln_jax.datasets import generators
+from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.datasets.generators import uniform_tests
+from dln_jax.figures.benchmarks import error_against_time
+from dln_jax.metrics.report import UNITS, Row, markdown_table, unit_of
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.types import InputError
+from scripts.reports.arm.models import (
+    TRIGONOMETRIC,
+    WIDTHS,
+    Measured,
+    measure_adam,
+    measure_one_by_one,
+    measure_plant,
+    measure_seeds,
+    measure_split,
+    measure_trigonometric,
+)
+from scripts.reports.case import Case, Findings, by_case, rows_of
+from scripts.reports.published import ARM, published
+
+MODELS = (*WIDTHS, TRIGONOMETRIC)
+LAGRANGIAN = "structured-delan"
+STRUCTURED = (LAGRANGIAN, "structured-hnn")
+STRUCTURED_FACTOR = 100.0
+"""By how much the structured models are to beat their published rows."""
+FROM_MOMENTA, WHOLE_CIRCLE = "torque_from_momenta_mse", "whole_circle_torque_mse"
+VPT_SHARE = 0.98
+"""Of the true plant's valid prediction time, that a structured model is to reach."""
+ARM_UNITS = {**UNITS, "forward_mse": "1/s^4", "power_mse": "W^2", "mse": "N^2 m^2"}
+BOUNDS = {
+    "structured-delan/characters/gauss-newton": {
+        **{"seconds_to_1.35e-05": 7.0, "seconds_to_1e-08": 20.0, "seconds_to_1e-09": 40.0, "seconds_to_1e-10": 110.0},
+        **{"torque_mse_largest": 1e-8, "cost_of_ten_seeds": 8.0},
+    },
+    "trigonometric/characters": {"torque_mse": 1e-20, "train_seconds": 1.0, "noisy_torque_mse": 5e-5},
+}
+"""Figures to reach that do not follow from published ones or from the plant's."""
+
+
+def letters(path: Path | None) -> Trajectories:
+    """What the arm writes."""
+    return _of_the_arm(path, default_data(two_link_arm()) if path is None else schema.load(path))
+
+
+def published_split(written: Trajectories) -> Split:
+    """Letters with the published ones as the test."""
+    return split(written, test=CHARACTERS_TEST)
+
+
+def states(path: Path | None, *, samples: int = 3_000, validation: int = 300) -> Split:
+    """Random states of the arm for training, the published free swings for the test."""
+    data = _of_the_arm(path, generators.uniform(two_link_arm(), samples=samples) if path is None else schema.load(path))
+    present = np.random.default_rng(0).permutation(np.unique(data.trajectory))
+    held_out = present[: min(validation, max(1, len(present) // 10))]
+    return Split(select(data, np.setdiff1d(present, held_out)), select(data, held_out), uniform_tests())
+
+
+def _of_the_arm(path: Path | None, data: Trajectories) -> Trajectories:
+    if data.degrees_of_freedom != 2:
+        raise InputError(f"{path} has {data.degrees_of_freedom} coordinates; the table is that of the two-link arm")
+    return data._replace(needs=two_link_arm().needs)
+
+
+def data_sets(data: Path | None, uniform: Path | None, splits: int) -> tuple[dict[str, Split], list[Split]]:
+    """Both published data sets, and further splits of the letters, each letter in one of their tests."""
+    written = letters(data)
+    tests = partition_labels(written, splits) if splits else []
+    sets = {"characters": published_split(written), "uniform": states(uniform)}
+    return sets, [split(written, test=labels) for labels in tests]
+
+
+def cases(
+    sets: Mapping[str, Split] | None = None,
+    parts: Sequence[Split] = (),
+    *,
+    seeds: int = 5,
+    split_seeds: int = 3,
+    steps: int | None = None,
+    adam_steps: int = 20_000,
+    timed_seeds: int = 5,
+) -> list[Case]:
+    """What the table measures on data sets (default: the embedded ones) and further splits, both as by `data_sets`.
+
+    `seeds` of each model are trained in one program; of each split, `split_seeds` of the structured Lagrangian and one
+    of the others. `timed_seeds` structured models are trained one by one. `adam_steps` are those on the letters. With
+    0, the last two are left out; by default `steps` of Gauss-Newton are each model's own.
+    """
+    sets = data_sets(None, None, 0)[0] if sets is None else sets
+    costs = ("train_seconds", "parameters", "one_step_p50_us")
+    found = []
+    for name, data in sets.items():
+        ceilings = ("vpt_seconds", "whole_circle_torque_mean_square")
+        found.append(_case(f"plant/{name}", partial(measure_plant, two_link_arm(), data), ceilings))
+        found.append(_case(f"{TRIGONOMETRIC}/{name}", partial(measure_trigonometric, data), costs))
+        for kind in WIDTHS:
+            found.append(_case(f"{kind}/{name}", partial(measure_seeds, kind, data, seeds=seeds, steps=steps), costs))
+    for kind in MODELS:
+        count = split_seeds if kind == LAGRANGIAN else 1
+        for number, part in enumerate(parts):
+            measure = partial(measure_split, kind, part, seeds=count, steps=steps)
+            name = f"{kind}/characters/split-{number + 1}"
+            found.append(_case(name, measure, ("torque_mse", "torque_mse_largest")))
+    written = sets["characters"]
+    if timed_seeds:
+        measure = partial(measure_one_by_one, written, seeds=timed_seeds, steps=steps)
+        found.append(_case(f"{LAGRANGIAN}/characters/gauss-newton", measure))
+    for kind in WIDTHS if adam_steps else ():
+        found.append(_case(f"{kind}/characters/adam", partial(measure_adam, kind, written, steps=adam_steps)))
+    return found
+
+
+def _case(name: str, measure: Callable[[], Measured], quantities: Sequence[str] = ()) -> Case:
+    def findings() -> Findings:
+        numbers, curve = measure()
+        return Findings(rows_of(name, numbers), curve)
+
+    return Case(name, findings, {name: quantities})
+
+
+def table_rows(found: Mapping[str, Findings]) -> list[Row]:
+    """All numbers, with the published values and the figures to reach, and what each model comes to over the splits."""
+    numbers = by_case([row for findings in found.values() for row in findings.rows])
+    numbers |= {f"{kind}/characters/splits": each for kind in MODELS if (each := over_splits(kind, numbers))}
+    return [_beside(row, numbers) for case in numbers for row in rows_of(case, numbers[case])]
+
+
+def over_splits(kind: str, numbers: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Median over the further splits of the test torque error, and the error of the worst single run."""
+    parts = [each for case, each in numbers.items() if case.startswith(f"{kind}/characters/split-")]
+    if not parts:
+        return {}
+    return {
+        "torque_mse_median": float(np.median([part["torque_mse"] for part in parts])),
+        "torque_mse_worst": float(np.max([part["torque_mse_largest"] for part in parts])),
+    }
+
+
+def _beside(row: Row, numbers: Mapping[str, Mapping[str, float]]) -> Row:
+    """A number beside the published one, and what it is to reach: that of the same kind, or of the plant."""
+    kind, dataset = row.case.split("/")[:2]
+    reference = published(ARM, row.case, row.quantity)
+    # Torques from recorded momenta are no better than the record, whatever the model; the sound ones are.
+    of_momenta = published(ARM, row.case, FROM_MOMENTA) if row.quantity == "torque_mse" else None
+    bound = reference if of_momenta is None else of_momenta
+    if row.quantity == "vpt_seconds":
+        of_structure = kind in STRUCTURED and row.case == f"{kind}/{dataset}"
+        bound = VPT_SHARE * numbers[f"plant/{dataset}"]["vpt_seconds"] if of_structure else None
+    elif bound is not None and kind in STRUCTURED and row.quantity != FROM_MOMENTA:
+        bound /= STRUCTURED_FACTOR
+    return row._replace(
+        unit=unit_of(row.quantity, ARM_UNITS),
+        reference=reference,
+        bound=BOUNDS.get(row.case, {}).get(row.quantity, bound),
+        at_least=row.quantity == "vpt_seconds" and bound is not None,
+    )
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The published table's columns, ours beside the published numbers, and what each model costs."""
+    found = by_case(rows)
+    parts = ("torque_mse", "inertial_mse", "coriolis_mse", "gravity_mse", "vpt_seconds")
+    columns = [*(("characters", quantity) for quantity in parts), ("uniform", "torque_mse"), ("uniform", "vpt_seconds")]
+    columns += [("characters", FROM_MOMENTA), ("uniform", FROM_MOMENTA), ("characters", WHOLE_CIRCLE)]
+    heads = [f"{dataset} {quantity.replace('_', ' ')}" for dataset, quantity in columns]
+    heads = ["model", *heads, "other splits: median, worst", "training, s", "parameters", "one step, µs"]
+    lines = []
+    for kind in [*MODELS, "plant"]:
+        cells = [kind]
+        for dataset, quantity in columns:
+            case = f"{kind}/{dataset}"
+            ours, theirs = found[case].get(quantity), published(ARM, case, quantity)
+            number = "{:.2f}" if quantity == "vpt_seconds" else "{:.1e}"
+            cells.append(" / ".join(number.format(x) for x in (ours, theirs) if x is not None))
+        splits = found.get(f"{kind}/characters/splits", {})
+        cells.append(", ".join(f"{error:.1e}" for error in splits.values()))
+        costs = found[f"{kind}/characters"]
+        shown = {"train_seconds": ".1f", "parameters": ".0f", "one_step_p50_us": ".0f"}
+        lines.append([*cells, *(format(costs[key], form) if key in costs else "" for key, form in shown.items())])
+    zero = found["plant/characters"]["whole_circle_torque_mean_square"]
+    note = f"\nours / published; medians over seeds. Mean square of torques, whole circle: {zero:.0f} (N m)².\n"
+    return markdown_table(heads, lines) + note
+
+
+def figure(found: Mapping[str, Findings]) -> Figure:
+    """Error against training time."""
+    curves = {case: each.curves for case, each in found.items() if each.curves}
+    return error_against_time({case: (each["seconds"], each["errors"]) for case, each in curves.items()})

@@ -1,0 +1,79 @@
+"""Train every model of the two-link arm on both published data sets, and print the results beside the published ones.
+
+Six models (structured and black-box Lagrangian, structured and black-box Hamiltonian, feed-forward, trigonometric), two
+data sets (letters: train 17, test e, q, v; random states: test three free swings), several seeds in one program; also
+on other splits of the letters, each a test once, and on states over the whole circle, which no letter holds.
+Prints a Markdown table, writes it as table.md with report.json, and draws error against training time.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dln_jax.command_line.arguments import Unstated, require_positive_if_given
+from dln_jax.command_line.options import Resumable
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import write_bytes, write_figure
+from dln_jax.metrics.report import conditions, publish
+from dln_jax.types import InputError
+from scripts.reports.arm import table
+from scripts.reports.case import Case, measure, say_numbers
+
+
+@dataclass(frozen=True)
+class Arguments(Resumable):
+    """What to measure."""
+
+    data: Unstated[Path] = None
+    """Letters written by the two-link arm, in the npz schema (default: the embedded ones)."""
+    uniform: Unstated[Path] = None
+    """Training states of the arm, in the npz schema (default: 3,000 generated ones)."""
+    seeds: int = 5
+    """Seeds of each model, in one program."""
+    splits: int = 7
+    """Further splits of the letters: permuted and cut into so many tests, each letter in one; 0 leaves them out."""
+    split_seeds: int = 3
+    """Seeds of the structured Lagrangian on each of them; other models have one."""
+    steps: Unstated[int] = None
+    """Iterations of Gauss-Newton (default: what each model's validation error takes to level off)."""
+    adam_steps: int = 20_000
+    """Steps of Adam, 64x64 networks, one seed, on the letters; 0 leaves Adam out."""
+    timed_seeds: int = 5
+    """Structured models that are trained one by one, to time Gauss-Newton; 0 leaves them out."""
+
+
+def main(given: Arguments) -> None:
+    """Measures what has not been measured yet, prints and writes."""
+    require_positive_if_given(given, ("seeds", "split_seeds", "steps"))
+    for name in ("splits", "adam_steps", "timed_seeds"):
+        if getattr(given, name) < 0:
+            raise InputError(
+                f"--{name.replace('_', '-')} is {getattr(given, name)}; expected a whole number, 0 or more"
+            )
+    sets, parts = table.data_sets(given.data, given.uniform, given.splits)
+    counts = {key: getattr(given, key) for key in ("seeds", "split_seeds", "steps", "adam_steps", "timed_seeds")}
+    cases = table.cases(sets, parts, **counts)
+    with command_folder(given, "arm_table") as folder:
+        say = say_numbers("torque_mse", "vpt_seconds", "train_seconds", "seconds_to_1e-08")
+        found = measure(sorted(cases, key=_late), say, folder=folder, resume=given.resume)
+        rows = table.table_rows({case.name: found[case.name] for case in cases})
+        facts = conditions(
+            dtype="float64; adam float32",
+            seeds=list(range(given.seeds)),
+            selection="stopping by validation; sizes settled on seed 0 by validation, its test errors printed beside "
+            "them",
+            data="embedded letters" if given.data is None else given.data.name,
+            statistics="medians over seeds; one program for all seeds of a model",
+            splits=[" ".join(part.test.label[np.unique(part.test.trajectory)]) for part in parts],
+        )
+        write_bytes(folder / "table.md", table.markdown(rows).encode())
+        write_figure(folder / "pareto.png", table.figure(found))
+        compared = [row for row in rows if row.bound is not None or row.reference is not None]
+        publish(folder, rows, facts, shown=compared, tables=[table.markdown(rows)])
+        print(f"table: {folder / 'table.md'}, figure: {folder / 'pareto.png'}")
+
+
+def _late(case: Case) -> bool:
+    """What is most likely wanted comes first, so that an interrupted table has it."""
+    return not case.name.startswith(("plant", table.LAGRANGIAN))

@@ -1,0 +1,67 @@
+"""Train one soft creature by gradients, by evolution and by PPO, and print what each needs for one body length.
+
+Several seeds each, until 1.2 body lengths or --steps. Writes report.json, a figure of the distance against environment
+steps and against wall time, and the model and gait of each method's best seed. ppo needs the extra [rl].
+"""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dln_jax.command_line.arguments import Unstated
+from dln_jax.command_line.options import Drawn, Folder, Scaled
+from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.scaled import mesh_of
+from dln_jax.files import write_figure, write_json
+from dln_jax.locomotion import comparison
+from dln_jax.locomotion.methods import METHODS, settings_of
+from dln_jax.locomotion.task import FALLEN
+from dln_jax.metrics.report import conditions, print_report, write_report
+from dln_jax.runs.locomotion import GOAL, Options, announce, learned, prepare, write_run
+from scripts.reports.locomotion import comparison_rows
+
+
+@dataclass(frozen=True)
+class Arguments(Options, Folder, Drawn, Scaled):
+    """What to compare, and where the results go."""
+
+    MEASURES_COMPILATION: ClassVar = True
+
+    seeds: int = 3
+    """Of each method, one after the other."""
+    until: Unstated[float] = 1.2
+    """Body lengths at which a seed ends (default: 1.2)."""
+
+
+def main(given: Arguments) -> None:
+    """Trains by all methods, prints and writes."""
+    mesh = mesh_of(given)
+    task = prepare(given, METHODS, mesh)
+    with command_folder(given, "compare_locomotion") as folder:
+        announce(task)
+        curves, numbers = {}, {}
+        for method in METHODS:
+            trained = learned(task, method, given, mesh)
+            (folder / method).mkdir()
+            found = write_run(folder / method, task, method, trained, given, figures=given.figures)
+            numbers |= {f"{method}_{name}": value for name, value in found.items()}
+            curves[method] = [of.records for of in trained.learned]
+        settings = {method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS}
+        rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
+        facts = conditions(
+            dtype="float64; ppo's networks float32",
+            seeds=list(range(given.seed, given.seed + given.seeds)),
+            settings={method: numbers._asdict() for method, numbers in settings.items()},
+            goal=f"{GOAL} body lengths in one episode of {task.episode} steps from rest, before a tilt of {FALLEN} rad",
+            counted="environment steps of learning; one episode after each evaluation is apart",
+            seconds="wall time with compilation and evaluation, which the first seed pays and every seed is charged",
+        )
+        write_report(folder / "report.json", rows, facts)
+        write_json(folder / "metrics.json", numbers)
+        if given.figures:
+            title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
+            write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
+        print_report(rows, facts)
+        if any(math.isinf(comparison.median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
+            print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")
+        print(f"run folder: {folder}")

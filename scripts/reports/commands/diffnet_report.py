@@ -1,0 +1,44 @@
+"""Time value, Jacobian and Hessian of one pass against jax.hessian of the same network, float32, batch 512.
+
+For n inputs and one output, all compute value, gradient and Hessian of a network for every sample, and the gradient
+with respect to its parameters of a loss that reads all three, which is a training step without its optimiser. The
+rivals are jax.grad and jax.hessian, of a plain network in jax.numpy and of this library's `value`, to which the
+formulas of its activations already give faster derivatives. Repetitions of all programs take turns, so that a busy
+machine slows all alike; medians are compared. Prints a table and writes report.json.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from dln_jax.command_line.arguments import choice, names_in
+from dln_jax.command_line.options import Folder
+from dln_jax.command_line.stored_arguments import stored_arguments
+from dln_jax.zoo.run_folder import run_folder
+from scripts.reports.case import measure_and_publish
+from scripts.reports.differential_networks.one_pass import PLAIN, cases
+
+
+@dataclass(frozen=True)
+class Arguments(Folder):
+    """What to time."""
+
+    width: int = 128
+    """Hidden units per layer."""
+    depth: int = 2
+    """Hidden layers."""
+    batch: int = 512
+    """Samples at once."""
+    activation: Annotated[str, choice(PLAIN)] = "tanh"
+    """Of the hidden layers."""
+    repetitions: int = 30
+    """Timed calls of each program."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    names_in("--activation", given.activation, PLAIN)
+    chosen = cases(**stored_arguments(given))
+    with run_folder(given.out, "diffnet_report") as folder:
+        network = f"{given.depth} layers of {given.width}, {given.activation}, batch {given.batch}"
+        measure_and_publish(folder, chosen, dtype="float32", network=network, repetitions=given.repetitions)
+        print(f"{network}; gradient of the training loss included; medians of {given.repetitions} interleaved calls")

@@ -1,0 +1,59 @@
+"""Train differential networks with all activations, losses and optimisers of the published table, beside its numbers.
+
+Both functions, sin and cos_sin, with the published noise; small networks by Gauss-Newton, whose widths are grown by
+validation, and the published wide ones by Adam. Prints the table and writes report.json.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dln_jax.command_line.options import Resumable
+from dln_jax.command_line.running import command_folder
+from dln_jax.command_line.stored_arguments import stored_arguments
+from dln_jax.learning.functions import WIDTHS
+from dln_jax.metrics.report import conditions, publish
+from dln_jax.types import require_seed
+from scripts.reports.case import by_case, measure, rows_in, say_numbers
+from scripts.reports.differential_networks.table import OPTIMIZERS, QUANTITIES, cases, comparison, table_rows
+
+
+@dataclass(frozen=True)
+class Arguments(Resumable):
+    """What to measure."""
+
+    MEASURES_COMPILATION: ClassVar = True
+
+    samples: int = 25_600
+    """Of each function."""
+    steps: int = 40
+    """Gauss-Newton: iterations on all samples at most, per network."""
+    coarse_steps: int = 200
+    """Gauss-Newton: iterations before those, at most, on 2,048 of the samples where there are twice as many; 0 for
+    none."""
+    epochs: int = 500
+    """Adam: passes over the data."""
+    seed: int = 0
+    """Of the data, the validation split, the initial parameters and the shuffling; 0 to 4294967295."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    require_seed(given.seed)
+    chosen = cases(**stored_arguments(given))
+    with command_folder(given, "diffnet_table") as folder:
+        say = say_numbers(*QUANTITIES, "width", "job_seconds")
+        rows = table_rows(rows_in(measure(chosen, say, folder=folder, resume=given.resume)))
+        facts = conditions(
+            dtype="float64 for gauss-newton, float32 for adam",
+            seeds=[given.seed],
+            adam=f"{given.epochs} epochs (published: 500), 128 units per layer, batch 512",
+            gauss_newton=f"{given.coarse_steps} iterations on 2,048 samples and {given.steps} on all, at most; width "
+            f"grown through {', '.join(map(str, WIDTHS))} by validation",
+            selection="widths and stopping by validation; best of a row over losses and activations, as published",
+            samples=f"{given.samples} (published: 25,600), noise sd 1e-3 on x, f and gradient, a tenth for validation",
+        )
+        numbers = by_case(rows)
+        tables = [comparison(numbers, optimizer, facts[optimizer.replace("-", "_")]) for optimizer in OPTIMIZERS]
+        publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=tables)
+        print("ReLU: the Hessian of a ReLU network is zero almost everywhere, its error that of predicting zero.")
+        print(facts["samples"])

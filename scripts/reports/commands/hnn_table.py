@@ -1,0 +1,108 @@
+"""Train Hamiltonian models and baselines on the published tasks, and print their errors beside the published ones.
+
+Tasks: spring, pendulum, real-pendulum, two-body, three-body and pixels. Models: what suits the scene (separable-hnn
+or pairwise-hnn, with friction where it has it), black-box-hnn (one network is H), phase-network (one gives the rates).
+Each is trained on the published data (those of seed 0) from several seeds; numbers are medians over these. Prints a
+table, writes report.json and table.md, and draws each task's motions and energies.
+
+--own FOLDER compares instead: files TASK-SEED.npz of the published protocols, learned as own data (train_hnn_task
+--task measured) with their needs stated and without, beside the named tasks on the same starts.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from dln_jax.command_line.arguments import Unstated, choice, names_in, refuse_given, require_positive_if_given
+from dln_jax.command_line.options import Drawn, Resumable
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import write_bytes
+from dln_jax.metrics.report import conditions, publish
+from dln_jax.runs.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.runs.hamiltonian.training import RECIPES
+from dln_jax.types import InputError
+from scripts.reports.case import measure, rows_in, say_numbers
+from scripts.reports.hamiltonian.own_files import compared, own_cases, own_markdown
+from scripts.reports.hamiltonian.table import SHOWN, TASKS, cases, markdown, table_rows
+
+
+@dataclass(frozen=True)
+class Arguments(Resumable, Drawn):
+    """What to measure."""
+
+    MEASURES_COMPILATION: ClassVar = True
+
+    tasks: Annotated[str, choice(TASKS, several=True)] = ",".join(TASKS)
+    """Tasks (default: all)."""
+    real_pendulum: Unstated[Path] = None
+    """The measured pendulum (Schmidt and Lipson 2009) in the npz schema; without it that task is left out."""
+    seeds: int = 3
+    """Seeds of each model: 0, 1, ..."""
+    trajectories: Unstated[int] = None
+    """Generated trajectories of each task, for a trial (default: as published)."""
+    own: Unstated[Path] = None
+    """Folder of files TASK-SEED.npz to be learned as own data; python -m tests.published_motions FOLDER writes some."""
+    steps: Unstated[int] = None
+    """Iterations of each fit (default: each task's own)."""
+
+
+def main(given: Arguments) -> None:
+    """Measures what has not been measured yet, prints and writes."""
+    if given.own is not None:
+        compare_own_files(given, given.own)
+        return
+    names = chosen_tasks(given)
+    counts = {key: getattr(given, key) for key in ("seeds", "steps", "trajectories", "real_pendulum")}
+    cases(names, folder=None, **counts)  # refuses before anything is written
+    with command_folder(given, "hnn_table") as folder:
+        chosen = cases(names, folder=folder if given.figures else None, **counts)
+        if REAL not in names and REAL in given.tasks.split(","):
+            print(f"{REAL} is left out: its data are not part of this project; give them by --real-pendulum FILE")
+        say = say_numbers("clean_field_mse", "energy_mse", "published_energy_mse", "train_seconds", "compile_seconds")
+        found = measure(chosen, say, folder=folder, resume=given.resume)
+        rows = table_rows(rows_in(found))
+        facts = conditions(
+            dtype="float64",
+            seeds=list(range(given.seeds)),
+            selection="parameters by validation trajectories alone; sizes and budgets are the same for all seeds",
+            data="published protocols, seed 0",
+            limits="seconds of a training, compilation included: "
+            + ", ".join(f"{name} {RECIPES[name].seconds:g}" for name in names if name != PIXELS),
+            statistics="medians over seeds; compilation is apart from train_seconds",
+        )
+        write_bytes(folder / "table.md", markdown(rows).encode())
+        publish(folder, rows, facts, shown=[row for row in rows if row.quantity in SHOWN], tables=[markdown(rows)])
+        print(f"table: {folder / 'table.md'}")
+
+
+def compare_own_files(given: Arguments, own: Path) -> None:
+    """Own files beside the named tasks."""
+    refuse_given(given, ["trajectories", "real_pendulum"], "for the table without --own")
+    require_positive_if_given(given, ["seeds", "steps"])
+    counts = {"seeds": given.seeds, "steps": given.steps}
+    chosen = own_cases(own, names_in("--tasks", given.tasks, TASKS), **counts, report=partial(print, flush=True))
+    with command_folder(given, "hnn_table") as folder:
+        found = measure(chosen, say_numbers("energy_mse", "energy_mse_largest"), folder=folder, resume=given.resume)
+        rows = compared(rows_in(found))
+        facts = conditions(
+            dtype="float64",
+            seeds=list(range(given.seeds)),
+            data="named tasks: published protocols, seed 0; own files: " + str(own),
+            statistics="median and largest over seeds of the named task, and over files; the same test starts",
+        )
+        write_bytes(folder / "table.md", own_markdown(rows).encode())
+        publish(folder, rows, facts, shown=[row for row in rows if row.bound is not None], tables=[own_markdown(rows)])
+        print(f"table: {folder / 'table.md'}")
+
+
+def chosen_tasks(given: Arguments) -> list[str]:
+    """The tasks that can be measured; checks their data before anything is written."""
+    names = names_in("--tasks", given.tasks, TASKS)
+    if given.real_pendulum is None:
+        names = [name for name in names if name != REAL]
+        if not names:
+            raise InputError(f"{REAL} needs its data, which are not part of this project; give --real-pendulum FILE")
+    elif REAL in names:
+        problem_of(REAL, data=given.real_pendulum)
+    return names

@@ -1,0 +1,72 @@
+"""Measure what devices and processes that share work gain over one device, and model it for many hosts.
+
+Subjects: crawlers (soft bodies stepped side by side, 64 to 4096), training (a small network by Adam and by
+Gauss-Newton), accelerator (both, and torques of a batch, against the processor; nothing where JAX sees none). One
+device, several of one process, and several processes take turns; compilation is apart, results are waited for, medians
+count. What n hosts would gain is a model of these seconds and of an assumed network, and is not measured. Writes
+report.json, metrics.json and figures.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from dln_jax.command_line.arguments import Unstated, choice, names_in
+from dln_jax.command_line.options import Drawn, Folder
+from dln_jax.command_line.running import command_folder
+from dln_jax.files import finite, write_json
+from dln_jax.metrics.report import conditions, publish
+from dln_jax.types import InputError, require_positive
+from scripts.reports.case import draw, measure, rows_in
+from scripts.reports.scale.cases import cases
+from scripts.reports.scale.hosts import CASES, NETWORKS, table
+
+SUBJECTS = ("crawlers", "training", "accelerator")
+
+
+@dataclass(frozen=True)
+class Arguments(Folder, Drawn):
+    """What to measure."""
+
+    only: Annotated[str, choice(SUBJECTS, several=True)] = ",".join(SUBJECTS)
+    """Subjects (default: all)."""
+    lanes: Unstated[str] = None
+    """Numbers of crawlers side by side, separated by commas (default: 64,512,4096)."""
+    sharing: int = 2
+    """Devices of one process, and processes, that share the work."""
+    quick: bool = False
+    """16 crawlers, two steps and two turns: a look at whether everything runs, in a minute."""
+
+
+def main(given: Arguments) -> None:
+    """Measures, prints and writes."""
+    subjects = names_in("--only", given.only, SUBJECTS)
+    require_positive(sharing=given.sharing)
+    chosen = cases(quick=given.quick, lanes=lanes_in(given.lanes), count=given.sharing)
+    chosen = [case for case in chosen if case.name in subjects]
+    with command_folder(given, "scale_report") as folder:
+        found = measure(chosen, lambda done: print(f"{done.place}  {done.case.name}  {done.seconds:.0f} s", flush=True))
+        if "accelerator" in found and not found["accelerator"].rows:
+            print("accelerator: not measured, JAX sees none")
+        if given.figures:
+            for case in chosen:
+                draw(folder, case, found[case.name])
+        rows = rows_in(found)
+        networks = {name: network._asdict() for name, network in NETWORKS.items()}
+        assumed = "network of hosts/...: bit/s and s of a message, assumed; what n hosts gain is computed, not measured"
+        facts = conditions(
+            dtype="float64, and float32 where a case says so", seeds=[0], networks=networks, assumed=assumed
+        )
+        write_json(folder / "metrics.json", {f"{row.case}/{row.quantity}": finite(row.value) for row in rows})
+        modelled = [row for row in rows if row.case.startswith(CASES)]
+        shown = [row for row in rows if row not in modelled]
+        publish(folder, rows, facts, shown=shown, tables=[table(modelled)] if modelled else [])
+
+
+def lanes_in(text: str | None) -> tuple[int, ...] | None:
+    """The numbers of --lanes; `InputError` for what are none."""
+    if text is None:
+        return None
+    numbers = tuple(int(each) if each.strip().isdecimal() and len(each) < 10 else 0 for each in text.split(","))
+    if 0 in numbers:
+        raise InputError(f"--lanes is {text!r:.60}; expected positive whole numbers, separated by commas")
+    return numbers

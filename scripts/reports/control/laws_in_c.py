@@ -1,0 +1,175 @@
+"""Controllers as C: whether they answer as in JAX does, and how long one call takes, warm and from cold caches.
+
+A control loop's call is the cold one: other code has had the caches for a millisecond. `LAWS` is the table; whoever has
+another controller adds a line.
+"""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.control import (
+    EnergyGains,
+    Gains,
+    Reference,
+    computed_torque,
+    energy_shaping,
+    feed_forward,
+    field_of,
+    holding_controls,
+    linearise,
+    lqr,
+    parts_of,
+    regulated,
+    switched,
+    value,
+)
+from dln_jax.deploy.c.load import load_c
+from dln_jax.deploy.c.source import export_c
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import tree_system
+from dln_jax.metrics.report import Row, expect
+from dln_jax.scenes.chain import chain
+from dln_jax.scenes.rotary_pendulum import rotary_pendulum
+from dln_jax.zoo.descriptions import build, describe
+from scripts.reports.case import Findings
+from scripts.reports.control.receding_calls import STACK, first_state, one_call
+from scripts.reports.control.values.laws import drawn_law
+from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
+from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
+
+AGREEMENT = 1e-10
+"""Relative to the largest control, of C and JAX at drawn states."""
+STATES = 8
+STEPS = 80
+"""Of a plan."""
+LEAST_EVICTED = 32
+"""MiB that are read before a cold call, at least."""
+
+
+class Law(NamedTuple):
+    """A controller as a function of arrays."""
+
+    function: Callable[..., Any]
+    examples: tuple[Any, ...]
+    """One for each argument; states are drawn about them."""
+    spread: float = 0.1
+    """Standard deviation of what is drawn."""
+
+
+def regulator() -> Law:
+    """Four states and one motor, angles the short way round."""
+    return Law(_rotary()[0], (np.zeros(4),))
+
+
+def swing_up() -> Law:
+    """The energy law, and near the top the regulator."""
+    near, cost, swing = _rotary()
+    return Law(switched(lambda x: swing(x[:2], x[2:]), near, cost, 0.1), (np.array([0.0, np.pi, 0.0, 0.0]),), 0.3)
+
+
+def tree_by_computed_torque() -> Law:
+    """A seven-axis arm, its model known."""
+    follow = computed_torque(dynamics(tree_system(arm(coulomb=False).tree)), Gains(np.full(D, 400.0), np.full(D, 40.0)))
+    return _tracking(follow, D)
+
+
+def tree_by_feed_forward() -> Law:
+    """Likewise, the model asked on the reference."""
+    return _tracking(feed_forward(dynamics(tree_system(arm(coulomb=False).tree)), Gains(STIFFNESS, DAMPING)), D)
+
+
+def network_by_computed_torque(d: int = 7, width: int = 32) -> Law:
+    """A structured DeLaN of two layers, with drawn parameters."""
+    model = build(describe("structured-delan", precision="f64", needs=chain(d).needs, width=width, depth=2))
+    random = np.random.default_rng(0)
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
+    drawn = jax.tree.map(lambda leaf: random.normal(size=leaf.shape) / np.sqrt(leaf.shape[0]), shapes)
+    system = dynamics(model.energies(jax.tree.map(lambda leaf: leaf.astype(np.float64), drawn)))
+    return _tracking(computed_torque(system, Gains(np.full(d, 400.0), np.full(d, 40.0))), d)
+
+
+def value_policy() -> Law:
+    """The optimal control by a value network of two layers of 64, a cart-pole."""
+    return Law(drawn_law("cart-pole"), (np.zeros(4),))
+
+
+def one_iteration() -> Law:
+    """A call of `receding` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
+    return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
+
+
+LAWS: dict[str, Callable[[], Law]] = {
+    "regulator": regulator,
+    "swing_up": swing_up,
+    "tree_feed_forward": tree_by_feed_forward,
+    "tree_computed_torque": tree_by_computed_torque,
+    "network_computed_torque": network_by_computed_torque,
+    "value_policy": value_policy,
+    "one_iteration": one_iteration,
+}
+"""Controllers by name."""
+
+
+def laws(quick: bool) -> Findings:
+    """Agreement with JAX, and microseconds of one call."""
+    rows: list[Row] = []
+    effort = {"repeats": 3, "calls": 100, "cold": 50} if quick else {"repeats": 9, "calls": 1000, "cold": 1000}
+    mebibytes = max(evicting(), LEAST_EVICTED)
+    for name, make in LAWS.items():
+        law = make()
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / name
+            export_c({name: (law.function, law.examples)}, folder, stack=STACK)
+            rows.append(agreement(name, law, load_c(folder)))
+            program = programs(folder, compiled(folder, folder), [name])[name]
+            # A plan takes a hundred times as long as a law.
+            spent = {**effort, "calls": max(effort["calls"] // 20, 10)} if name == "one_iteration" else effort
+            rows += rows_of(name, timed(program, mebibytes=mebibytes, **spent))
+    rows.append(Row("laws", "emptied_by_mib", mebibytes, "MiB", expected="read before each cold call"))
+    return Findings(rows)
+
+
+def agreement(name: str, law: Law, loaded: Any) -> Row:
+    """The largest difference of C and JAX at drawn states, relative to the largest number of the answer."""
+    in_jax, in_c, random, worst = jax.jit(law.function), getattr(loaded, name), np.random.default_rng(0), 0.0
+    for _ in range(STATES):
+        state = [each + law.spread * random.normal(size=np.shape(each)) for each in law.examples]
+        ours, theirs = (jax.tree.leaves(function(*state)) for function in (in_c, in_jax))
+        sizes = [max(float(jnp.max(jnp.abs(each))), 1e-12) for each in theirs]
+        off = [float(np.max(np.abs(a - np.asarray(b)))) for a, b in zip(ours, theirs, strict=True)]
+        worst = max(worst, *(each / size for each, size in zip(off, sizes, strict=True)))
+    words = f"largest of {STATES} drawn states, relative to the answer"
+    return expect(f"laws/{name}", "difference_from_jax", words, worst, AGREEMENT)
+
+
+def rows_of(name: str, times: Times) -> list[Row]:
+    """Microseconds, warm and cold."""
+    case, cold = f"laws/{name}", np.percentile(times.cold, [50, 99.9]) / 1e3
+    return [
+        Row(case, "warm_us", float(np.median(times.hot)) / 1e3, "us"),
+        Row(case, "cold_p50_us", float(cold[0]), "us"),
+        Row(case, "cold_p999_us", float(cold[1]), "us"),
+    ]
+
+
+def _rotary() -> tuple[Callable, Callable, Callable]:
+    scene = rotary_pendulum(friction=1e-5)
+    plant, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
+    goal = np.zeros(4)
+    at = linearise(field_of(plant, B), goal, holding_controls(plant, goal[:2], B))
+    found = lqr(at.A, at.B, np.diag([1.0, 1.0, 0.01, 0.01]), [[50.0]])
+    near, cost = regulated(found, goal, at.u, joints), value(found, goal, joints)
+    return near, cost, energy_shaping(plant, parts_of(B), [0.0, 0.0], EnergyGains(2e7, 20.0, 5.0))
+
+
+def _tracking(follow: Callable, d: int) -> Law:
+    def law(q: Any, qd: Any, wanted_q: Any, wanted_qd: Any, wanted_qdd: Any) -> Any:
+        return follow(q, qd, Reference(wanted_q, wanted_qd, wanted_qdd))
+
+    return Law(law, (np.zeros(d),) * 5, 1.0)

@@ -1,0 +1,113 @@
+"""A planned swing-up of the acrobot or the pendubot: least cost over a horizon, then a regulator that holds it.
+
+The torque is a state of the plan and its slope the control, so that smooth torques can be asked for. Feedback about the
+plan is that of its linear-quadratic gains. Of several horizons and weights the one is kept whose run has the best
+score: the plant is known, and the score is what is asked for.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control import (
+    Controller,
+    Plan,
+    Problem,
+    error,
+    field_of,
+    holding_controls,
+    linearise,
+    optimise,
+    sampled_lqr,
+)
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
+from scripts.reports.control.board import GOAL, LIMIT, RATE, Motor, criteria, plant, play, score
+
+EVERY = 10
+"""Samples of the board to a step of the plan."""
+END = np.array([300.0, 300.0, 30.0, 30.0, 3.0])
+"""Weights of what the last state is off, with the torque."""
+BEYOND = 100.0
+"""Weight of the square by which a torque is beyond nine tenths of its limit."""
+
+
+class Weights(NamedTuple):
+    """Of the integrals."""
+
+    torque: float = 0.3
+    velocity: float = 0.01
+    slope: float = 1e-3
+    """Of the torque's slope."""
+
+
+def problem(motor: Motor, weights: Weights) -> Problem:
+    """On (q, qd, tau), by steps of `EVERY` samples over which the torque grows linearly."""
+    scene, B = plant(motor)
+    field, dt = field_of(dynamics(scene.energies), B), 1.0 / RATE
+
+    def sample(state: Array, slope: Array) -> Array:
+        # As the board has it: the torque of a sample is held.
+        step = runge_kutta(CLASSICAL, lambda t, x: field(x, state[4:]))
+        return jnp.concatenate([step(0.0, state[:4], dt), state[4:] + dt * slope])
+
+    def step(state: Array, slope: Array) -> Array:
+        return jax.lax.fori_loop(0, EVERY, lambda _, state: sample(state, slope), state)
+
+    def cost(state: Array, slope: Array) -> Array:
+        tau, over = state[4], jnp.maximum(jnp.abs(state[4]) - 0.9 * LIMIT, 0.0)
+        speed = jnp.sum(state[2:4] ** 2)
+        running = weights.torque * tau**2 + weights.velocity * speed + weights.slope * slope[0] ** 2 + BEYOND * over**2
+        return EVERY * dt * running
+
+    def final_cost(state: Array) -> Array:
+        return jnp.asarray(END) @ (state - jnp.append(jnp.asarray(GOAL), 0.0)) ** 2
+
+    return Problem(step, cost, final_cost)
+
+
+def planned(motor: Motor, weights: Weights, guess: Array, *, iterations: int = 300) -> Plan:
+    """The best trajectory from a guess of the torque's slopes [N, 1], which says how long it takes."""
+    return optimise(problem(motor, weights), np.zeros(5), guess, iterations=iterations)
+
+
+def follower(motor: Motor, weights: Weights, plan: Plan) -> Controller:
+    """Feedback about the plan, and at its end a regulator about the goal."""
+    scene, B = plant(motor)
+    field, joints, dt = field_of(dynamics(scene.energies), B), scene.needs.joints, 1.0 / RATE
+    at = linearise(field, GOAL, holding_controls(dynamics(scene.energies), GOAL[:2], B))
+    holding = sampled_lqr(at.A, at.B, np.diag([10.0, 10.0, 1.0, 1.0]), np.eye(1), dt)
+    last = EVERY * len(plan.u)
+
+    def act(memory: tuple[Array, Array, Array], t: Array, y: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        number, tau, slope = memory
+        index = jnp.minimum(number // EVERY, len(plan.u) - 1)
+        corrected = plan.u[index, 0] + plan.K[index, 0] @ (jnp.append(y, tau) - plan.x[index])
+        slope = jnp.where(number % EVERY == 0, corrected, slope)
+        u = jnp.where(number >= last, -holding.K[0] @ error(y, jnp.asarray(GOAL), joints), tau)
+        return (number + 1, tau + dt * slope, slope), u[None]
+
+    return Controller((jnp.asarray(0), jnp.asarray(0.0), jnp.asarray(0.0)), act)
+
+
+def search(
+    motor: Motor, horizons: Sequence[float], weights: Sequence[Weights], guesses: int = 3
+) -> tuple[float, Plan, Weights]:
+    """The best score of all horizons, weights and random guesses, its plan, and its weights."""
+    best: tuple[float, Plan, Weights] | None = None
+    for each in weights:
+        for seconds in horizons:
+            steps = round(seconds * RATE / EVERY)
+            solve = jax.jit(lambda guess, each=each: planned(motor, each, guess))
+            for seed in range(guesses):
+                plan = solve(jnp.asarray(10.0 * np.random.default_rng(seed).normal(size=(steps, 1))))
+                found = score(criteria(motor, play(motor, follower(motor, each, plan))))
+                if best is None or found > best[0]:
+                    best = found, plan, each
+    if best is None:
+        raise ValueError("there is nothing to search")
+    return best

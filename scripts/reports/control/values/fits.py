@@ -1,0 +1,233 @@
+"""Fitted values of the published plants: how long they take, what their policies cost, and how far they are off.
+
+The pendulum's value is compared with one on a grid over the whole box, that of the cart-pole with direct optimisation
+from the starts of the evaluation. Seeds are trained one after the other, and their mean is one more value.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from dln_jax.control.optimal.evaluation import SECONDS, evaluate, starts
+from dln_jax.control.optimal.fitted import fit_values
+from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
+from dln_jax.control.optimal.grid_interpolation import interpolated
+from dln_jax.control.optimal.plant_fits import FITS, Fit
+from dln_jax.control.optimal.plants import PLANTS, ValuePlant
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import ValueAndGradient
+from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.metrics.report import Row, expect
+from dln_jax.solvers.ending import reason
+from scripts.reports.case import Findings
+from scripts.reports.control.values.truths import direct_values, followed
+from scripts.reports.figures.values import value_figure
+
+SEEDS = 3
+TO_REACH = {"pendulum": -30.9, "cart-pole": -25.0}
+"""Mean return of downward starts; the published policies have it by 0.06 and 0.05 less."""
+CLOSE = 1e-2
+"""Relative error of V, of the median state."""
+LEAST = 1e-2
+"""Share of the largest V below which a state does not count, as its V is near zero."""
+GRIDS = (101, 201, 401)
+EDGE = 12.0
+"""rad/s, beyond which no trajectory from the box comes."""
+
+
+class Trained(NamedTuple):
+    """Values of some seeds, in float64."""
+
+    values: list[ValueAndGradient]
+    seconds: list[float]
+    """Of each training."""
+
+
+def trained(plant: ValuePlant, fit: Fit, seeds: int) -> Trained:
+    """By fitted value iteration, one seed after the other."""
+    network = value_network(plant.problem, widths=fit.widths, scale=fit.scale)
+    found = fit_values(plant.problem, network, range(seeds), numbers=fit.numbers)
+    return Trained([_value(network, each.parameters) for each in found], [each.train_seconds for each in found])
+
+
+def mean_value(values: Sequence[ValueAndGradient]) -> ValueAndGradient:
+    """The mean of several values, and of their slopes."""
+
+    def mean(x: Array) -> tuple[Array, Array]:
+        each, slopes = zip(*(value(x) for value in values), strict=True)
+        return jnp.mean(jnp.stack(each)), jnp.mean(jnp.stack(slopes), axis=0)
+
+    return mean
+
+
+def pendulum(quick: bool) -> Findings:
+    """The pendulum, against a grid over the box."""
+    plant, fit, seeds = PLANTS["pendulum"](), FITS["pendulum"], 1 if quick else SEEDS
+    if quick:
+        fit = fit._replace(widths=(24, 24), numbers=fit.numbers._replace(iterations=4, starts=128, seconds=1.0))
+    points = (41, 81) if quick else GRIDS
+    coarse = _on_grid(plant, points[:-1])
+    fine = _on_grid(plant, points[-1:], coarse)
+    nodes = states_of_box(plant, 80)
+    truth, before = np.asarray(extrapolated(coarse, fine, nodes)), np.asarray(interpolated(fine.grid, fine.V, nodes))
+    counted, ridge = truth > LEAST * truth.max(), beside_ridge(fine, nodes, plant.limit)
+    found = trained(plant, fit, seeds)
+    of_all = [np.asarray(_V(value)(nodes.reshape(-1, 2))).reshape(truth.shape) for value in found.values]
+    case = "value/pendulum"
+    rows = [
+        *_returns(case, plant, found),
+        *_errors(case, of_all, truth, counted),
+        *(
+            Row(case, f"beside_ridge_{quantity}", of(_relative(of_all, truth)[:, counted & ridge]))
+            for quantity, of in (("median_relative_error", np.median), ("worst_relative_error", np.max))
+        ),
+        Row(case, "ridge_share", float(np.mean(ridge[counted]))),
+        expect(case, "grid_converged", reason(fine.ending), float(fine.converged), 1.0, at_least=True),
+        Row(case, "grid_median_relative_extrapolation", float(np.median(_relative([before], truth)[:, counted]))),
+        _of_grid(case, plant, fine),
+        Row(case, "grid_value_hanging", float(interpolated(fine.grid, fine.V, jnp.array([np.pi, 0.0])))),
+    ]
+    runs = evaluate(plant, _law(plant, found.values[0]), starts(plant, "down", 12)).x
+    curves = {"nodes": nodes, "truth": truth, "V": of_all[0], "runs": runs}
+    for name, u in (("u", _controls(plant, found.values[0], nodes)), ("best", interpolated(fine.grid, fine.u, nodes))):
+        curves[name] = np.asarray(u)
+    return Findings(rows, curves)
+
+
+def cart_pole(quick: bool) -> Findings:
+    """The cart-pole, against direct optimisation from the starts all around the circle."""
+    plant, fit, seeds = PLANTS["cart-pole"](), FITS["cart-pole"], 1 if quick else SEEDS
+    if quick:
+        numbers = fit.numbers._replace(iterations=3, starts=128, seconds=0.5, steps=50)
+        fit = fit._replace(widths=(24, 24), numbers=numbers)
+    found = trained(plant, fit, seeds)
+    x = starts(plant, "uniform", 4 if quick else 100)
+    truth = _direct(plant, found.values, x, iterations=5 if quick else 25)
+    of_all = [np.asarray(_V(value)(x)) for value in found.values]
+    case = "value/cart-pole"
+    rows = [*_returns(case, plant, found), *_errors(case, of_all, truth, truth > LEAST * truth.max())]
+    return Findings(rows)
+
+
+CASES: dict[str, Callable[[bool], Findings]] = {"value/pendulum": pendulum, "value/cart-pole": cart_pole}
+"""Of the report of control."""
+
+
+def states_of_box(plant: ValuePlant, count: int) -> Float[np.ndarray, "A B 2"]:
+    """A grid over the box of two states, whose first is an angle."""
+    low, high = plant.problem.low, plant.problem.high
+    axes = [np.linspace(low[0], high[0], count, endpoint=False), np.linspace(low[1], high[1], count + 1)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def beside_ridge(found: GridValue, nodes: np.ndarray, limit: float, *, distance: float = 0.1) -> np.ndarray:
+    """Whether the best control changes by half the limit within a distance, in rad, and 2.5 of it in rad/s."""
+    near = [nodes + distance * np.array([i, 2.5 * j]) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    controls = np.stack([np.asarray(interpolated(found.grid, found.u, each)) for each in near])
+    return np.ptp(controls, axis=0) > 0.5 * limit
+
+
+def _on_grid(plant: ValuePlant, points: Sequence[int], start: GridValue | None = None) -> GridValue:
+    angle = plant.problem.high[0]
+    # The action cost is finite up to the limit.
+    return solve_on_grid(plant.problem, points, low=[-angle, -EDGE], high=[angle, EDGE], most=plant.limit, start=start)
+
+
+def _of_grid(case: str, plant: ValuePlant, found: GridValue) -> Row:
+    """What the grid's own policy gets, against which returns are to be seen."""
+    got = evaluate(plant, lookahead(plant.problem, found, most=plant.limit), starts(plant, "down"))
+    return Row(case, "grid_down_return", float(np.mean(got.returns)))
+
+
+def _direct(plant: ValuePlant, values: Sequence[ValueAndGradient], x: np.ndarray, *, iterations: int) -> np.ndarray:
+    """The least cost that optimisation finds from the controls of each value's policy."""
+    dt = 0.0125
+    guesses = np.stack([followed(plant.problem, _law(plant, value), x, dt=dt, steps=200) for value in values])
+    found = direct_values(plant.problem, x, guesses, limit=plant.limit, dt=dt, iterations=iterations)
+    return np.min(found, axis=0)
+
+
+def _returns(case: str, plant: ValuePlant, found: Trained) -> list[Row]:
+    """Of each kind of starts, over the seeds, and of their mean."""
+    x = np.concatenate([starts(plant, "down"), starts(plant, "uniform")])
+    half = len(x) // 2
+    each = [evaluate(plant, _law(plant, value), x) for value in found.values]
+    together = evaluate(plant, _law(plant, mean_value(found.values)), x)
+    rows = []
+    for where, part in (("down", slice(half)), ("uniform", slice(half, None))):
+        means = [float(np.mean(run.returns[part])) for run in each]
+        up = float(min(np.mean(np.isfinite(run.settled[part])) for run in each))
+        if where == "down":
+            words = f"mean of {half} starts, the median of {len(means)} seeds"
+            bound, reference = TO_REACH[case.split("/")[1]], plant.reference[where]
+            rows.append(expect(case, "down_return", words, np.median(means), bound, at_least=True, reference=reference))
+        else:
+            rows.append(Row(case, "uniform_return", float(np.median(means))))
+        rows += [
+            expect(case, f"{where}_up_share", "of the worst seed", up, 1.0, at_least=True),
+            Row(case, f"{where}_return_worst_seed", float(np.min(means))),
+            Row(case, f"{where}_return_median_start", float(np.median([run.returns[part] for run in each]))),
+            Row(case, f"{where}_return_worst_start", float(np.min([run.returns[part] for run in each]))),
+            Row(case, f"{where}_return_of_mean_value", float(np.mean(together.returns[part]))),
+            Row(case, f"{where}_settled_median", float(np.median([run.settled[part] for run in each])), "s"),
+        ]
+    rows.append(Row(case, "control_most", max(run.most for run in each)))
+    seconds = found.seconds
+    return [
+        *rows,
+        Row(case, "train_seconds", float(np.median(seconds)), "s"),
+        Row(case, "train_seconds_worst", max(seconds), "s"),
+    ]
+
+
+def _errors(case: str, of_all: Sequence[np.ndarray], truth: np.ndarray, counted: np.ndarray) -> list[Row]:
+    """Relative to the truth, where that is not near zero."""
+    off = _relative(of_all, truth)[:, counted]
+    medians = np.median(off, axis=1)
+    together = _relative([np.mean(of_all, axis=0)], truth)[:, counted]
+    words = f"of V over states, the median of {len(of_all)} seeds"
+    return [
+        expect(case, "median_relative_error", words, np.median(medians), CLOSE),
+        Row(case, "median_relative_error_worst_seed", float(np.max(medians))),
+        Row(case, "p90_relative_error", float(np.quantile(off, 0.9))),
+        Row(case, "worst_relative_error", float(np.max(off))),
+        Row(case, "median_relative_error_of_mean_value", float(np.median(together))),
+    ]
+
+
+def _relative(of_all: Sequence[np.ndarray], truth: np.ndarray) -> np.ndarray:
+    return np.abs(np.stack(of_all) - truth) / np.maximum(truth, LEAST * truth.max())
+
+
+def _value(network: ValueNetwork, parameters: Any) -> ValueAndGradient:
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)
+    return lambda x: network.value_and_gradient(parameters, x)
+
+
+def _V(value: ValueAndGradient) -> Callable[[np.ndarray], Array]:
+    return jax.jit(jax.vmap(lambda x: value(x)[0]))
+
+
+def _law(plant: ValuePlant, value: ValueAndGradient) -> Callable[[Array], Array]:
+    return hjb_policy(value, plant.problem)
+
+
+def _controls(plant: ValuePlant, value: ValueAndGradient, nodes: np.ndarray) -> np.ndarray:
+    return np.asarray(jax.jit(jax.vmap(_law(plant, value)))(nodes.reshape(-1, 2))).reshape(nodes.shape[:2])
+
+
+def draw_pendulum(curves: dict[str, Any]) -> Figure:
+    """The first seed's value beside the grid's."""
+    plant = PLANTS["pendulum"]()
+    values, controls = (curves["V"], curves["truth"]), (curves["u"], curves["best"])
+    return value_figure(curves["nodes"], values, controls, curves["runs"], limit=plant.limit, seconds=SECONDS)
+
+
+DRAWINGS: dict[str, Callable[[dict[str, Any]], Figure]] = {"value/pendulum": draw_pendulum}
+"""Of the curves of cases, by name."""

@@ -1,0 +1,18 @@
+"""Laws of value functions by size, for whoever times or exports them."""
+
+from collections.abc import Sequence
+
+import jax
+
+from dln_jax.control.balance import Law
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.value_networks import value_network
+
+
+def drawn_law(plant: str = "cart-pole", *, widths: Sequence[int] = (64, 64), members: int = 1, seed: int = 0) -> Law:
+    """x [n] -> u [m] of a network that is drawn and not trained: what a call takes is the same."""
+    problem = PLANTS[plant]().problem
+    network = value_network(problem, widths=widths, members=members, scale=30.0)
+    parameters = network.init(jax.random.key(seed))
+    return hjb_policy(lambda x: network.value_and_gradient(parameters, x), problem)

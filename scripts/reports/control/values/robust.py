@@ -1,0 +1,68 @@
+"""What a value that is trained against an adversary gains on plants that are not the model, and what that costs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.control.balance import Law
+from dln_jax.control.optimal.adversaries import Bounds, adversary
+from dln_jax.control.optimal.evaluation import Returns, evaluate, starts
+from dln_jax.control.optimal.plants import PLANTS
+from dln_jax.control.optimal.policy import hjb_policy
+from dln_jax.control.optimal.problem import ControlProblem
+from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.metrics.report import Row
+from scripts.reports.case import Findings
+
+SHARE = 0.15
+"""Of mass and length, by which the adversary moves them."""
+FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.15)}
+"""On mass and length, of the plants that are tried; the last is beyond what was trained for."""
+
+
+def rod(x: Array, u: Array, p: Array) -> Array:
+    """dx/dt of the published pendulum with p = (mass, length)."""
+    mass, length = p
+    return jnp.stack([x[1], 3 / (mass * length**2) * (u[0] + mass * 9.81 * length / 2 * jnp.sin(x[0]))])
+
+
+def pendulum(quick: bool) -> Findings:
+    """Returns and successes of downward starts on other pendulums, by the equation with an adversary and without."""
+    case, seeds, plant = "equation/robust", 1 if quick else 3, PLANTS["pendulum"]()
+    x, rows = starts(plant, "down", 20 if quick else 100), []
+    for name, share in (("trusting", 0.0), ("robust", SHARE)):
+        laws = [trained(plant.problem, share, seed, quick) for seed in range(seeds)]
+        for where, factors in FACTORS.items():
+            found = [evaluate(plant._replace(problem=moved(plant.problem, factors)), law, x) for law in laws]
+            rows += rows_of_returns(case, f"{name}_{where}", found)
+    return Findings(rows)
+
+
+def trained(problem: ControlProblem, share: float, seed: int, quick: bool) -> Law:
+    """The law of a value from the equation, against an adversary that moves mass and length by a share."""
+    network = value_network(problem, widths=(8, 8) if quick else (16, 16), scale=30.0)
+    of_parameters, of_samples = jax.random.split(jax.random.key(seed))
+    fit = fit_residual(
+        problem, network.value_and_gradient, network.init(of_parameters), of_samples,
+        samples=512 if quick else 2048, iterations=5 if quick else 15, rounds=6,
+        disturbance=adversary(rod, [1.0, 1.0], Bounds(parameters=share)) if share else None,
+    )  # fmt: skip
+    return hjb_policy(lambda x: network.value_and_gradient(fit.parameters, x), problem)
+
+
+def moved(problem: ControlProblem, factors: tuple[float, float]) -> ControlProblem:
+    """The problem of a pendulum with other mass and length."""
+    p = jnp.asarray(factors)
+    return problem._replace(
+        drift=lambda x: rod(x, jnp.zeros(1), p), actuation=lambda x: jnp.array([[0.0], [3 / (p[0] * p[1] ** 2)]])
+    )
+
+
+def rows_of_returns(case: str, name: str, found: list[Returns]) -> list[Row]:
+    """Over the seeds."""
+    return [
+        Row(case, f"{name}_return_median", float(np.median([np.mean(run.returns) for run in found]))),
+        Row(case, f"{name}_up_share_worst", float(min(np.mean(np.isfinite(run.settled)) for run in found))),
+    ]

@@ -1,0 +1,118 @@
+"""All that the published table of differential networks has, trained by both optimisers."""
+
+import itertools
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from rich.table import Table
+
+from dln_jax.data import functions
+from dln_jax.data.functions import FunctionSamples, SampleSplit
+from dln_jax.learning.engine import optimisers
+from dln_jax.learning.engine.optimisers import Adam, Optimiser
+from dln_jax.learning.functions import (
+    GAUSS_NEWTON,
+    WIDTHS,
+    Network,
+    grow_width,
+    published_adam,
+    targets,
+    train,
+)
+from dln_jax.metrics.functions import errors, predictions
+from dln_jax.metrics.report import Row, unit_of
+from dln_jax.nn.activations import activation
+from scripts.reports.case import Case, Findings, rows_of
+from scripts.reports.published import DIFFERENTIAL_NETWORKS as TABLE
+from scripts.reports.published import published
+
+OPTIMIZERS = ("gauss-newton", "adam")
+LOSSES = ("type1", "type2")
+ACTIVATIONS = ("relu", "softplus", "tanh", "cos")
+QUANTITIES = ("value_mse", "gradient_mse", "hessian_mse")
+FACTORS = {"sin": 30.0, "cos_sin": 10.0}
+"""By how much the best of our row is to beat the best of the published row."""
+TITLES = {"sin": ("1-D f", "1-D f'", "1-D f''"), "cos_sin": ("2-D f", "2-D gradient", "2-D Hessian")}
+
+
+def cases(
+    *, samples: int = 25_600, seed: int = 0, steps: int = 40, coarse_steps: int = 200, epochs: int = 500
+) -> list[Case]:
+    """A case for each function, loss and activation by each optimiser; `InputError` for settings that cannot be.
+
+    Gauss-Newton takes `steps` iterations on all samples at most, before those `coarse_steps` on some; Adam `epochs`.
+    """
+    problems = {
+        "sin": (functions.sine(samples=samples, seed=seed), functions.sine_grid()),
+        "cos_sin": (functions.cosine_sine(samples=samples, seed=seed), functions.cosine_sine_grid()),
+    }
+    found = []
+    for optimizer, function, loss, name in itertools.product(OPTIMIZERS, problems, LOSSES, ACTIVATIONS):
+        if (optimizer, name) == ("gauss-newton", "relu"):
+            continue
+        data, test = problems[function]
+        sets = functions.split(data, seed=seed)
+        network = Network(loss=loss, activation=name, depth=1 if function == "sin" else 2, seed=seed)
+        optimiser = published_adam(len(sets.train.x), epochs=epochs)
+        if optimizer == "gauss-newton":
+            network = network._replace(width=WIDTHS[0], precision="f64")
+            optimiser = GAUSS_NEWTON._replace(steps=steps, coarse_steps=coarse_steps)
+        targets(data, network)
+        optimisers.check(optimiser)
+        case = f"{function}/{loss}/{name}/{optimizer}"
+        job = partial(findings, case, sets, test, network, optimiser)
+        found.append(Case(case, job, {case: (*QUANTITIES, "width", "job_seconds")}))
+    return found
+
+
+def findings(case: str, sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> Findings:
+    """The numbers of one network, the published one or for Gauss-Newton one that starts small."""
+    return Findings(rows_of(case, trained(sets, test, network, optimiser)))
+
+
+def trained(sets: SampleSplit, test: FunctionSamples, network: Network, optimiser: Optimiser) -> dict[str, float]:
+    """Trains one network, at the width that validation chooses or the published one, and measures it on the grid."""
+    began = time.perf_counter()
+    if isinstance(optimiser, Adam):
+        every = [training := train(sets, network, optimiser)]
+    else:
+        chosen, trials = grow_width(sets, network, lambda candidate: train(sets, candidate, optimiser))
+        network, training, every = chosen.candidate, chosen.outcome, [trial.outcome for trial in trials]
+    predicted = predictions(training.parameters, test.x, activation=activation(network.activation))
+    return {
+        **errors(predicted.mean, test),
+        "width": network.width,
+        **{name: sum(getattr(each, name) for each in every) for name in ("train_seconds", "compile_seconds")},
+        "job_seconds": time.perf_counter() - began,
+    }
+
+
+def table_rows(rows: Sequence[Row]) -> list[Row]:
+    """Every number beside the published one, the best of each published row, and the time of all."""
+    found = []
+    for row in rows:
+        theirs = published(TABLE, row.case.rpartition("/")[0], row.quantity)  # without the optimiser
+        found.append(row._replace(unit=unit_of(row.quantity), reference=theirs))
+    for function, factor in FACTORS.items():
+        for quantity in QUANTITIES:
+            ours = [row.value for row in rows if row.case.startswith(f"{function}/") and row.quantity == quantity]
+            theirs = min(each[quantity] for case, each in TABLE.values.items() if case.startswith(f"{function}/"))
+            found.append(Row(f"{function}/best", quantity, min(ours), "1", theirs, theirs / factor))
+    seconds = sum(row.value for row in rows if row.quantity == "job_seconds")
+    return [*found, Row("table/all", "table_seconds", seconds, "s", bound=900.0)]
+
+
+def comparison(found: Mapping[str, Mapping[str, float]], optimizer: str, recipe: str) -> Table:
+    """The published table with ours above each published number."""
+    recipes = list(itertools.product(LOSSES, ACTIVATIONS))
+    columns = [f"{loss} {name}" for loss, name in recipes]
+    table = Table("", "", *columns, title=f"{optimizer}: {recipe}", caption="mean squared errors on the clean grid")
+    for function, titles in TITLES.items():
+        cases = [f"{function}/{loss}/{name}" for loss, name in recipes]
+        for title, quantity in zip(titles, QUANTITIES, strict=True):
+            ours = [found.get(f"{case}/{optimizer}", {}).get(quantity) for case in cases]
+            table.add_row(title, "ours", *("" if value is None else f"{value:.1e}" for value in ours))
+            theirs = [f"{TABLE.values[case][quantity]:.1e}" for case in cases]
+            table.add_row("", "published", *theirs, style="dim", end_section=True)
+    return table

@@ -1,0 +1,146 @@
+"""The table of Hamiltonian tasks: every model of the published ones, medians over seeds, beside published errors."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dln_jax.files import write_figure
+from dln_jax.metrics.report import Row, markdown_table, unit_of
+from dln_jax.runs.hamiltonian import pixels
+from dln_jax.runs.hamiltonian.choice import description_of, models_of
+from dln_jax.runs.hamiltonian.predictions import Seen, figure_of, measured_once
+from dln_jax.runs.hamiltonian.recipes import RECIPES
+from dln_jax.runs.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.runs.hamiltonian.training import train
+from dln_jax.types import require_positive
+from scripts.reports.case import Case, Findings, by_case, rows_of
+from scripts.reports.published import HAMILTONIAN, published
+
+TASKS = ("spring", "pendulum", REAL, "two-body", "three-body", PIXELS)
+"""The published ones."""
+BOUNDS = {
+    "spring/separable-hnn": {"energy_mse": 3.8e-5, "train_seconds": 5.0},
+    "pendulum/separable-hnn": {"published_energy_mse": 2.5e-3, "train_seconds": 8.0},
+    "real-pendulum/separable-hnn": {"energy_mse": 8e-4, "train_seconds": 60.0},
+    "two-body/pairwise-hnn": {"energy_mse": 3.9e-6, "train_seconds": 30.0},
+    "three-body/pairwise-hnn": {"energy_mse": 4.2e-3, "energy_mse_median": 4.2e-3, "train_seconds": 300.0},
+    "pixels/black-box-hnn": {"energy_mse": 1.5e-4, "energy_mse_over_baseline": 0.1, "train_seconds": 300.0},
+}
+"""Figures to reach, of the model that suits the scene."""
+SHOWN = (
+    *("test_loss", "clean_field_mse", "energy_mse", "energy_mse_standard_error", "energy_mse_median"),
+    *("energy_mse_over_baseline", "published_energy_mse", "rollout_mse", "train_seconds", "compile_seconds"),
+)
+TITLES = {
+    "test_loss": "test loss",
+    "clean_field_mse": "clean field",
+    "energy_mse": "energy MSE",
+    "published_energy_mse": "energy MSE, q²+p²",
+    "rollout_mse": "rollout MSE",
+    "train_seconds": "training, s",
+}
+
+
+def cases(
+    names: Sequence[str] = tuple(name for name in TASKS if name != REAL),
+    *,
+    seeds: int = 3,
+    steps: int | None = None,
+    trajectories: int | None = None,
+    real_pendulum: Path | None = None,
+    folder: Path | None = None,
+) -> list[Case]:
+    """A case for each task, with every model of it; `InputError` for a number that is not positive.
+
+    By default `steps` of each fit are each task's own, `trajectories` the published number, and the measured task needs
+    the file `real_pendulum`. With a `folder`, each task's figure is drawn while what it shows is at hand.
+    """
+    given = {"steps": steps, "trajectories": trajectories}
+    require_positive(seeds=seeds, **{key: value for key, value in given.items() if value is not None})
+    found = []
+    for name in names:
+        task = pixel_task if name == PIXELS else partial(phase_task, name, data=real_pendulum if name == REAL else None)
+        kinds = pixels.MODELS if name == PIXELS else models_of(name)
+        measure = partial(task, seeds=seeds, folder=folder, **given)
+        found.append(Case(name, measure, {f"{name}/{kind}": () for kind in kinds}))
+    return found
+
+
+def phase_task(
+    name: str, *, seeds: int, steps: int | None, trajectories: int | None, data: Path | None, folder: Path | None
+) -> Findings:
+    """Every model of a task in coordinates and momenta, and its figure."""
+    problem = problem_of(name, trajectories=trajectories, data=data)
+    options: dict[str, Any] = {"steps": steps, "seconds": RECIPES[name].seconds}
+    rows: list[Row] = []
+    seen: dict[str, Seen] = {}
+    for kind in models_of(name):
+        description = description_of(problem, kind)
+        # Each seed pays for its own compilation, as a user does.
+        runs = [measured_once(problem, train(problem, description, seed=seed, **options)) for seed in range(seeds)]
+        rows += rows_of(f"{name}/{kind}", medians(runs))
+        seen[kind] = runs[0][1]
+    if folder is not None:
+        write_figure(folder / f"{name}.png", figure_of(problem, seen))
+    return Findings(rows)
+
+
+def pixel_task(*, seeds: int, steps: int | None, trajectories: int | None, folder: Path | None) -> Findings:
+    """The models of pictures, and their animation and pictures."""
+    data = pixels.pixel_data(trajectories)
+    numbers, seen = {}, {}
+    for kind in pixels.MODELS:
+        runs = [pixels.measure_pixels(kind, data, seed=seed, steps=steps) for seed in range(seeds)]
+        numbers[kind], seen[kind] = medians(runs), runs[0][1]
+    energetic, baseline = (numbers[kind] for kind in pixels.MODELS)
+    energetic["energy_mse_over_baseline"] = energetic["energy_mse"] / baseline["energy_mse"]
+    if folder is not None:
+        pixels.draw_pixels(seen, data, folder)
+    return Findings([row for kind, each in numbers.items() for row in rows_of(f"{PIXELS}/{kind}", each)])
+
+
+def medians(runs: Sequence[tuple[dict[str, float], *tuple[Any, ...]]]) -> dict[str, float]:
+    """Of each quantity over the seeds, and the largest energy error."""
+    of_seeds = [numbers for numbers, *_ in runs]
+    found = {key: float(np.median([each[key] for each in of_seeds])) for key in of_seeds[0]}
+    found["energy_mse_largest"] = float(np.max([each["energy_mse"] for each in of_seeds]))
+    return {key: value for key, value in found.items() if not np.isnan(value)}
+
+
+def table_rows(rows: Sequence[Row]) -> list[Row]:
+    """Numbers with the published ones and the figures to reach; every Hamiltonian network beside the published one."""
+    return [
+        row._replace(
+            unit=unit_of(row.quantity),
+            reference=beside(row.case, row.quantity),
+            bound=BOUNDS.get(row.case, {}).get(row.quantity),
+        )
+        for row in rows
+    ]
+
+
+def beside(case: str, quantity: str) -> float | None:
+    """The published number that a model stands beside: the baseline's, or the Hamiltonian network's."""
+    task, kind = case.split("/")
+    name = kind if kind == "phase-network" else "black-box-hnn"
+    return published(HAMILTONIAN, f"{task}/{name}", quantity)
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Ours / published, a line per case: of the model that suits the scene, and of the baseline."""
+    lines, compared = [], {*BOUNDS, *(f"{task}/phase-network" for task in TASKS)}
+    for case, numbers in by_case(rows).items():
+        cells = [case]
+        for quantity in TITLES:
+            value, theirs = numbers.get(quantity), beside(case, quantity) if case in compared else None
+            text = "" if value is None else f"{value:.1f}" if quantity == "train_seconds" else f"{value:.1e}"
+            if f"{quantity}_standard_error" in numbers:
+                text += f" ± {numbers[f'{quantity}_standard_error']:.0e}"
+            if value is not None and theirs is not None:
+                text += f" / {theirs:.1e}"
+            cells.append(text)
+        lines.append(cells)
+    return markdown_table(["task / model", *TITLES.values()], lines)

@@ -1,0 +1,28 @@
+"""Ways of learning to move, compared: what each needs until a creature travels one body length."""
+
+import math
+
+from dln_jax.locomotion.comparison import first_reaching, median_to_reach
+from dln_jax.locomotion.learning import Record
+from dln_jax.metrics.report import Row
+
+
+def comparison_rows(creature: str, curves: dict[str, list[list[Record]]], *, goal: float, seed: int) -> list[Row]:
+    """What each method needs, and the ratios to gradients; only the crawler's numbers have bounds.
+
+    `curves` has, by method, the records of each seed, the first of which is `seed`; `goal` is in body lengths.
+    """
+    rows, needed, crawls, steps = [], {}, creature == "crawler", "environment_steps_to_one_body_length"
+    for method, seeds in curves.items():
+        case = f"{creature}/{method}"
+        for number, records in enumerate(seeds, start=seed):
+            first = first_reaching(records, goal)
+            rows.append(Row(case, f"{steps}_seed_{number}", math.nan if first is None else float(first.steps)))
+        median, seconds = (median_to_reach(seeds, goal, field) for field in ("steps", "seconds"))
+        needed[method] = float(max(r[-1].steps for r in seeds)) if math.isinf(median) else median
+        bound = 60.0 if method == "gradient" and crawls else None
+        rows += [Row(case, steps, median), Row(case, "seconds_to_one_body_length", seconds, "s", bound=bound)]
+    name, bound = "environment_steps_ratio_to_gradient", 3.0 if crawls else None
+    ratios = {method: needed[method] / needed["gradient"] for method in curves if method != "gradient"}
+    rows += [Row(f"{creature}/{method}", name, each, bound=bound, at_least=True) for method, each in ratios.items()]
+    return rows

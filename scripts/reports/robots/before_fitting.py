@@ -1,0 +1,81 @@
+"""What comes before a fit: motions that show the parameters, and what is made of encoders, as cases of the report."""
+
+import jax
+import numpy as np
+
+from dln_jax.excitation.candidates import Design, random_designs
+from dln_jax.excitation.design import CRITERIA, best_design, make_optimiser
+from dln_jax.excitation.limits import MotionLimits
+from dln_jax.excitation.task import Task, make_task
+from dln_jax.metrics.report import Row, expect
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.scenes.panda import panda
+from scripts.reports.case import Findings
+from scripts.reports.encoder_data import encoder_rows
+from scripts.reports.excitation import compare
+from scripts.reports.robots.arm import ENCODER_NOISE, TORQUE_NOISE, arm
+from scripts.reports.robots.known_kinematics import FULL, QUICK, logs
+
+PARTS = 3
+"""Logs of as many motions each, with noise of their own."""
+PERIOD, HARMONICS = 20.0, 5
+SMOOTH = 0.05
+"""rad/s, of the dry friction that motions are designed for."""
+DESIGNS, SEEDS = 6, 60
+"""Of each kind of motion, and of the noise."""
+
+
+def encoders(quick: bool) -> Findings:
+    """Errors by what is made of q and tau before the fit, with viscous friction and with MuJoCo's dry one."""
+    rows, effort = [], QUICK if quick else FULL
+    for name, robot in (("viscous", arm(coulomb=False)), ("coulomb", arm(coulomb=True))):
+        random = np.random.default_rng(0)
+        exact, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
+        parts = np.array_split(np.arange(effort.motions), 1 if quick else PARTS)
+        found = encoder_rows(
+            robot.tree,
+            exact,
+            test,
+            noise_q=ENCODER_NOISE,
+            noise_tau=TORQUE_NOISE,
+            parts=[each.tolist() for each in parts],
+        )
+        rows += [row._replace(case=row.case.replace("encoders/", f"encoders/{name}/")) for row in found]
+    return Findings(rows)
+
+
+def excitation(quick: bool) -> Findings:
+    """Errors of parameters after designed motions over those after random ones of the same series, by criterion."""
+    task = lip_task(3 if quick else 7)
+    count = 2 if quick else DESIGNS
+    drawn = random_designs(task, count)
+    starts = random_designs(task, count, seed=1)
+    rows = [Row("excitation/random", "condition_median", float(np.median([each.condition for each in drawn])))]
+    for criterion in CRITERIA:
+        designed = designs(task, criterion, starts)
+        found = compare(task, designed, drawn, seeds=SEEDS)
+        case, words = f"excitation/{criterion}", f"of {SEEDS} draws of noise, over errors after random motions"
+        rows += [
+            Row(case, "condition_median", float(np.median([each.condition for each in designed]))),
+            Row(case, "error_worst", found.worst, expected=words),
+        ]
+        if criterion == "information":
+            rows.append(expect(case, "error_median", words, found.median, 1.0))
+        else:
+            rows.append(Row(case, "error_median", found.median, expected=words))
+    return Findings(rows)
+
+
+def lip_task(active: int) -> Task:
+    """The Panda of the LIP protocol within its limits, its inertias and friction to be found."""
+    robot = panda(active)
+    model = make_rigid_tree(robot.tree, friction=True, velocity_scale=SMOOTH)
+    free = np.tile([-np.inf, np.inf], (active, 1))
+    limits = MotionLimits(robot.limits, robot.rates, robot.accelerations, free)
+    return make_task(model, model.init(jax.random.key(0)), limits, period=PERIOD, harmonics=HARMONICS)
+
+
+def designs(task: Task, criterion: str, starts: list[Design]) -> list[Design]:
+    """A motion by each start."""
+    optimise = make_optimiser(task, CRITERIA[criterion])
+    return [best_design(task, optimise, CRITERIA[criterion], [start]) for start in starts]

@@ -1,0 +1,118 @@
+"""A real double pendulum with motors: nine recordings of `design_A.0` (DFKI, BSD 3-Clause), some held out.
+
+A planar chain of ten parameters (two moments of inertia, their coupling, the second motor's armature, two weights,
+viscous and dry friction of both joints) is fitted in the ways of `double_pendulum_fits`, from q, t and tau, and judged
+by torques of filtered motions and by how long it predicts motions.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dln_jax.data.encoders import smooth
+from dln_jax.data.schema import Trajectories, load
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, valid_times
+from dln_jax.metrics.report import Row
+from scripts.reports.robots.double_pendulum_fits import (
+    CUTOFF,
+    RATE,
+    WINDOW,
+    Fitted,
+    Logs,
+    choose_scale,
+    fit_both,
+    fit_low_passed,
+    fit_motions,
+    fit_stacked,
+    fit_torques,
+    low_passed,
+)
+
+FINE, BASE = 30.0, 500.0
+"""Hz: a cut-off that keeps the motion; and the rate of the recordings, nearly."""
+TRIM = 0.3
+"""s, that are left out at both ends of a recording."""
+HORIZON, EVERY = 2.2, 0.5
+"""s: predicted stretches, and from one start to the next."""
+HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
+"""Recordings of each split."""
+WAYS = ("least-squares", "chosen-scale", "low-passed", "stacked", "motions", "both")
+QUANTITIES = {
+    "torque_nmse": ("1", False),
+    "torque_nmse_low_passed": ("1", False),
+    "vpt_seconds": ("s", True),
+    "vpt_mean_seconds": ("s", True),
+}
+"""Their unit, and whether more is better."""
+
+Numbers = dict[str, float]
+
+
+def rows(path: Path, held_out: Sequence[Sequence[str]] = HELD_OUT) -> list[Row]:
+    """Torque errors and valid prediction times of each way on recordings held out: median, worst, and each split's.
+
+    The bounds of the others are the least squares' numbers. `torque_nmse` is that of torques which filtered motions
+    take, `torque_nmse_low_passed` that of torques of less filtered motions, low-passed beside the measured ones.
+    """
+    logs = read(path)
+    found = [split_numbers(logs, labels) for labels in held_out]
+    listed = []
+    for way in WAYS:
+        for quantity, (unit, longer) in QUANTITIES.items():
+            values, rival = ([each[name][quantity] for each in found] for name in (way, WAYS[0]))
+            of_splits = {f"_{'_'.join(labels)}": lambda each, n=n: each[n] for n, labels in enumerate(held_out)}
+            for suffix, of in {"": np.median, "_worst": np.min if longer else np.max, **of_splits}.items():
+                bound = float(of(rival)) if way != WAYS[0] else None
+                row = Row(f"double-pendulum/{way}", quantity + suffix, float(of(values)), unit, None, bound, longer)
+                listed.append(row)
+    return listed
+
+
+def split_numbers(logs: Logs, held_out: Sequence[str]) -> dict[str, Numbers]:
+    """By way and quantity, for the recordings with these labels."""
+    index = {label: place for place, label in enumerate(logs.fine.label)}
+    test = [index[label] for label in held_out]
+    rest = logs.of(each for each in np.unique(logs.fine.trajectory) if each not in test)
+    scale = choose_scale(rest)
+    fits = (
+        fit_torques(rest),
+        fit_torques(rest, scale),
+        fit_low_passed(rest, scale)[0],
+        fit_stacked(rest, scale),
+        fit_motions(rest, scale),
+        fit_both(rest, scale),
+    )
+    return {way: judged(found, logs.of(test), logs) for way, found in zip(WAYS, fits, strict=True)}
+
+
+def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
+    """Errors of torques in the variance of all recordings, mean of both joints; and valid prediction times."""
+    torque = jax.jit(jax.vmap(dynamics(found.model.energies(found.parameters)).inverse_dynamics))
+    variance = every.coarse.tau.var(axis=0)
+
+    def error(data: Trajectories, filtered: Any) -> float:
+        off = np.asarray(torque(data.q, data.qd, data.qdd)) - data.tau
+        parts = [filtered(off[data.trajectory == index]) for index in np.unique(data.trajectory)]
+        return float(np.mean(np.concatenate(parts) ** 2 / variance))
+
+    stretches = cut_stretches(held.fine, round(HORIZON * RATE), every=round(EVERY * RATE))
+    predicted = predict_measured(*found, stretches, fitted=WINDOW)
+    times = valid_times(stretches, predicted, fitted=WINDOW, variance=every.fine.q.var(axis=0))
+    numbers = (
+        error(held.coarse, lambda off: off),
+        error(held.fine, low_passed),
+        float(np.median(times)),
+        float(np.mean(times)),
+    )
+    return dict(zip(QUANTITIES, numbers, strict=True))
+
+
+def read(path: Path) -> Logs:
+    """The recordings of the file, resampled to equal steps, filtered, and without their ends."""
+    data = load(path)
+    known = {"rate": BASE, "trim": TRIM, "decimate": round(BASE / RATE), "filter_torque": True}
+    return Logs(*(smooth(data, cutoff, **known).data for cutoff in (CUTOFF, FINE)))

@@ -1,0 +1,191 @@
+"""A seven-axis arm whose frames are known, from logs: parameters, torques of other motions, and tracking at 1 kHz.
+
+The rival is given the same samples, the same filter and the same columns, and once our velocity scales too. Errors are
+those of unseen motions of the true arm, free of noise.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.data.encoders import smooth
+from dln_jax.data.schema import Trajectories, from_arrays
+from dln_jax.data.splits import every
+from dln_jax.identification import identify, parameters_of
+from dln_jax.learning.friction import fit_friction
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.trees import Tree, tree_system
+from dln_jax.metrics.errors import normalised_error
+from dln_jax.metrics.report import Row, expect
+from dln_jax.models.rigid_tree import make_rigid_tree
+from scripts.reports.case import Findings
+from scripts.reports.robots.arm import D, Log, Motion, arm, exact_torque, follow, measured, motion, trajectories
+from scripts.reports.robots.rivals import regression
+
+LAWS = ("viscous", "coulomb", "offset")
+USUAL_SCALE = 0.01
+"""rad/s, of dry friction whose shape is not fitted: the rival's, and that of our robust fit."""
+DECIMATE = 3
+"""Every so manyth sample is fitted; torques are not filtered, which would smear dry friction."""
+CLEAN, SEEN = 1e-12, 1.65e-3
+"""nMSE to reach: clean data, viscous friction; noisy ones with dry friction, which a regressor reached."""
+TRACKING = 1.1
+"""Times the error with true parameters."""
+
+Torque = Callable[[Any, Any, Any], np.ndarray]
+"""q, qd, qdd, each [N, d] -> tau [N, d]."""
+
+
+class Effort(NamedTuple):
+    """How much is measured."""
+
+    seeds: int
+    motions: int
+    unseen: int
+
+
+FULL, QUICK = Effort(5, 15, 6), Effort(1, 4, 2)
+
+
+def rough(tree: Tree) -> Tree:
+    """The tree with inertias that an engineer would guess: balls of 2 kg at the joints, and no armature."""
+    ball = np.array([2.0, 0, 0, 0, 0.02, 0, 0, 0.02, 0, 0.02])
+    return tree._replace(inertias=np.tile(ball, (tree.degrees_of_freedom, 1)), armature=np.full(D, 0.05))
+
+
+def torque_of(model: Any, parameters: Any) -> Torque:
+    """The inverse model of a batch."""
+    batch = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
+    return lambda q, qd, qdd: np.asarray(batch(q, qd, qdd))
+
+
+def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> Torque:
+    """Ours: bodies that exist, torques weighted by their noise, or Huber's estimate.
+
+    Args:
+        tree: whose frames are known.
+        data: to fit.
+        scale: of dry friction, rad/s, for each joint or one for all.
+        robust: count errors of torque beyond the noise, as where friction turns round, by their size.
+    """
+    shape = tuple(np.broadcast_to(scale, D).tolist())
+    model = make_rigid_tree(rough(tree), friction=LAWS, velocity_scale=shape)
+    known = model.init(jax.random.key(0))
+    known = known._replace(viscous=jnp.full(D, 0.5), coulomb=jnp.full(D, 0.5))
+    found = identify(model, known, data, joints=tree.joints, robust=robust)
+    return torque_of(model, parameters_of(found.theta, known))
+
+
+def clean(quick: bool) -> Findings:
+    """Exact states of an arm with viscous friction."""
+    effort, robot, errors = (QUICK if quick else FULL), arm(coulomb=False), []
+    for seed in range(effort.seeds):
+        random = np.random.default_rng(seed)
+        train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
+        model = make_rigid_tree(rough(robot.tree), friction=True)
+        known = model.init(jax.random.key(0))
+        found = identify(model, known, every(train, DECIMATE), joints=robot.tree.joints, consistent=False)
+        errors.append(error(torque_of(model, parameters_of(found.theta, known)), test).mean())
+    words = f"of torques on unseen motions, the worst of {effort.seeds} seeds"
+    return Findings([expect("arm/clean-viscous", "nmse", words, max(errors), CLEAN)])
+
+
+def noisy(quick: bool) -> Findings:
+    """Encoders and torques with noise, dry friction: ours, with fitted shapes or robust, and Pinocchio's regressor."""
+    effort, robot = (QUICK if quick else FULL), arm(coulomb=True)
+    by_method: dict[str, list[np.ndarray]] = {}
+    tracked: dict[str, list[float]] = {}
+    for seed in range(effort.seeds):
+        random = np.random.default_rng(seed)
+        train, test = (logs(robot, random, count) for count in (effort.motions, effort.unseen))
+        data = every(smooth(from_arrays(measured(train, random))).data, DECIMATE)
+        scales = fit_friction(rough(robot.tree), data, LAWS).shape["velocity_scale"]
+        methods = {
+            "ours": identified(robot.tree, data, scales),
+            "ours-robust": identified(robot.tree, data, USUAL_SCALE, robust=True),
+        }
+        for name, scale in (("pinocchio", USUAL_SCALE), ("pinocchio-with-our-scales", scales)):
+            rival = regression(robot.tree, data, velocity_scale=scale)
+            if rival is not None:
+                methods[name] = rival.torque
+        for name, torque in methods.items():
+            by_method.setdefault(name, []).append(error(torque, test))
+        for name, values in tracking(robot, methods, random, effort.unseen).items():
+            tracked.setdefault(name, []).extend(values)
+    return Findings([*rows_of_errors(by_method, effort.seeds), *rows_of_tracking(tracked)], curves_of(by_method))
+
+
+def tracking(robot: Any, methods: dict[str, Torque], random: np.random.Generator, count: int) -> dict[str, list[float]]:
+    """Rms errors in mrad of unseen motions under PD control with each model's torques fed forward, and without."""
+    true = tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb, velocity_scale=USUAL_SCALE))
+    exact = jax.jit(jax.vmap(dynamics(true).inverse_dynamics))
+    feeds: dict[str, Callable[[Motion], np.ndarray | None]] = {
+        "without": lambda wanted: None,
+        "simulator": lambda wanted: exact_torque(robot, wanted),
+        "true-parameters": lambda wanted: np.asarray(exact(*wanted)),
+        **{name: lambda wanted, torque=torque: torque(*wanted) for name, torque in methods.items()},
+    }
+    found: dict[str, list[float]] = {name: [] for name in feeds}
+    for _ in range(count):
+        wanted = motion(random)
+        for name, feed in feeds.items():
+            found[name].append(1e3 * rms(follow(robot, wanted, feed(wanted))))
+    return found
+
+
+def rows_of_errors(by_method: dict[str, list[np.ndarray]], seeds: int) -> list[Row]:
+    """Median and worst over seeds of the mean over joints; medians of joints of ours."""
+    means = {name: np.mean(errors, axis=1) for name, errors in by_method.items()}
+    rows = []
+    for name, each in means.items():
+        case, bound = f"arm/noisy-coulomb/{name}", SEEN if name == "ours" else None
+        rows.append(Row(case, "nmse", float(np.median(each)), bound=bound, expected=f"median of {seeds} seeds"))
+        rows.append(Row(case, "nmse_worst", float(np.max(each))))
+    rows += [
+        Row("arm/noisy-coulomb/ours", f"nmse_joint_{joint + 1}", float(value))
+        for joint, value in enumerate(np.median(by_method["ours"], axis=0))
+    ]
+    for name in means:
+        if name.startswith("pinocchio"):
+            words = f"median over seeds of ours over {name}, the same samples and filter"
+            rows.append(
+                expect("arm/noisy-coulomb/ours", f"over_{name}", words, np.median(means["ours"] / means[name]), 1)
+            )
+    return rows
+
+
+def rows_of_tracking(tracked: dict[str, list[float]]) -> list[Row]:
+    """Medians over motions and seeds, and ours over that with the true parameters."""
+    rows = [Row(f"arm/tracking/{name}", "rms_mrad", float(np.median(each)), "mrad") for name, each in tracked.items()]
+    words = "median over motions of ours over that with true parameters and dry friction of the usual scale"
+    for name in (name for name in tracked if name.startswith("ours")):
+        ratio = np.median(np.divide(tracked[name], tracked["true-parameters"]))
+        rows.append(expect(f"arm/tracking/{name}", "over_true_parameters", words, float(ratio), TRACKING))
+    return rows
+
+
+def curves_of(by_method: dict[str, list[np.ndarray]]) -> dict[str, list[float]]:
+    """nMSE of each joint, the median over seeds, by method."""
+    return {name: np.median(errors, axis=0).tolist() for name, errors in by_method.items()}
+
+
+def logs(robot: Any, random: np.random.Generator, count: int) -> Trajectories:
+    """Drawn motions that the arm follows under PD control, free of noise."""
+    return trajectories([follow(robot, motion(random)) for _ in range(count)])
+
+
+def error(torque: Torque, test: Trajectories) -> np.ndarray:
+    """nMSE of each joint [d] on true states."""
+    return normalised_error(torque(test.q, test.qd, test.qdd), test.tau)
+
+
+def rms(log: Log) -> float:
+    """Tracking error, rad."""
+    return float(np.sqrt(np.mean((log.q - log.reference) ** 2)))
+
+
+MEASURES: Sequence[Callable[[bool], Findings]] = (clean, noisy)

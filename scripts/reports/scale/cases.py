@@ -1,0 +1,129 @@
+"""The cases of `scale_report`: one device against several and against several processes."""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from dln_jax.metrics.report import Row
+from scripts.reports.case import Case, Findings
+from scripts.reports.figures.scale import speed_ups
+from scripts.reports.scale import hosts
+from scripts.reports.scale.turns import Layout, Measured, taken_in_turns, team, teams_of
+
+LANES = (64, 512, 4096)
+STEPS = 10
+"""Of each crawler, in a turn."""
+EPISODE = 80
+"""Steps of an episode that evolution judges."""
+TURNS = 5
+BATCH = 65_536
+"""States whose torques are asked for."""
+SAMPLES = 4096
+TRAININGS = {"adam": {"optimiser": "adam", "steps": 200}, "gauss-newton": {"optimiser": "gauss-newton", "steps": 5}}
+BASE = "one-device"
+
+
+def layouts(count: int) -> dict[str, Layout]:
+    """One device, so many of one process, and so many processes."""
+    return {BASE: Layout(), f"{count}-devices": Layout(devices=count), f"{count}-processes": Layout(processes=count)}
+
+
+def cases(*, quick: bool, lanes: Sequence[int] | None = None, count: int = 2) -> list[Case]:
+    """All of them; `lanes` are the numbers of crawlers, and `count` those who share the work."""
+    lanes = lanes or ((16,) if quick else LANES)
+    turns, samples = (2, 1024) if quick else (TURNS, SAMPLES)
+    of_crawlers = partial(measure_crawlers, lanes, 2 if quick else STEPS, turns, count)
+    return [
+        Case("crawlers", of_crawlers, draw=partial(draw, "crawlers side by side")),
+        Case("training", partial(measure_training, samples, turns, count), draw=partial(draw, "optimiser")),
+        Case("accelerator", partial(measure_accelerator, quick, lanes[-1], turns)),
+    ]
+
+
+def measure_crawlers(lanes: Sequence[int], steps: int, turns: int, count: int) -> Findings:
+    """Seconds of a step of one crawler where many are stepped side by side, and what evolution would gain by hosts."""
+    rows, curves, alone = [], {}, 0.0
+    with contextlib.ExitStack() as stack:
+        teams = teams_of(stack, layouts(count))
+        for number in lanes:
+            found = taken_in_turns(teams, {"work": "crawlers", "lanes": number, "steps": steps}, turns)
+            alone = found[BASE].seconds / (number * steps)
+            case = f"crawlers/{number}"
+            rows += compared(case, found, "seconds_per_lane_step", number * steps)
+            facts = found[BASE].facts
+            rows += [Row(case, name, facts[name]) for name in ("useful_iterations_share", "converged_share")]
+            curves[str(number)] = gains(found)
+    generation = max(lanes)
+    modelled = hosts.rows("evolution", generation * EPISODE * alone, hosts.of_results(generation))
+    return Findings(rows + modelled, {"measured": curves, "modelled": {"evolution": hosts.curves(modelled)}})
+
+
+def measure_training(samples: int, turns: int, count: int) -> Findings:
+    """Seconds of a step of training a small network, and what it would gain by hosts."""
+    rows, curves, lines = [], {}, {}
+    with contextlib.ExitStack() as stack:
+        teams = teams_of(stack, layouts(count))
+        for name, given in TRAININGS.items():
+            found = taken_in_turns(teams, {"work": "training", "samples": samples, **given}, turns)
+            facts = found[BASE].facts
+            parameters = int(facts["parameters"])
+            rows += compared(f"training/{name}", found, "seconds_per_step", facts["steps"])
+            rows.append(Row(f"training/{name}", "parameters", parameters))
+            exchange = hosts.of_gradient(parameters) if name == "adam" else hosts.of_normal_equations(parameters)
+            modelled = hosts.rows(name, found[BASE].seconds / facts["steps"], exchange)
+            rows += modelled
+            curves[name], lines[name] = gains(found), hosts.curves(modelled)
+    return Findings(rows, {"measured": curves, "modelled": lines})
+
+
+def measure_accelerator(quick: bool, lanes: int, turns: int) -> Findings:
+    """An accelerator against the processor; nothing where JAX sees none."""
+    with team(Layout(platform="")) as (_, seen):
+        platform, kind = str(seen["platform"]), str(seen["kind"])
+    if platform == "cpu":
+        return Findings([])
+    rows, batch = [], 1024 if quick else BATCH
+    asked: dict[str, tuple[dict[str, Any], str, float]] = {
+        f"inverse-dynamics/{dtype}": (
+            {"work": "inverse-dynamics", "batch": batch, "dtype": dtype},
+            "seconds_per_state",
+            batch,
+        )
+        for dtype in ("float32", "float64")
+    }
+    for name, given in TRAININGS.items():
+        work = {"work": "training", "samples": SAMPLES, **given}
+        asked[f"training/{name}"] = (work, "seconds_per_step", float(given["steps"]))
+    asked["crawlers"] = ({"work": "crawlers", "lanes": lanes, "steps": STEPS}, "seconds_per_lane_step", lanes * STEPS)
+    with contextlib.ExitStack() as stack:
+        teams = teams_of(stack, {BASE: Layout(), _named(kind): Layout(platform=platform)})
+        for name, (work, quantity, count) in asked.items():
+            rows += compared(f"accelerator/{name}", taken_in_turns(teams, work, turns), quantity, count)
+    return Findings(rows)
+
+
+def compared(case: str, found: Mapping[str, Measured], quantity: str, count: float | int) -> list[Row]:
+    """What each layout takes for one of `count`, how many cores were busy, and how many times as fast it is."""
+    rows = []
+    for name, each in found.items():
+        at = f"{case}/{name}"
+        rows += [Row(at, quantity, each.seconds / count, "s"), Row(at, "busy_cores", each.processors)]
+        rows += [Row(at, "speed_up", found[BASE].seconds / each.seconds)] if name != BASE else []
+    return rows
+
+
+def gains(found: Mapping[str, Measured]) -> dict[str, float]:
+    """How many times as fast as one device the others are."""
+    return {name: found[BASE].seconds / each.seconds for name, each in found.items() if name != BASE}
+
+
+def draw(x: str, curves: dict[str, Any]) -> Figure:
+    """What was measured beside what is modelled."""
+    return speed_ups(curves["measured"], curves["modelled"], hosts=hosts.HOSTS, x=x)
+
+
+def _named(kind: str) -> str:
+    return "-".join(kind.lower().split())

@@ -1,0 +1,103 @@
+"""What n hosts would gain, on paper: measured seconds of computing against bytes and messages of a network.
+
+    T(n) = C / n + B(n) 8 / rate + M(n) latency
+    all-gather of G bytes:   B = (n - 1) / n G,     M = n - 1
+    sum of S bytes:          B = 2 (n - 1) / n S,   M = 2 (n - 1)        (each of them)
+
+in rings, which move as few bytes as can be (Patarasuk and Yuan 2009, "Bandwidth optimal all-reduce algorithms for
+clusters of workstations"). C is what one device takes. Left out is what all hosts do alike, such as the solution of the
+normal equations, and that lanes which wait for each other wait less in smaller groups.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from rich.table import Table
+
+from dln_jax.metrics.report import Row
+from scripts.reports.case import by_case
+
+CASES = "hosts/"
+"""Beginning of the cases of modelled rows."""
+
+HOSTS = (1, 2, 4, 8, 16, 64)
+NUMBER = 8
+"""Bytes of a float64."""
+
+
+class Network(NamedTuple):
+    """Between hosts; an assumption."""
+
+    rate: float
+    """bit/s."""
+    latency: float = 5e-5
+    """s of a message: TCP within a room."""
+
+
+NETWORKS = {"1_gbit": Network(1e9), "25_gbit": Network(25e9)}
+
+
+class Exchange(NamedTuple):
+    """What a step sends."""
+
+    gathered: float = 0.0
+    """Bytes of the results of all, which all get."""
+    summed: float = 0.0
+    """Bytes of the sums, which all get."""
+    sums: int = 0
+    """How many there are one after the other."""
+
+
+def of_results(lanes: int, size: int = 1) -> Exchange:
+    """So many numbers of every lane, gathered: the fitness of an episode, or a gradient."""
+    return Exchange(gathered=NUMBER * lanes * size)
+
+
+def of_gradient(parameters: int) -> Exchange:
+    """A step of Adam: one sum of the gradient."""
+    return Exchange(summed=NUMBER * parameters, sums=1)
+
+
+def of_normal_equations(parameters: int) -> Exchange:
+    """An iteration of Gauss-Newton with one trial: half of JᵀJ, and three sums of a gradient at most."""
+    return Exchange(summed=NUMBER * (parameters**2 / 2 + 3 * parameters), sums=4)
+
+
+def exchange_seconds(exchange: Exchange, hosts: int, network: Network) -> float:
+    """What a step waits for the network."""
+    share = (hosts - 1) / hosts
+    sent = share * (exchange.gathered + 2 * exchange.summed)
+    messages = (hosts - 1) * ((exchange.gathered > 0) + 2 * exchange.sums)
+    return 8 * sent / network.rate + messages * network.latency
+
+
+def speed_up(seconds: float, exchange: Exchange, hosts: int, network: Network) -> float:
+    """How many times as fast n hosts are as one, which takes `seconds`."""
+    return seconds / (seconds / hosts + exchange_seconds(exchange, hosts, network))
+
+
+def rows(work: str, seconds: float, exchange: Exchange) -> list[Row]:
+    """The speed-up of a step on each number of hosts, as cases hosts/WORK/NETWORK."""
+    case = f"{CASES}{work}"
+    moved = Row(case, "megabytes_per_step", (exchange.gathered + exchange.summed) / 1e6, "MB")
+    return [Row(case, "seconds_per_step_of_one", seconds, "s"), moved] + [
+        Row(f"{case}/{name}", f"speed_up_of_{hosts}", speed_up(seconds, exchange, hosts, network))
+        for name, network in NETWORKS.items()
+        for hosts in HOSTS
+    ]
+
+
+def curves(modelled: Sequence[Row]) -> dict[str, list[float]]:
+    """By network, the speed-ups in rows of one work."""
+    return {name: [row.value for row in modelled if row.case.endswith(f"/{name}")] for name in NETWORKS}
+
+
+def table(modelled: Sequence[Row]) -> Table:
+    """A line for each work and network, a column for each number of hosts."""
+    titles = [f"{hosts} host{'s' if hosts > 1 else ''}" for hosts in HOSTS]
+    shown = Table("times as fast as one", *titles, caption="modelled, not measured: see the conditions in report.json")
+    for case, numbers in by_case(modelled).items():
+        values = [f"{numbers[name]:.3g}" for hosts in HOSTS if (name := f"speed_up_of_{hosts}") in numbers]
+        if values:
+            shown.add_row(case.removeprefix(CASES), *values)
+    return shown

@@ -1,0 +1,133 @@
+"""The same work by one device, several, and several processes, which take turns: a slow spell meets all of them."""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from dln_jax.types import InputError
+
+ROOT = Path(__file__).parents[3]
+"""Where the package is, which the processes are to import."""
+
+
+class Layout(NamedTuple):
+    """Who shares the work."""
+
+    devices: int = 1
+    """Of each process."""
+    processes: int = 1
+    platform: str = "cpu"
+    """JAX's name; empty for the one that JAX prefers."""
+
+
+class Measured(NamedTuple):
+    """Of one layout."""
+
+    seconds: float
+    """Of the slowest process; the median over turns."""
+    processors: float
+    """Processor seconds of all processes a second: how many cores were busy."""
+    facts: dict[str, Any]
+    """What the work came to."""
+
+
+Team = Callable[[Any], list[dict[str, Any]]]
+"""A question to all processes of a layout -> the answer of each."""
+
+
+@contextlib.contextmanager
+def team(layout: Layout) -> Iterator[tuple[Team, dict[str, Any]]]:
+    """The processes of a layout, and what the first one says of its device.
+
+    Raises:
+        InputError: a process that ends instead of answering.
+    """
+    command = [sys.executable, "-m", "scripts.reports.scale.worker", str(layout.devices), str(layout.processes)]
+    told = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "PYTHONPATH": _path()}
+    told |= {"JAX_PLATFORMS": layout.platform} if layout.platform else {}
+    port = str(_free_port())
+    with contextlib.ExitStack() as stack:
+        said = [stack.enter_context(tempfile.TemporaryFile()) for _ in range(layout.processes)]
+        workers = [
+            stack.enter_context(_ended(_started([*command, str(number), port], told, error)))
+            for number, error in enumerate(said)
+        ]
+
+        def ask(question: Any) -> list[dict[str, Any]]:
+            for worker, error in zip(workers, said, strict=True):
+                try:
+                    print(json.dumps(question), file=worker.stdin, flush=True)
+                except BrokenPipeError:
+                    raise _silent(error) from None
+            return answers()
+
+        def answers() -> list[dict[str, Any]]:
+            return [_answer(worker, error) for worker, error in zip(workers, said, strict=True)]
+
+        yield ask, answers()[0]
+
+
+def taken_in_turns(teams: Mapping[str, Team], work: Mapping[str, Any], repetitions: int) -> dict[str, Measured]:
+    """What some work costs each team."""
+    facts = {name: ask(work)[0] for name, ask in teams.items()}
+    turns: dict[str, list[tuple[float, float]]] = {name: [] for name in teams}
+    for _ in range(repetitions + 1):
+        for name, ask in teams.items():
+            answers = ask(None)
+            seconds = max(each["seconds"] for each in answers)
+            turns[name].append((seconds, sum(each["processor_seconds"] for each in answers) / seconds))
+    # The first turn warms up.
+    medians = {name: np.median(each[1:], axis=0) for name, each in turns.items()}
+    return {name: Measured(float(medians[name][0]), float(medians[name][1]), facts[name]) for name in teams}
+
+
+def teams_of(stack: contextlib.ExitStack, layouts: Mapping[str, Layout]) -> dict[str, Team]:
+    """The teams of some layouts, for as long as the stack is open."""
+    return {name: stack.enter_context(team(layout))[0] for name, layout in layouts.items()}
+
+
+def _started(command: Sequence[str], told: Mapping[str, str], error: IO[bytes]) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, env=told, stdin=pipe, stdout=pipe, stderr=error, text=True)
+
+
+@contextlib.contextmanager
+def _ended(worker: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
+    # A process that waits for another one, which has ended, would not see that its input has.
+    try:
+        yield worker
+    finally:
+        worker.kill()
+        worker.communicate()
+
+
+def _answer(worker: subprocess.Popen[str], error: IO[bytes]) -> dict[str, Any]:
+    line = worker.stdout.readline() if worker.stdout else ""
+    if not line:
+        raise _silent(error)
+    return json.loads(line)
+
+
+def _silent(error: IO[bytes]) -> InputError:
+    error.seek(0)
+    lines = error.read().decode(errors="replace").strip().splitlines() or ["it printed nothing"]
+    return InputError(f"a process that was to be measured ended: {lines[-1]}")
+
+
+def _path() -> str:
+    return os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]

@@ -1,0 +1,61 @@
+"""What the cases of soft bodies share: a solid under its weight, its motion, and that every step must converge."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from dln_jax.metrics.report import Row, expect
+from dln_jax.rollout import rollout
+from dln_jax.softbody.mesh.mesh import Mesh, vertices_where
+from dln_jax.softbody.scene import Params, SoftScene, State, make_scene
+from dln_jax.softbody.step import Step
+from dln_jax.softbody.terms.elasticity import elastic
+from dln_jax.softbody.terms.gravity import gravity
+from dln_jax.softbody.terms.strain_energies import stable_neo_hookean
+from dln_jax.softbody.terms.term import Term
+from dln_jax.softbody.verdict import Info
+
+GRAVITY = 9.8
+"""In m/s², of the reference values."""
+
+
+class Seen(NamedTuple):
+    """What is seen after each of T steps."""
+
+    x: Float[np.ndarray, "T n dim"]
+    v: Float[np.ndarray, "T n dim"]
+    iterations: Int[np.ndarray, " T"]
+    converged: Bool[np.ndarray, " T"]
+
+
+def solid(mesh: Mesh, *others: Term, modulus: float, poisson_ratio: float = 0.3, **scene: Any) -> SoftScene:
+    """A stable neo-Hookean body under its weight; Young's modulus in Pa."""
+    material = elastic(mesh, stable_neo_hookean, youngs_modulus=modulus, poisson_ratio=poisson_ratio)
+    return make_scene(mesh, [material, gravity(mesh, (0.0, -GRAVITY)), *others], **scene)
+
+
+def cantilever_of(mesh: Mesh, modulus: float = 1e6, **others: Any) -> SoftScene:
+    """A solid that is held where x = 0; one of 4 m x 1 m and 1e6 Pa sags by about a length."""
+    return solid(mesh, modulus=modulus, held=vertices_where(mesh, lambda x: x[:, 0] == 0), **others)
+
+
+def converges(name: str, converged: Any) -> Row:
+    """That no step has failed."""
+    return expect(name, "steps_not_converged", "every step converges", np.sum(~np.asarray(converged)), 0.0)
+
+
+def motion(step: Step, steps: int) -> Callable[[Params, State], Seen]:
+    """(params, state) -> so many steps from there, compiled at its first call."""
+
+    def observe(state: State, info: Info) -> tuple:
+        return state.x, state.v, info.iterations, info.converged
+
+    @jax.jit
+    def program(params: Params, state: State) -> tuple:
+        return rollout(functools.partial(step, params), state, steps=steps, observe=observe)[1]
+
+    return lambda params, state: Seen(*map(np.asarray, program(params, state)))

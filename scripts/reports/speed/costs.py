@@ -1,0 +1,148 @@
+"""benchmark throughput and scaling: what a structured DeLaN of two layers of 64 costs, with the batch and with joints.
+
+Throughput is that of batched states, also against the full-Hessian way.
+"""
+
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+from matplotlib.figure import Figure
+
+from dln_jax.figures.benchmarks import cost_curves, cost_panels
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.natural import NaturalSystem, lagrangian
+from dln_jax.metrics.latency import medians_in_turns, one_step
+from dln_jax.metrics.report import Row
+from dln_jax.models.lagrangian import make_delan
+from dln_jax.scenes.chain import chain
+from dln_jax.types import Lagrangian
+from scripts.reports.case import Findings
+
+BATCHES = (1, 10, 100, 1_000, 10_000, 100_000)
+QUICK = (1, 1_000)
+SIZES = (2, 4, 7, 12)
+TRAINING_BATCH = 512
+NAMES = ("inverse", "forward")
+JOINTS, QUICK_JOINTS = (1, 2, 3, 4, 6, 8, 10, 12, 30), (2, 4)
+FITTED = (2, 12)
+"""Joints between which exponents of growth are fitted."""
+UNITS = {
+    **{"inverse_p50_us": "us", "inverse_p99_us": "us", "inverse_compile_seconds": "s"},
+    **{"training_step_ms": "ms", "training_compile_seconds": "s", "training_memory_mib": "MiB"},
+}
+SHOWN = {
+    "one call": ("inverse_p50_us", "µs"),
+    "training step": ("training_step_ms", "ms"),
+    "compilation of a training step": ("training_compile_seconds", "s"),
+    "memory of a training step": ("training_memory_mib", "MiB"),
+}
+
+
+def measure_throughput(quick: bool) -> Findings:
+    """Inverse and forward dynamics for growing batches; at one batch, the full-Hessian way for growing d."""
+    repetitions = 10 if quick else 40
+    batches = QUICK if quick else BATCHES
+    rows: list[Row] = []
+    for batch in batches:
+        energies, states = structured(2, batch)
+        model = dynamics(energies)
+        programs = {
+            "inverse": jax.jit(jax.vmap(model.inverse_dynamics)),
+            "inverse_again": jax.jit(jax.vmap(model.inverse_dynamics)),
+            "forward": jax.jit(jax.vmap(model.forward_dynamics)),
+        }
+        seconds = medians_in_turns(programs, states, repetitions=repetitions)
+        case, noise = f"structured-delan/batch-{batch}", abs(seconds["inverse_again"] / seconds["inverse"] - 1)
+        rows += [Row(case, f"{name}_states_per_second", batch / seconds[name], "1/s") for name in NAMES]
+        rows.append(Row(case, "noise_of_repetition", noise, "1"))
+    rates = {name: [row.value for row in rows if row.quantity.startswith(name)] for name in NAMES}
+    rows += [hessian_row(d, repetitions) for d in (SIZES[:1] if quick else SIZES)]
+    return Findings(rows, {name: (list(batches), each) for name, each in rates.items()})
+
+
+titles = {"x": "batch", "y": "states per second", "title": "structured DeLaN, d = 2, 64x64, float32"}
+draw_throughput = partial(cost_curves, **titles)
+
+
+def hessian_row(d: int, repetitions: int) -> Row:
+    """How many times the states per second of the full-Hessian way."""
+    energies, states = structured(d, TRAINING_BATCH)
+    ways = {
+        "ours": jax.jit(jax.vmap(dynamics(energies).inverse_dynamics)),
+        "full": jax.jit(jax.vmap(by_full_hessian(lagrangian(energies)))),
+    }
+    seconds = medians_in_turns(ways, states, repetitions=repetitions)
+    bound = 4.0 if d == 2 else None
+    return Row(f"full-hessian/d-{d}", "speedup", seconds["full"] / seconds["ours"], "1", None, bound, at_least=True)
+
+
+def structured(d: int, batch: int) -> tuple[NaturalSystem, tuple[Array, ...]]:
+    """The energies of a structured DeLaN, and states (q, qd, qdd), float32."""
+    model = make_delan(chain(d).needs, width=64, depth=2)
+    keys = jax.random.split(jax.random.key(0), 4)
+    states = tuple(jax.random.normal(key, (batch, d), jnp.float32) for key in keys[1:])
+    return model.energies(model.init(keys[0])), states
+
+
+def by_full_hessian(L: Lagrangian):
+    """(q, qd, qdd) -> tau by `jax.hessian` over both arguments, as published implementations have it."""
+
+    def inverse_dynamics(q: Array, qd: Array, qdd: Array) -> Array:
+        _, (mixed, inertia) = jax.hessian(L, argnums=(0, 1))(q, qd)
+        return inertia @ qdd + mixed @ qd - jax.grad(L)(q, qd)
+
+    return inverse_dynamics
+
+
+def measure_scaling(quick: bool) -> Findings:
+    """Latency of single calls, a training step at batch 512, compilation and memory; and how fast each grows."""
+    sizes = QUICK_JOINTS if quick else JOINTS
+    found = {d: cost(d, calls=500 if quick else 4_000, repetitions=10 if quick else 30) for d in sizes}
+    rows = [Row(f"structured-delan/d-{d}", *item, UNITS[item[0]]) for d in sizes for item in found[d].items()]
+    by_quantity = {name: [each[name] for each in found.values()] for name in UNITS}
+    inside = [index for index, d in enumerate(sizes) if FITTED[0] <= d <= FITTED[1]]
+    for quantity, values in by_quantity.items():
+        slope = np.polyfit(np.log([sizes[i] for i in inside]), np.log([values[i] for i in inside]), 1)[0]
+        bound = 2.0 if quantity == "inverse_p50_us" else None
+        rows.append(Row("structured-delan/growth", f"{quantity}_exponent", float(slope), "1", None, bound))
+    places = list(map(float, sizes))
+    return Findings(rows, {title: (places, by_quantity[name], unit) for title, (name, unit) in SHOWN.items()})
+
+
+def draw_scaling(lines: dict) -> Figure:
+    """Each cost against the number of joints."""
+    panels = {name: {"structured-delan": (sizes, values)} for name, (sizes, values, _) in lines.items()}
+    return cost_panels(panels, x="joints", y=[unit for *_, unit in lines.values()])
+
+
+def cost(d: int, *, calls: int, repetitions: int) -> dict[str, float]:
+    """Of d joints."""
+    model = make_delan(chain(d).needs, width=64, depth=2)
+    parameters = jax.jit(model.init)(jax.random.key(0))
+    arrays = jax.random.normal(jax.random.key(1), (4, TRAINING_BATCH, d), jnp.float32)
+    states = [tuple(arrays[:3, index]) for index in range(64)]
+    single = one_step(jax.jit(dynamics(model.energies(parameters)).inverse_dynamics), states, calls=calls)
+    optimiser = optax.adam(1e-3)
+
+    def step(parameters, moments, arrays):
+        def loss(parameters):
+            tau = jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics)(*arrays[:3])
+            return jnp.mean((tau - arrays[3]) ** 2)
+
+        changes, moments = optimiser.update(jax.grad(loss)(parameters), moments)
+        return optax.apply_updates(parameters, changes), moments
+
+    arguments = (parameters, optimiser.init(parameters), arrays)
+    began = time.perf_counter()
+    compiled = jax.jit(step).lower(*arguments).compile()
+    seconds = time.perf_counter() - began
+    analysis = compiled.memory_analysis()
+    memory = analysis.temp_size_in_bytes / 2**20 if analysis else float("nan")
+    training = medians_in_turns({"step": compiled}, arguments, repetitions=repetitions)["step"]
+    of_a_call = (single.p50_us, single.p99_us, single.compile_seconds)
+    return dict(zip(UNITS, (*of_a_call, 1e3 * training, seconds, memory), strict=True))

@@ -1,0 +1,249 @@
+"""benchmark c: exported C, called in a warm loop, with cold caches and from Python; its derivatives, rivals and making.
+
+What is compared takes turns in one run, each turn in processes of its own; medians over turns count, and quantiles of
+cold calls are those of all turns. Before a cold call twice the last-level cache is read, 64 MiB at most; numbers are
+drawn, since times do not depend on them.
+"""
+
+import json
+import math
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.deploy.c.families import functions_of_system
+from dln_jax.deploy.c.load import FLAGS, load_c
+from dln_jax.deploy.c.source import export_c
+from dln_jax.figures.benchmarks import call_times
+from dln_jax.metrics.report import Row, expect
+from dln_jax.precision import data_type
+from dln_jax.scenes.chain import chain
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build, describe
+from scripts.reports.case import Findings
+from scripts.reports.speed.calls_from_python import Timed, pinocchio_functions, seconds_of_calls
+from scripts.reports.speed.calls_in_c import Times, compiled, evicting, last_level_cache, programs, timed
+
+
+class Arm(NamedTuple):
+    """A structured DeLaN of a chain of d links, with two layers."""
+
+    width: int
+    precision: str
+    d: int
+    speedup: float | None = None
+    """Bound on how many times as fast as another export its inverse dynamics must be."""
+
+
+ARMS = {
+    f"structured-delan-{arm.width}x{arm.width}-{arm.precision}-d-{arm.d}": arm
+    for arm in (Arm(8, "f64", 2, 1.2), Arm(64, "f64", 2, 2.0), Arm(64, "f32", 2, 1.3), Arm(8, "f64", 7))
+}
+SMALLEST, *_, RIVALLED = ARMS
+"""What a quick run has; the rival is given as many joints as the second."""
+LARGEST = {"structured-delan-64x64-f64-d-7": Arm(64, "f64", 7)}
+"""Is only exported and compiled."""
+FUNCTIONS = INVERSE, FORWARD, JACOBIAN = ("inverse_dynamics", "forward_dynamics", "inverse_dynamics_jacobian")
+"""Those that an export declares are timed."""
+RIVALS = {INVERSE: "rnea", FORWARD: "aba"}
+"""Pinocchio's functions of the same arguments."""
+OURS, OTHERS = "ours", "against"
+TURNS, QUICK_TURNS = 5, 2
+SECONDS = 20.0
+"""Within which the largest export must be written and compiled."""
+AGREEMENT = {"f64": 1e-11, "f32": 1e-4}
+"""Bound on the relative difference of sums of results of two exports."""
+WAYS = {
+    "hot_ns": "warm loop",
+    "cold_p50_ns": "cold, median",
+    "cold_p99_ns": "cold, p99",
+    "python_us": "from Python",
+    "pinocchio_us": "from Python",
+}
+"""What is drawn."""
+
+
+def export(arm: Arm, folder: Path) -> None:
+    """Writes the C of an arm with drawn parameters, the same at every call, as model.c, .h and .json."""
+    needs = chain(arm.d).needs
+    description = describe("structured-delan", precision=arm.precision, needs=needs, width=arm.width, depth=2)
+    random = np.random.default_rng(0)
+    shapes = jax.eval_shape(build(description).init, jax.random.key(0))
+    drawn = jax.tree.map(lambda leaf: random.normal(size=leaf.shape) / np.sqrt(leaf.shape[0]), shapes)
+    dtype = data_type(arm.precision)
+    energies = build(description).energies(jax.tree.map(lambda leaf: leaf.astype(dtype), drawn))
+    functions = functions_of_system(energies, arm.d, dtype=dtype)
+    export_c(functions, folder, precision=arm.precision, leave_out_large=True)
+
+
+def export_all(folder: Path) -> None:
+    """Exports every arm into a folder of its name; another release measures itself against that by `--against`."""
+    for name, arm in ARMS.items():
+        export(arm, folder / name)
+
+
+def measure(quick: bool, against: Path | None = None) -> Findings:
+    """Every function of every arm, hot, cold and from Python, against Pinocchio, and against another export.
+
+    Args:
+        quick: fewer arms, turns and calls.
+        against: folder of what `export_all` wrote, of another release for instance.
+
+    Raises:
+        InputError: the other export lacks an arm, or something does not compile.
+    """
+    names = (SMALLEST, RIVALLED) if quick else tuple(ARMS)
+    require_exports(against, names)
+    effort = {"repeats": 3, "calls": 200, "cold": 50} if quick else {"repeats": 15, "calls": 2_000, "cold": 200}
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as place:
+        ours, others = (Path(place) / whose for whose in (OURS, OTHERS))
+        making: dict[str, tuple[float, float]] = {}
+        every: list[Times] = []
+        for name in names:
+            making[name] = made(ARMS[name], ours / name)
+            timing = {OURS: programs(ours / name, ours / name / "model.o", FUNCTIONS)}
+            if against:
+                (others / name).mkdir(parents=True)
+                timing[OTHERS] = programs(against / name, compiled(against / name, others / name), FUNCTIONS)
+            each = {(whose, function): path for whose, found in timing.items() for function, path in found.items()}
+            turns = [
+                {key: timed(program, mebibytes=evicting(), **effort) for key, program in each.items()}
+                for _ in range(QUICK_TURNS if quick else TURNS)
+            ]
+            every += turns[0].values()
+            rows += stated(name, json.loads((ours / name / "model.json").read_text()))
+            rows += rows_of_calls(name, ARMS[name], {key: [turn[key] for turn in turns] for key in each})
+            print(f"{name}: {sum(making[name]):.1f} s to make; {len(each)} functions timed", flush=True)
+        loaded = {name: load_c(ours / name) for name in names}
+        making |= {name: made(arm, ours / name) for name, arm in LARGEST.items()}
+    rows += from_python(loaded, repetitions=20 if quick else 200)
+    rows += [row for name, seconds in making.items() for row in rows_of_making(name, seconds, every[0].compiler)]
+    rows.append(Row("caches", "emptied_by_mib", evicting(), "MiB", expected="read before each cold call"))
+    rows.append(Row("caches", "last_level_mib", last_level_cache() or math.nan, "MiB"))
+    rows.append(Row("clock", "subtracted_ns", every[0].timer, "ns", expected="taken off each cold call"))
+    return Findings(rows, curves_of(rows))
+
+
+def require_exports(against: Path | None, names: Sequence[str]) -> None:
+    """`InputError` unless a folder, if one is given, has an export of each arm."""
+    wanted = [f"{name}/model{suffix}" for name in names for suffix in (".h", ".c")]
+    missing = [path for path in wanted if against and not (against / path).is_file()]
+    if missing:
+        raise InputError(f"{against} lacks {missing[0]}; expected what `exported_c.export_all` wrote there")
+
+
+def made(arm: Arm, folder: Path) -> tuple[float, float]:
+    """Seconds in which an arm is exported, and compiled to model.o in the same folder."""
+    began = time.perf_counter()
+    export(arm, folder)
+    written = time.perf_counter()
+    compiled(folder, folder)
+    return written - began, time.perf_counter() - written
+
+
+def rows_of_making(arm: str, seconds: tuple[float, float], compiler: str) -> list[Row]:
+    """The seconds that `made` returns, and together, which are bounded for the largest export."""
+    rows = [Row(arm, f"{what}_seconds", each, "s") for what, each in zip(("export", "compiler"), seconds, strict=True)]
+    words = f"export, and {compiler} {' '.join(FLAGS)}"
+    bound = SECONDS if arm in LARGEST else None
+    return [*rows, Row(arm, "making_seconds", sum(seconds), "s", bound=bound, expected=words)]
+
+
+def stated(arm: str, description: Mapping[str, Any]) -> list[Row]:
+    """Stack and operations of the functions that are timed, where the description of an export states them."""
+    found, units = description["functions"], {"stack_bytes": "B", "operations": "1"}
+    return [
+        Row(f"{arm}/{function}", key, float(found[function][key]), unit)
+        for function in FUNCTIONS
+        for key, unit in units.items()
+        if isinstance(found.get(function), dict) and key in found[function]
+    ]
+
+
+def rows_of_calls(name: str, arm: Arm, turns: Mapping[tuple[str, str], Sequence[Times]]) -> list[Row]:
+    """Of the calls of one arm in C, by whose they are and by function; ratios are medians of those of each turn."""
+    rows = []
+    for (whose, function), times in turns.items():
+        case = f"{name}/{function}" if whose == OURS else f"{name}/{function}/{whose}"
+        cold = np.percentile(np.concatenate([each.cold for each in times]), [50, 99, 99.9, 100])
+        of_turns = [hot(each) for each in times]
+        rows.append(Row(case, "hot_ns", float(np.median(of_turns)), "ns"))
+        rows.append(Row(case, "hot_spread_ns", float(np.ptp(of_turns)), "ns"))
+        rows.append(Row(case, "hot_best_ns", min(float(each.hot.min()) for each in times), "ns"))
+        for quantile, value in zip(("p50", "p99", "p999", "worst"), cold, strict=True):
+            rows.append(Row(case, f"cold_{quantile}_ns", float(value), "ns"))
+        if function == JACOBIAN:
+            words, bound = f"d + 3 times the time of {INVERSE}", arm.d + 3.0 if whose == OURS else None
+            rows.append(
+                Row(case, "over_inverse", ratio(times, turns[whose, INVERSE], hot), bound=bound, expected=words)
+            )
+        if whose == OURS and (OTHERS, function) in turns:
+            others, bound = turns[OTHERS, function], arm.speedup if function == INVERSE else None
+            rows.append(Row(case, "speedup", ratio(others, times, hot), bound=bound, at_least=True))
+            rows.append(Row(case, "cold_speedup", ratio(others, times, cold_median)))
+            difference = abs(times[0].sum / others[0].sum - 1)
+            rows.append(Row(case, "relative_difference", difference, bound=AGREEMENT[arm.precision]))
+    return rows
+
+
+def hot(times: Times) -> float:
+    """Nanoseconds of a call in a loop, the median of the repeats."""
+    return float(np.median(times.hot))
+
+
+def cold_median(times: Times) -> float:
+    """Nanoseconds of the median cold call."""
+    return float(np.median(times.cold))
+
+
+def ratio(one: Sequence[Times], other: Sequence[Times], number: Callable[[Times], float]) -> float:
+    """How many times as long one takes as the other, the median over turns."""
+    return float(np.median([number(a) / number(b) for a, b in zip(one, other, strict=True)]))
+
+
+def from_python(exports: Mapping[str, Any], *, repetitions: int) -> list[Row]:
+    """Microseconds of calls from Python, of loaded exports by arm and of Pinocchio, and how both compare."""
+    functions = {
+        f"{name}/{each}": Timed(getattr(loaded, each), ARMS[name].d, data_type(ARMS[name].precision))
+        for name, loaded in exports.items()
+        for each in RIVALS
+    }
+    rivals = pinocchio_functions(ARMS[RIVALLED].d) if RIVALLED in exports else {}
+    seconds = seconds_of_calls({**functions, **rivals}, repetitions=repetitions)
+    rows = [Row(case, "python_us", 1e6 * seconds[case], "us") for case in functions]
+    for function, rival in RIVALS.items():
+        if rival in rivals:
+            case, words = f"{RIVALLED}/{function}", f"from Python, the time of {rivals[rival].title} for as many joints"
+            rows.append(Row(case, "pinocchio_us", 1e6 * seconds[rival], "us"))
+            rows.append(expect(case, f"over_{rival}", words, seconds[case] / seconds[rival], 1.0))
+    return rows
+
+
+def curves_of(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Nanoseconds by ARM/FUNCTION, by whose the code is, and by way to call it."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for row in rows:
+        if row.quantity in WAYS:
+            case = row.case.removesuffix(f"/{OTHERS}")
+            owner = "exported C" if case == row.case else "other export"
+            owner = "Pinocchio" if row.quantity == "pinocchio_us" else owner
+            times = found.setdefault(case, {}).setdefault(owner, {})
+            times[WAYS[row.quantity]] = row.value * (1e3 if row.unit == "us" else 1.0)
+    return found
+
+
+def draw(times: dict[str, dict[str, dict[str, float]]]) -> Figure:
+    """Times of calls, a panel for each function."""
+    panels: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for case, by_owner in times.items():
+        arm, function = case.split("/")
+        width, precision, d, _ = ARMS[arm]
+        panels.setdefault(function.replace("_", " "), {})[f"{width}x{width}, {precision}, d = {d}"] = by_owner
+    return call_times(panels, x="one call, ns")

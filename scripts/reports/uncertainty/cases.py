@@ -1,0 +1,212 @@
+"""Coverage of 95 % bands on motions that neither the fit nor the calibration has seen, and flags of states far away."""
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.encoders import smooth
+from dln_jax.data.joints import with_joints
+from dln_jax.data.schema import Trajectories, load
+from dln_jax.data.splits import in_blocks, partition_labels, select
+from dln_jax.data.splits import split as split_by_labels
+from dln_jax.datasets.generators import characters, uniform
+from dln_jax.learning import dynamics as problems
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.linear import fit_linear
+from dln_jax.learning.uncertainty import Estimate, estimate
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.trees import Tree, dh_frames, inertial_parameters, serial
+from dln_jax.metrics.coverage import LEVEL, coverage
+from dln_jax.metrics.report import Row
+from dln_jax.models.lagrangian import make_delan
+from dln_jax.models.model import Model, Parameters
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.models.uncertainty import outside, predictive
+from dln_jax.precision import in_float64
+from dln_jax.scenes.two_link_arm import two_link_arm
+from scripts.reports.case import Case, Findings
+from scripts.reports.uncertainty.arms import UR10, VELOCITY_SCALE, arm, motions, plant
+
+LOWEST, HIGHEST = 0.90, 0.98
+"""Of the coverage to reach."""
+NEGLIGIBLE = 1e-12
+TRIM, BLOCK = 0.5, 2.0
+"""s: left out at both ends of a recording, and of a block that counts as a trajectory."""
+
+
+class HeldOut(NamedTuple):
+    """One split: what was found on its test motions, and on far states where there are any."""
+
+    coverage: np.ndarray
+    """[d]."""
+    outside: float
+    """Share of the test's states that are flagged."""
+    far_outside: float
+    """Of far states; NaN where there are none."""
+    far_coverage: float
+
+
+def judged(
+    model: Model, parameters: Parameters, found: Estimate, test: Trajectories, far: Trajectories | None = None
+) -> HeldOut:
+    """A model's bands and flags against held-out data."""
+    answer = _answer(model)
+    shares, flags = [], []
+    for data in (test, far) if far is not None else (test,):
+        tau, sd, out = answer(parameters, found.uncertainty, data.q, data.qd, data.qdd)
+        shares.append(coverage(tau - data.tau, sd, levels=(LEVEL,)).shares[0])
+        flags.append(float(out.mean()))
+    away = (flags[1], float(shares[1].mean())) if far is not None else (np.nan, np.nan)
+    return HeldOut(shares[0], flags[0], *away)
+
+
+@functools.lru_cache(maxsize=2)
+def _answer(model: Model) -> Callable[..., Any]:
+    """Torque, its standard deviation, and the flag, of many states; one program for all splits."""
+
+    def one(parameters, known, *state):
+        std = predictive(model, parameters, known.factor, known.noise, known.inflation)
+        tau = dynamics(model.energies(parameters)).inverse_dynamics(*state)
+        return tau, std(*state), outside(model, parameters, known)(*state)
+
+    many = jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0, 0)), compiler_options=quick_compilation())
+
+    def answer(parameters, known, *states):
+        """By pieces of one size, so that tests of any size are one program."""
+        samples, parts = len(states[0]), []
+        for first in range(0, samples, 256):
+            rows = np.minimum(np.arange(first, first + 256), samples - 1)
+            parts.append(many(parameters, known, *(each[rows] for each in states)))
+        return tuple(np.concatenate(each)[:samples] for each in zip(*parts, strict=True))
+
+    return answer
+
+
+def rows_of(name: str, found: Sequence[HeldOut]) -> list[Row]:
+    """Medians over splits by joint, the best and the worst of all, and flags."""
+    shares = np.array([each.coverage for each in found])
+    medians = np.median(shares, axis=0)
+    expected = f"{LOWEST:.0%} to {HIGHEST:.0%} of held-out torques within bands of 95 %, median over splits"
+    rows = [
+        Row(name, "coverage_95_lowest_joint", float(medians.min()), bound=LOWEST, at_least=True, expected=expected),
+        Row(name, "coverage_95_highest_joint", float(medians.max()), bound=HIGHEST, expected=expected),
+        Row(name, "coverage_95_median", float(np.median(shares))),
+        Row(name, "coverage_95_lowest_split", float(shares.min())),
+        Row(name, "coverage_95_highest_split", float(shares.max())),
+        *(Row(name, f"coverage_95_joint_{joint + 1}", float(each)) for joint, each in enumerate(medians)),
+        Row(name, "outside_share", float(np.median([each.outside for each in found]))),
+        Row(name, "outside_share_highest_split", max(each.outside for each in found)),
+    ]
+    if np.isfinite(found[0].far_outside):
+        rows.append(Row(name, "far_outside_share", float(np.median([each.far_outside for each in found]))))
+        rows.append(Row(name, "far_coverage_95", float(np.median([each.far_coverage for each in found]))))
+    return rows
+
+
+@in_float64
+def simulated_arm(name: str, d: int, *, noise: float, unmodelled: bool, splits: int) -> Findings:
+    """A rigid tree with friction, fitted to 9 motions of 6 s, calibrated on 2, judged on 3; new ones for each split."""
+    tree = arm(d)
+    model = make_rigid_tree(tree, friction=True, velocity_scale=VELOCITY_SCALE)
+    torque, found = plant(tree, unmodelled=unmodelled), []
+    for seed in range(splits):
+        drawn = functools.partial(motions, torque, d, 14, noise=noise)
+        data, far = drawn(seed=2 * seed), drawn(seed=2 * seed + 1, reach=2.0, speed=2.0)
+        train, validation, test = (select(data, each) for each in (range(9), range(9, 11), range(11, 14)))
+        found.append(_linear(model, train, validation, test, far))
+    return Findings(rows_of(name, found))
+
+
+@in_float64
+def letters(name: str, *, noise: float, splits: int, width: int, steps: int) -> Findings:
+    """A structured network of the two-link arm, trained by Gauss-Newton; each letter is a test once, in turn.
+
+    Far are random states over the whole circle. `noise` is a share of each torque's standard deviation.
+    """
+    data, scene, found = characters(), two_link_arm(), []
+    far = uniform(scene, samples=500, seed=1)
+    model = make_delan(scene.needs, width=width, depth=2, dtype=jnp.float64)
+    for seed, labels in enumerate(partition_labels(data, 7, seed=1)[:splits]):
+        random = np.random.default_rng(seed)
+        noisy = data._replace(tau=data.tau + noise * data.tau.std(axis=0) * random.normal(size=data.tau.shape))
+        sets = split_by_labels(noisy, test=labels, seed=seed)
+        parameters = fit(problems.problem(model, sets, seeds=seed), GaussNewton(steps=steps)).parameters
+        known = estimate(model, parameters, sets.train, sets.validation)
+        found.append(judged(model, parameters, known, sets.test, far))
+    return Findings(rows_of(name, found))
+
+
+@in_float64
+def recording(name: str, model: Model, data: Trajectories, *, splits: int) -> Findings:
+    """A rigid tree on a real recording: a fifth of its blocks or trajectories is the test, two more calibrate."""
+    found = []
+    for seed, labels in enumerate(partition_labels(data, 5, seed=0)[:splits]):
+        sets = split_by_labels(data, test=labels, validation_share=0.2, seed=seed)
+        found.append(_linear(model, sets.train, sets.validation, sets.test, None))
+    return Findings(rows_of(name, found))
+
+
+def ur10(path: Path) -> tuple[Model, Trajectories]:
+    """The recording of an UR10 in blocks of 2 s, filtered at 8 Hz, and the rigid tree of its frames."""
+    data = with_joints(load(path), tuple(f"{each}_joint" for each in _UR10_JOINTS))
+    data = smooth(data, 8.0, decimate=2, trim=TRIM).data
+    data = in_blocks(data, round((data.t[-1] - data.t[0]) / BLOCK))
+    link = inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
+    tree = serial(*dh_frames(UR10), [link] * 6, armature=np.ones(6))
+    return make_rigid_tree(tree, friction=True, velocity_scale=0.02), data
+
+
+_UR10_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+def double_pendulum(path: Path) -> tuple[Model, Trajectories]:
+    """Recordings of a double pendulum, filtered at 15 Hz, and its rigid tree in a vertical plane."""
+    link = inertial_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
+    tree: Tree = serial(
+        np.stack([np.eye(3)] * 2), np.array([[0, 0, 0], [0.3, 0, 0]]), [link] * 2, armature=np.ones(2) * 1e-2,
+        gravity=np.array([9.81, 0, 0]),
+    )  # fmt: skip
+    model = make_rigid_tree(tree, friction=True, velocity_scale=0.1)
+    return model, smooth(load(path), 15.0, decimate=8, trim=TRIM).data
+
+
+def _linear(
+    model: Model, train: Trajectories, validation: Trajectories, test: Trajectories, far: Trajectories | None
+) -> HeldOut:
+    parameters = fit_linear(model, train, negligible=NEGLIGIBLE).parameters
+    known = estimate(model, parameters, train, validation, ridge=0.0, negligible=NEGLIGIBLE)
+    return judged(model, parameters, known, test, far)
+
+
+def cases(
+    *, splits: int, recorded_arm: Path | None = None, recorded_pendulum: Path | None = None, steps: int = 150
+) -> list[Case]:
+    """All of them; recordings where their files are given."""
+    made: dict[str, Callable[[str], Findings]] = {}
+    for d in (3, 7):
+        for what, unmodelled in (("modelled", False), ("unmodelled", True)):
+            made[f"rigid-tree-{d}/friction-{what}"] = functools.partial(
+                simulated_arm, d=d, noise=0.3, unmodelled=unmodelled, splits=splits
+            )
+    for what, noise in (("exact", 0.0), ("noisy", 0.01)):
+        made[f"structured-delan/letters-{what}"] = functools.partial(
+            letters, noise=noise, splits=splits, width=8, steps=steps
+        )
+    if recorded_arm is not None:
+        made["rigid-tree/ur10"] = functools.partial(_recorded, ur10, recorded_arm, splits=splits)
+    if recorded_pendulum is not None:
+        made["rigid-tree/double-pendulum"] = functools.partial(
+            _recorded, double_pendulum, recorded_pendulum, splits=splits
+        )
+    return [Case(name, functools.partial(measure, name)) for name, measure in made.items()]
+
+
+def _recorded(read: Callable[[Path], Any], path: Path, name: str, *, splits: int) -> Findings:
+    return recording(name, *read(path), splits=splits)

@@ -1,0 +1,33 @@
+"""Errors after designed and random motions are what theory says of them."""
+
+import jax
+import numpy as np
+
+from dln_jax.excitation.candidates import random_designs
+from dln_jax.excitation.limits import MotionLimits
+from dln_jax.excitation.task import make_task
+from dln_jax.mechanics import trees
+from dln_jax.models.rigid_tree import make_rigid_tree
+from scripts.reports.excitation import compare
+
+LINK = trees.inertial_parameters(1.0, [0.2, 0.0, 0.0], 0.01 * np.eye(3))
+ARM = trees.serial(*trees.dh_frames([[-np.pi / 2, 0, 0, 0]]), [LINK])
+FREE = np.array([[-np.inf, np.inf]])
+
+
+def test_a_wider_motion_errs_less_and_the_same_not_at_all():
+    model = make_rigid_tree(ARM, friction=True, velocity_scale=0.05)
+    limits = MotionLimits(np.array([[-2.0, 2.0]]), np.array([3.0]), np.array([20.0]), FREE)
+    task = make_task(model, model.init(jax.random.key(0)), limits, period=5.0, harmonics=3, noise=0.1)
+    wide = random_designs(task, 2)
+    same = compare(task, wide, wide, samples=100, seeds=4)
+    assert np.allclose(same.ratios, 1.0) and same.median == same.worst == 1.0
+    # Half as far: a sixteenth of the information of some parameters.
+    narrow = [
+        each._replace(motion=each.motion._replace(coefficients=0.5 * np.asarray(each.motion.coefficients)))
+        for each in wide
+    ]
+    found = compare(task, wide, narrow, samples=100, seeds=20)
+    assert found.median < 0.8 and found.ratios.shape == (20,)
+    again = compare(task, narrow, wide, samples=100, seeds=20)
+    assert again.median > 1.2
