@@ -16,7 +16,7 @@ from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
-from dln_jax.runs.hamiltonian import choice, measurements, stages
+from dln_jax.runs.hamiltonian import choice, measurements, predictions, stages
 from dln_jax.runs.hamiltonian import pixels as pixel_task
 from dln_jax.runs.hamiltonian import tasks as hnn_tasks
 from dln_jax.runs.hamiltonian import training as hnn_models
@@ -85,7 +85,7 @@ def workplace(tmp_path_factory):
             patch.setattr(module, "WINDOW", dict.fromkeys(hnn_tasks.WINDOW, 6))
         patch.setattr(hnn_tasks, "HORIZONS", dict.fromkeys(hnn_tasks.HORIZONS, 0.5))
         patch.setattr(table, "models_of", MEASURED.get)
-        patch.setattr(table, "predict", quick_prediction)
+        patch.setattr(predictions, "predict", quick_prediction)
         patch.setattr(table, "train", quick_training)
         for module in (phase_samples, hnn_tasks):
             patch.setattr(module, "reference_motion", quick_motion)

@@ -347,6 +347,12 @@ def test_a_repair_is_judged_by_the_joints_that_it_concerns():
     assert not decisive(now, other, 0.8, np.arange(7) == 2) and not decisive(now, other, 0.8, np.ones(7, bool))
 
 
+def test_a_channel_that_is_dead_is_found_with_the_robot(clean):
+    """Its torque does not vary: no number may overflow."""
+    data = schema.from_arrays({**clean, "tau": column(clean["tau"], 1, np.zeros_like)})
+    assert any(1 in each.joints for each in quick(data, arm()) if each.severity != "note")
+
+
 def test_quick_checks_use_the_robot_where_there_is_one(clean):
     """A base that is tilted is seen by the robot's file only; rough masses in it are no fault of the log."""
     data = schema.from_arrays(without(["qd"], clean))
