@@ -78,9 +78,12 @@ def findings(
     counts = Counter(verdict_of(seed + number, fault) for number in range(logs))
     shares = {level: counts[level] / logs for level in LEVELS}
     rows = [Row(case, f"{level}_share", shares[level]) for level in LEVELS]
-    if fault is None:
+    told_frames = case.startswith("identify")
+    if fault is None and told_frames:
         rows[0] = expect(case, "good_share", "sound logs are good", shares["good"], 1.0, at_least=True)
-    elif fault.level == "refused":
+    elif fault is None:  # of the arms' friction, such a tree lacks the offsets
+        rows[2] = expect(case, "refused_share", "sound logs are not refused", shares["refused"], 0.0)
+    elif fault.level == "refused" and told_frames:
         rows[2] = expect(case, "refused_share", "ruined", shares["refused"], 1.0, at_least=True)
     else:
         rows[0] = expect(case, "good_share", "spoiled: at least doubtful", shares["good"], 0.0)
