@@ -84,9 +84,9 @@ def run(
     if member is None:
         work(given)
         return
+    with as_one_line(prog, given):
+        given = joined(member, given, seconds=joining)
     try:
-        with as_one_line(prog, given):
-            given = joined(member, given, seconds=joining)
         work(given)
     except SystemExit as stop:
         end_at_once(stop.code if isinstance(stop.code, int) else 1)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from dln_jax.command_line.options import Scaled
@@ -97,6 +96,8 @@ def is_first(given: Any) -> bool:
 def wait_for_all(given: Any) -> None:
     """Waits until all processes are here."""
     if (getattr(given, "processes", None) or 1) > 1:
+        from jax.experimental import multihost_utils  # takes long to import
+
         multihost_utils.sync_global_devices("all are here")
 
 

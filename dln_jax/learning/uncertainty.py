@@ -30,7 +30,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtri, stdtrit
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select
@@ -200,6 +199,8 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
     beyond = np.var(squares, ddof=1) - chance * np.mean(squares) ** 2
     if not beyond > 0:
         return 1.0
+    from scipy.special import ndtri, stdtrit  # commands first decide on BLAS's threads
+
     return float((1 + np.sqrt((1 + 1 / M) * beyond)) * (stdtrit(M - 1, UPPER) / ndtri(UPPER)) ** 2)
 
 

@@ -37,7 +37,7 @@ def address(coordinator: str) -> tuple[str, int]:
     return parts[1].strip("[]"), int(parts[2])
 
 
-def meet(member: Membership, options: Mapping[str, Any], seconds: float) -> None:
+def meet(member: Membership, options: Mapping[str, Any], seconds: int) -> None:
     """Waits until all processes are there and have the same options and versions.
 
     Process 0 listens at the coordinator's port, which it leaves to JAX afterwards; the others report to it.

@@ -88,8 +88,9 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
         seconds: for all to be started.
 
     Raises:
-        InputError: the coordinator cannot be reached, a process does not come, or the processes differ.
+        InputError: JAX has been used, the coordinator cannot be reached, a process does not come, or they differ.
     """
+    require_unused()
     if member.coordinator is not None:
         # JAX would abort, with a trace of C++, where a process does not come or a port is taken.
         meet(member, options, seconds)
@@ -109,6 +110,16 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
     if jax.process_index() == 0:
         local, kind = jax.local_device_count(), jax.default_backend()
         print(f"{jax.process_count()} processes, {local} {kind} device{'s' * (local > 1)} each")
+
+
+def require_unused() -> None:
+    """Raises `InputError` if JAX has been used: it then refuses another number of devices."""
+    devices = jax.config.values["jax_num_cpu_devices"]
+    try:
+        jax.config.update("jax_num_cpu_devices", devices + 1)
+        jax.config.update("jax_num_cpu_devices", devices)
+    except RuntimeError:
+        raise InputError("JAX has been used in this process; several are started before it is") from None
 
 
 @contextlib.contextmanager

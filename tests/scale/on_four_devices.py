@@ -9,7 +9,7 @@ import numpy as np
 
 from dln_jax import commands
 from dln_jax.scale.mesh import batch_mesh, gathered, replicate, shard, shares, spread, summed
-from dln_jax.scale.processes import host_devices
+from dln_jax.scale.processes import host_devices, require_unused
 from dln_jax.types import InputError
 
 
@@ -36,7 +36,8 @@ def total(scale, batch):
 jax.config.update("jax_enable_x64", True)
 for module in pkgutil.iter_modules(commands.__path__):
     importlib.import_module(f"{commands.__name__}.{module.name}")
-host_devices(4)  # no effect if a command that is imported has used a device
+require_unused()  # a command that is imported has used no device
+host_devices(4)
 assert batch_mesh(1) is None
 mesh = batch_mesh()
 assert mesh is not None and mesh.size == 4 and batch_mesh(2).size == 2

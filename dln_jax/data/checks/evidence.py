@@ -94,7 +94,7 @@ def _covariance(prior: Prior, weights: np.ndarray, noise: np.ndarray, d: int) ->
         K += weight * part
     for weight, columns in zip(weights[len(prior.parts) :], prior.columns, strict=False):
         K += weight * columns @ columns.T
-    # Rounding of large parts may leave K indefinite where noise is small: an exact log, a fault tried on a robot's file.
+    # Rounding of large parts may leave K indefinite where noise is small, as on an exact log or a dead channel.
     K[np.diag_indices_from(K)] += len(K) * np.finfo(float).eps * K.diagonal().max()
     return K
 
