@@ -272,7 +272,7 @@ def test_options_and_models_of_other_commands_are_refused(positions, capsys):
     old = positions.parent / "old"
     old.mkdir()
     (old / "config.json").write_text(json.dumps({**stored_arguments(train_hnn.Arguments()), "task": "spring"}))
-    assert "train_hnn_task --task NAME" in refused(capsys, train_hnn, "--out", str(old), "--resume")
+    assert "'task' is no argument of this release" in refused(capsys, train_hnn, "--out", str(old), "--resume")
 
 
 def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch):
