@@ -49,6 +49,7 @@ def double(tmp_path_factory):
 MEASURE = ("--task", "measured", "--data", "double.npz", "--no-low-latency", "--no-figures")
 
 
+@pytest.mark.slow
 def test_coupled_joints_are_learned_and_reported(double, capsys):
     options = ("--model", "planar-chain", "--coordinates", "absolute", "--test", "d", "--steps", "20")
     command(train_hnn_task, *MEASURE, *options, "--out", "run")

@@ -92,6 +92,7 @@ def test_own_springs_are_learned_as_the_named_task(files):
     assert errors["named"] < 1e-3 and errors["own"] < 2 * errors["named"]
 
 
+@pytest.mark.slow
 def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
     """Nothing is stated: order, bodies and model are found, rates are exact, and the true energy is conserved."""
     command(train_hnn_task, *TASK, "orbits.npz", "--out", "orbits", "--steps", "25")
@@ -135,6 +136,7 @@ def test_motions_are_left_out_where_they_could_not_be_compiled_in_time(files):
     assert list(trained.fits) == ["rates"] and "motions were not fitted" in trained.stopped
 
 
+@pytest.mark.slow
 def test_the_fit_of_motions_ends_where_it_is_flat(files):
     """At the floor of the noise iterations bring nothing: the fit stops by itself, and says that it has finished."""
     own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))

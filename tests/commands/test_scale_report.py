@@ -46,6 +46,7 @@ def test_what_is_sent():
     assert hosts.of_normal_equations(100).summed == 8 * (5000 + 300)
 
 
+@pytest.mark.slow
 def test_teams_answer_in_turn_and_say_why_they_cannot():
     layouts = {"one": Layout(), "devices": Layout(devices=2), "processes": Layout(processes=2)}
     work = {"work": "inverse-dynamics", "batch": 3, "dtype": "float32"}

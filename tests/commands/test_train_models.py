@@ -58,6 +58,7 @@ def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     assert "has no seeds" in refused(capsys, train_delan, *options, "--seeds", "2")
 
 
+@pytest.mark.slow
 def test_a_kernel_is_made_of_samples_and_its_order_is_chosen_by_validation(workplace, capsys):
     options = ("--data", "swing.npz", "--model", "trigonometric-kernel", "--no-figures", "--no-low-latency")
     command(train_delan, *options, "--samples", "40", "--out", "kernel")
@@ -109,6 +110,7 @@ def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, 
     assert metrics_of(workplace / "negative")["share_not_definite"] > 0.3
 
 
+@pytest.mark.slow
 def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_their_spread(workplace, capsys):
     command(train_delan, *QUICK, "--seeds", "2", "--out", "seeds")
     metrics = metrics_of(workplace / "seeds")
@@ -188,6 +190,7 @@ def test_an_objective_vanishes_for_the_plant_and_follows_the_data(workplace):
     assert errors.shape == (120, 2) and float(jnp.abs(errors).max()) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_table_has_the_plant_beside_the_model_and_a_test_that_stands_still_is_no_mistake(workplace, capsys):
     data = generators.free_swing(pendulum(), trajectories=7, steps=40)
     torque = np.random.default_rng(0).normal(size=data.tau.shape)

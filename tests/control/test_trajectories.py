@@ -81,6 +81,7 @@ def cart_pole_problem(dt):
 DOWN = np.array([0.0, np.pi, 0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_a_cart_pole_swings_up_within_its_limits_and_receding_plans_hold_it():
     problem = cart_pole_problem(0.04)
     u = 0.5 * np.sin(np.linspace(0, 6, 75))[:, None]

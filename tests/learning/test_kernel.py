@@ -32,6 +32,7 @@ def arm():
     return select(data, np.arange(60)), select(data, np.arange(60, 140))
 
 
+@pytest.mark.slow
 def test_it_is_the_trigonometric_model_where_torques_determine_both(arm):
     train, test = arm
     fit = fit_kernel(train.needs, train, likelihood_samples=30, iterations=20, least_noise=1e-6)

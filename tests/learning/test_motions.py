@@ -47,6 +47,7 @@ def test_windows_never_cross_trajectories():
     assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
 
 
+@pytest.mark.slow
 def test_a_noisy_oscillator_is_recovered_without_the_bias_of_its_noise():
     """H = q² + p² from states with noise of 0.1: derivative matching flattens it, trajectories do not."""
     random, t = np.random.default_rng(0), np.linspace(0, 3, 30)

@@ -42,6 +42,7 @@ def test_identified_inertias_and_friction_are_the_plant_s(prepared):
     np.testing.assert_allclose(found.friction(q, qd), TRUTH.friction(q, qd), rtol=0.3)
 
 
+@pytest.mark.slow
 def test_a_network_comes_close_in_a_few_iterations(prepared):
     found = learned(prepared, PLANT.scene.needs, steps=10, width=4, depth=1)
     left = deviations(found.dynamics, cut_momentum_windows(prepared.train))

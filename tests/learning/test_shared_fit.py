@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from sharing import run_on_all
 
+pytestmark = pytest.mark.slow
+"""Every program is compiled for one device and for several."""
+
 PATH = Path(__file__).parent / "shared_trainings.py"
 SHARED = ("four devices", "first of two", "second of two")
 ROUNDING = 1e-12

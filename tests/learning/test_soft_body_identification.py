@@ -46,6 +46,7 @@ def params_of(scene, theta):
     )
 
 
+@pytest.mark.slow
 def test_material_friction_and_muscle_are_recovered_from_a_motion(slider):
     stepper = make_step(slider, 0.02, tolerance=1e-9)
     state = stepper.init(v=[1.5, 0.0])
@@ -72,6 +73,7 @@ def test_material_friction_and_muscle_are_recovered_from_a_motion(slider):
         np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_rest_shape_is_found_that_hangs_as_wanted():
     scene = make_scene(MESH, (elastic(MESH, stable_neo_hookean, youngs_modulus=2e5), gravity(MESH)), held=[0, 2])
     wanted = jnp.asarray(MESH.vertices)

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from sharing import run_on_all
 
+pytestmark = pytest.mark.slow
+"""Every program is compiled for one device and for several."""
+
 PATH = Path(__file__).parent / "shared_batches.py"
 
 

@@ -107,6 +107,7 @@ def digest(seeds):
     return hashlib.sha256(source_files(programs, name="model")["model.c"]).hexdigest()
 
 
+@pytest.mark.slow
 def test_the_text_is_the_same_in_every_process():
     check_text(0, 12)
 

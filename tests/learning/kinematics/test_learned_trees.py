@@ -51,6 +51,7 @@ def test_an_arm_is_found_down_to_the_noise():
     assert root_mean_square(SKEW, fit, data.needs) < NOISE
 
 
+@pytest.mark.slow
 def test_from_a_sketch_a_sliding_arm_is_found():
     data = lip_trajectories(SLIDING, noise=NOISE, every=60)
     exact = Frames(SLIDING.tree.rotations, SLIDING.tree.positions)

@@ -31,6 +31,7 @@ def test_criteria_of_a_motion_that_is_known():
     assert found.smoothness == pytest.approx(2 / np.sqrt(4999), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_plan_is_followed_up_and_held():
     weights = Weights()
     plan = planned("shoulder", weights, jnp.asarray(10.0 * np.random.default_rng(0).normal(size=(60, 1))))

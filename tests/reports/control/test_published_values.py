@@ -55,6 +55,7 @@ def test_returns_of_rest_and_of_a_law_that_fails():
     assert np.abs(starts(plant, "down")[:, 0] - np.pi).max() < 0.2 and len(starts(plant, "uniform", 7)) == 7
 
 
+@pytest.mark.slow
 def test_direct_optimisation_near_the_goal_is_the_regulator():
     plant = PLANTS["pendulum"]()
     value = regulator_value(plant.problem)

@@ -5,6 +5,7 @@ import pytest
 from scripts.reports.robots import lip
 
 
+@pytest.mark.slow
 def test_three_joints_are_at_the_floor():
     rows = {(row.case, row.quantity): row for row in lip.rows("panda-3", friction=False, every=100, tests=(101,))}
     case = "lip/panda-3/frictionless/50"

@@ -164,6 +164,7 @@ def test_rows_have_the_bounds_that_exports_must_reach():
     ]
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_two_exports_take_turns_and_are_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(exported_c, "ARMS", {name: Arm(2, "f64", d) for d, name in enumerate(ARMS, start=1)})
