@@ -12,9 +12,9 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.schema import load as load_trajectories
 from dln_jax.data.schema import save as save_trajectories
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
-from dln_jax.deploy.low_latency import enable_low_latency, low_latency
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, Training

@@ -8,13 +8,13 @@ import os
 import sys
 from pathlib import Path
 
-from dln_jax.commands import COMMANDS
+from dln_jax.cli.commands import COMMANDS
 
 REPORTS = "scripts.reports.commands"
 """Package of the commands that measure the project, which a checkout has and the wheel has not."""
 
 
-def command(name: str, prog: str, *, package: str = "dln_jax.commands") -> None:
+def command(name: str, prog: str, *, package: str = "dln_jax.cli.commands") -> None:
     """Runs one command with the arguments of this process.
 
     Args:
@@ -27,7 +27,7 @@ def command(name: str, prog: str, *, package: str = "dln_jax.commands") -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.argv[0] = prog  # a report says how it was made
     try:
-        from dln_jax.command_line.running import run
+        from dln_jax.cli.running import run
 
         module = importlib.import_module(f"{package}.{name}")
     except KeyboardInterrupt:
@@ -48,7 +48,7 @@ def main() -> None:
     if words[:1] == ["report"]:
         _choose(words[1:], f"{prog} report", REPORTS, report_names())
     else:
-        _choose(words, prog, "dln_jax.commands", COMMANDS, "\nreport NAME, in a checkout, measures the project\n")
+        _choose(words, prog, "dln_jax.cli.commands", COMMANDS, "\nreport NAME, in a checkout, measures the project\n")
 
 
 def report_names() -> list[str]:
@@ -88,7 +88,7 @@ def _choose(words: list[str], prog: str, package: str, names: list[str], more: s
     command(name, f"{prog} {name}", package=package)
 
 
-def first_line(name: str, package: str = "dln_jax.commands") -> str:
+def first_line(name: str, package: str = "dln_jax.cli.commands") -> str:
     """What a command's first line states that it does."""
     # Read and not imported: some commands take seconds to import.
     specification = importlib.util.find_spec(f"{package}.{name}")

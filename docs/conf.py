@@ -54,19 +54,18 @@ sphinx_gallery_conf = {
 suppress_warnings = ["config.cache"]
 warnings.filterwarnings("ignore", message="FigureCanvasAgg is non-interactive")
 
-ROOMS = {
+PACKAGES = {
     "types": "Symbols, units and shapes",
     "mechanics": "Mechanics: equations of motion from energies",
-    "scenes": "Textbook systems",
+    "scenes": "Textbook systems and data generated from them",
     "models": "Models: energies made of networks and bases",
     "data": "Data: a user's file",
-    "datasets": "Data sets that are generated",
     "zoo": "Models by name, run folders",
     "learning": "Learning",
     "metrics": "Numbers about a model",
     "figures": "Pictures",
     "control": "Control",
-    "deploy": "Real time, C and StableHLO",
+    "export": "Real time, C and StableHLO",
     "softbody": "Soft bodies",
     "locomotion": "Locomotion",
     "nn": "Networks",
@@ -77,9 +76,9 @@ ROOMS = {
 """Folders and modules of dln_jax that the API pages show, in the order of the contents."""
 
 
-def modules(room):
-    """A room's modules, itself first, without those that need an extra which is not installed."""
-    package = importlib.import_module(f"dln_jax.{room}")
+def modules(package):
+    """A package's modules, itself first, without those that need an extra which is not installed."""
+    package = importlib.import_module(f"dln_jax.{package}")
     yield package
     for found in pkgutil.walk_packages(getattr(package, "__path__", []), package.__name__ + "."):
         try:
@@ -90,17 +89,17 @@ def modules(room):
 
 
 def write_api_pages():
-    """One page a room, so that a new module is in the documentation without a list to extend."""
+    """One page a package, so that a new module is in the documentation without a list to extend."""
     folder = HERE / "api"
-    for room, title in ROOMS.items():
+    for package, title in PACKAGES.items():
         parts = [title, "=" * len(title), ""]
-        for module in modules(room):
+        for module in modules(package):
             members = [] if hasattr(module, "__path__") else ["   :members:"]
             short = module.__name__.removeprefix("dln_jax.")
-            heading = [] if short == room else [short, "-" * len(short), ""]
+            heading = [] if short == package else [short, "-" * len(short), ""]
             parts += [*heading, f".. automodule:: {module.__name__}", *members, "   :ignore-module-all:", ""]
         text = "\n".join(parts)
-        path = folder / f"{room}.rst"
+        path = folder / f"{package}.rst"
         if not path.exists() or path.read_text() != text:
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from dln_jax.command_line.running import run
+from dln_jax.cli.running import run
 
 
 def command(script, *arguments):

@@ -12,13 +12,13 @@ import pytest
 import dln_jax
 from dln_jax import sizes
 from dln_jax.data import schema
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning.engine import newton
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.engine.problem import Problem
 from dln_jax.learning.engine.sharing import sharing
 from dln_jax.mechanics.trees import make_tree
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.sizes import memory, require_memory, require_network
 from dln_jax.softbody import make_scene, with_parameters

@@ -17,10 +17,10 @@ from calls import command
 from conftest import CACHE, LEAST_SECONDS
 from interpreters import Program, interpreters
 
-from dln_jax.commands import COMMANDS
+from dln_jax.cli.commands import COMMANDS
 from dln_jax.data import schema
-from dln_jax.datasets import generators
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
 
 ROOT = Path(__file__).parent.parent
@@ -58,7 +58,7 @@ def commands(text):
 def script_and_arguments(words):
     assert words[:2] == ["python", "-m"] and words[2].startswith("scripts."), words
     name = words[2].removeprefix("scripts.")
-    package = "dln_jax.commands" if name in COMMANDS else "scripts.reports.commands"
+    package = "dln_jax.cli.commands" if name in COMMANDS else "scripts.reports.commands"
     return importlib.import_module(f"{package}.{name}"), words[3:]
 
 

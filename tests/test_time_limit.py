@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dln_jax.commands import train_delan
+from dln_jax.cli.commands import train_delan
 from dln_jax.data import schema
-from dln_jax.datasets import generators
 from dln_jax.learning.engine.problem import Progress, Stop, Training
-from dln_jax.runs import dynamics_growth, dynamics_training
-from dln_jax.runs.dynamics_growth import Candidate
 from dln_jax.scenes.chain import chain
+from dln_jax.scenes.datasets import generators
 from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
+from dln_jax.training import dynamics_growth, dynamics_training
+from dln_jax.training.dynamics.growth import Candidate
 from tests.calls import command
 
 
@@ -66,7 +66,7 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
 
     grow = dynamics_growth.grow_to_target
     monkeypatch.setattr(dynamics_growth, "_try", tried)
-    monkeypatch.setattr("dln_jax.runs.dynamics.grow_to_target", ended)
+    monkeypatch.setattr("dln_jax.training.dynamics.run.grow_to_target", ended)
     with pytest.raises(Enough):
         command(train_delan, *arm, "--target", "1e-9")
     assert left == [30.0, 10.0]

@@ -7,11 +7,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dln_jax.datasets.pendulum_frames import FRAME_TIME
 from dln_jax.figures import style
 from dln_jax.figures.style import TRUTH
 from dln_jax.metrics.frames import Injection
 from dln_jax.metrics.phase_space import Motions
+from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME
 from dln_jax.types import require_positive
 
 Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dln_jax.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, pictures, render, rod
 from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import flow
 from dln_jax.mechanics.integrators import advance, rk4, rollout, second_order
@@ -24,6 +23,7 @@ from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, su
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
 from dln_jax.precision import in_float64, with_float64
+from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, pictures, render, rod
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 

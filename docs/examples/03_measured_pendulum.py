@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import dln_jax
-from dln_jax.commands import train_hnn_task
+from dln_jax.cli.commands import train_hnn_task
 from dln_jax.mechanics.integrators import rk4, rollout
 
 jax.config.update("jax_enable_x64", True)

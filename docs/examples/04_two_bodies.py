@@ -13,12 +13,12 @@ import numpy as np
 
 from dln_jax import GaussNewton, fit
 from dln_jax.data.splits import hold_out
-from dln_jax.datasets.hamiltonian_tasks import two_body
 from dln_jax.learning.rates import problem
 from dln_jax.mechanics import equations
 from dln_jax.mechanics.integrators import gauss_legendre4, rollout
 from dln_jax.models.n_body import make_pairwise_hamiltonian
 from dln_jax.nn.activations import tanh
+from dln_jax.scenes.datasets.hamiltonian_tasks import two_body
 
 jax.config.update("jax_enable_x64", True)
 

@@ -16,9 +16,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from dln_jax import dynamics, export_c, load_c
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning.linear import fit_linear
 from dln_jax.models.trigonometric import make_trigonometric
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 
 jax.config.update("jax_enable_x64", True)

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dln_jax.excitation.candidates import Design, functions_at, states
-from dln_jax.excitation.task import Task
+from dln_jax.identification.excitation.candidates import Design, functions_at, states
+from dln_jax.identification.excitation.task import Task
 
 
 class Comparison(NamedTuple):

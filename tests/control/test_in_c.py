@@ -18,8 +18,8 @@ from dln_jax.control import (
     switched,
     value,
 )
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 

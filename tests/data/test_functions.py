@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.command_line.optimisers import optimiser_named
+from dln_jax.cli.optimisers import optimiser_named
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples
 from dln_jax.learning import functions as regression

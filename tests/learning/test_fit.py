@@ -9,7 +9,6 @@ import optax
 import pytest
 
 from dln_jax.data.splits import split
-from dln_jax.datasets import generators
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine import descent, newton, optimisers
 from dln_jax.learning.engine.checkpoint import Checkpoint, fingerprint, identity
@@ -20,6 +19,7 @@ from dln_jax.learning.engine.sharing import Sharing
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs

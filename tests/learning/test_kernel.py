@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dln_jax.data.splits import select
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.marginal_likelihood import Equations, Unknowns, likelihood, start_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.torque_covariance import States
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError

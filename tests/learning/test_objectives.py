@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dln_jax.data.splits import Split, split
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning import BOTH_WAYS, FORWARD, TORQUE, objective_of
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
@@ -18,6 +17,7 @@ from dln_jax.learning.objectives import STATED, arrays, residuals
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.hamiltonian import HamiltonianSystem, legendre
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build, describe_for

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.datasets import generators
 from dln_jax.learning.online import (
     Replay,
     appended,
@@ -17,6 +16,7 @@ from dln_jax.learning.online import (
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.models.planar_chain import make_planar_chain
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
 

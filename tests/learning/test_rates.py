@@ -7,7 +7,6 @@ import pytest
 from motions import quick_motion
 
 from dln_jax.data.splits import hold_out
-from dln_jax.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.rates import match_linear, problem
@@ -19,6 +18,7 @@ from dln_jax.models.baselines import make_phase_network
 from dln_jax.models.dissipative import make_dissipative
 from dln_jax.models.hamiltonian import make_black_box_hamiltonian, make_separable_hamiltonian
 from dln_jax.models.polynomial_hamiltonian import make_polynomial_hamiltonian
+from dln_jax.scenes.datasets import hamiltonian_tasks, phase_samples
 from dln_jax.types import InputError, Needs
 
 NEEDS = Needs(joints=("revolute", "prismatic"), friction=True)

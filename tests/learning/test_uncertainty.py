@@ -7,7 +7,6 @@ import pytest
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import split
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning import uncertainty as learning
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.posterior import leading_directions, posterior, spectrum
@@ -22,6 +21,7 @@ from dln_jax.models.model import Model
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.models.uncertainty import outside, predictive, scores
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
 

@@ -14,7 +14,7 @@ from calls import refused
 from gymnasium.utils.env_checker import check_env
 from jax.sharding import Mesh
 
-from dln_jax.commands import train_locomotion
+from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.environment import CreatureEnvironment

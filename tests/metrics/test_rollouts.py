@@ -7,7 +7,6 @@ import pytest
 
 from dln_jax.data import schema
 from dln_jax.data.splits import select
-from dln_jax.datasets import generators
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
@@ -21,6 +20,7 @@ from dln_jax.metrics.rollouts import (
     valid_prediction_time,
     valid_prediction_times,
 )
+from dln_jax.scenes.datasets import generators
 from dln_jax.types import InputError
 
 FRICTION = 0.3

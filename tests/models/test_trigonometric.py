@@ -11,7 +11,6 @@ from jax.flatten_util import ravel_pytree
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select, split
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning.linear import LinearFit, choose_degrees, fit_linear, linearised
 from dln_jax.mechanics import closed_form, lagrangian
 from dln_jax.mechanics.closed_form import ClosedForm
@@ -21,6 +20,7 @@ from dln_jax.models.model import Model
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 
-from dln_jax.excitation.candidates import random_designs
-from dln_jax.excitation.limits import MotionLimits
-from dln_jax.excitation.task import make_task
+from dln_jax.identification.excitation.candidates import random_designs
+from dln_jax.identification.excitation.limits import MotionLimits
+from dln_jax.identification.excitation.task import make_task
 from dln_jax.mechanics import trees
 from dln_jax.models.rigid_tree import make_rigid_tree
 from scripts.reports.excitation import compare

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax import commands
+from dln_jax.cli import commands
 from dln_jax.scale.mesh import batch_mesh, gathered, replicate, shard, shares, spread, summed
 from dln_jax.scale.processes import host_devices, require_unused
 from dln_jax.types import InputError

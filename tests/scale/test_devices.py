@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dln_jax import compilation
-from dln_jax.deploy.low_latency import enable_low_latency, low_latency
+from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.learning.engine.problem import Problem, require_finite_start
 from dln_jax.scale import devices
 from dln_jax.types import InputError

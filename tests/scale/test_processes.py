@@ -22,10 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.options import Resumable, Scaled
-from dln_jax.command_line.progress import progress
-from dln_jax.command_line.running import command_folder, run
-from dln_jax.command_line.scaled import mesh_of
+from dln_jax.cli.options import Resumable, Scaled
+from dln_jax.cli.progress import progress
+from dln_jax.cli.running import command_folder, run
+from dln_jax.cli.scaled import mesh_of
 from dln_jax.scale.mesh import gathered, shard, spread, summed
 from dln_jax.scale.processes import process_key
 from dln_jax.types import InputError

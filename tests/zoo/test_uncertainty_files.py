@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.deploy.c.families import functions_of_run
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.run import export_run
+from dln_jax.export.c.families import functions_of_run
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.run import export_run
 from dln_jax.models.uncertainty import Domain, Uncertainty, outside, predictive
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe

@@ -8,7 +8,6 @@ import numpy as np
 
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split
-from dln_jax.datasets import generators
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
@@ -23,6 +22,7 @@ from dln_jax.metrics.errors import errors, mean_square, predictions
 from dln_jax.metrics.latency import Latency, one_step
 from dln_jax.metrics.rollouts import rollout_metrics
 from dln_jax.models.model import Model
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import Hamiltonian

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.progress import progress
+from dln_jax.cli.progress import progress
 from dln_jax.data.splits import Split
 from dln_jax.mechanics import closed_form
 from dln_jax.mechanics.equations import dynamics

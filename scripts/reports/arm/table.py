@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from dln_jax.data import schema
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import Split, partition_labels, select, split
-from dln_jax.datasets import generators
-from dln_jax.datasets.default_data import CHARACTERS_TEST, default_data
-from dln_jax.datasets.generators import uniform_tests
 from dln_jax.figures.benchmarks import error_against_time
 from dln_jax.metrics.report import UNITS, Row, markdown_table, unit_of
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.scenes.datasets.generators import uniform_tests
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError
 from scripts.reports.arm.models import (

@@ -14,8 +14,8 @@ from typing import Literal
 
 import tyro
 
-from dln_jax.command_line.arguments import Unstated
-from dln_jax.command_line.options import Folder
+from dln_jax.cli.arguments import Unstated
+from dln_jax.cli.options import Folder
 from dln_jax.files import write_bytes
 from dln_jax.metrics.report import Row, conditions, markdown, publish
 from dln_jax.types import InputError

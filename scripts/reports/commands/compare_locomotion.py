@@ -8,16 +8,16 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dln_jax.command_line.arguments import Unstated
-from dln_jax.command_line.options import Drawn, Folder, Scaled
-from dln_jax.command_line.running import command_folder
-from dln_jax.command_line.scaled import mesh_of
+from dln_jax.cli.arguments import Unstated
+from dln_jax.cli.options import Drawn, Folder, Scaled
+from dln_jax.cli.running import command_folder
+from dln_jax.cli.scaled import mesh_of
 from dln_jax.files import write_figure, write_json
 from dln_jax.locomotion import comparison
 from dln_jax.locomotion.methods import METHODS, settings_of
 from dln_jax.locomotion.task import FALLEN
 from dln_jax.metrics.report import conditions, print_report, write_report
-from dln_jax.runs.locomotion import GOAL, Options, announce, learned, prepare, write_run
+from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, write_run
 from scripts.reports.locomotion import comparison_rows
 
 

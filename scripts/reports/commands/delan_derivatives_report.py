@@ -7,7 +7,7 @@ gradients of the torque loss at batch 512, single calls are one state. `mechanic
 
 from dataclasses import dataclass
 
-from dln_jax.command_line.options import Folder
+from dln_jax.cli.options import Folder
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import measure_and_publish
 from scripts.reports.speed.derivatives import cases

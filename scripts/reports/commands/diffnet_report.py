@@ -10,9 +10,9 @@ machine slows all alike; medians are compared. Prints a table and writes report.
 from dataclasses import dataclass
 from typing import Annotated
 
-from dln_jax.command_line.arguments import choice, names_in
-from dln_jax.command_line.options import Folder
-from dln_jax.command_line.stored_arguments import stored_arguments
+from dln_jax.cli.arguments import choice, names_in
+from dln_jax.cli.options import Folder
+from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import measure_and_publish
 from scripts.reports.differential_networks.one_pass import PLAIN, cases

@@ -7,9 +7,9 @@ validation, and the published wide ones by Adam. Prints the table and writes rep
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dln_jax.command_line.options import Resumable
-from dln_jax.command_line.running import command_folder
-from dln_jax.command_line.stored_arguments import stored_arguments
+from dln_jax.cli.options import Resumable
+from dln_jax.cli.running import command_folder
+from dln_jax.cli.stored_arguments import stored_arguments
 from dln_jax.learning.functions import WIDTHS
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.types import require_seed

@@ -8,8 +8,8 @@ end), resumed to the end, and its model file compared. Prints a count for each, 
 from dataclasses import dataclass
 from typing import Annotated
 
-from dln_jax.command_line.arguments import choice, names_in
-from dln_jax.command_line.options import Folder
+from dln_jax.cli.arguments import choice, names_in
+from dln_jax.cli.options import Folder
 from dln_jax.metrics.report import conditions, publish
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import Done, measure, rows_in

@@ -7,9 +7,9 @@ figures. All of it is float64 unless a case says otherwise.
 from dataclasses import dataclass
 from typing import Annotated
 
-from dln_jax.command_line.arguments import choice, names_in
-from dln_jax.command_line.options import Drawn, Folder
-from dln_jax.command_line.running import command_folder
+from dln_jax.cli.arguments import choice, names_in
+from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.running import command_folder
 from scripts.reports.case import measure_and_publish, named
 from scripts.reports.stability import NAMES, cases
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from dln_jax.command_line.arguments import Unstated, names_in
-from dln_jax.command_line.options import Folder
+from dln_jax.cli.arguments import Unstated, names_in
+from dln_jax.cli.options import Folder
 from dln_jax.types import InputError, require_positive
 from dln_jax.zoo.run_folder import run_folder
 from scripts.reports.case import measure_and_publish, named

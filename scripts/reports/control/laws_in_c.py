@@ -29,8 +29,8 @@ from dln_jax.control import (
     switched,
     value,
 )
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.report import Row, expect

@@ -11,7 +11,7 @@ from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.outcomes import Outcomes
 from dln_jax.control.swing_up_runs import Tried, law_of, model_of_maker, try_starts
 from dln_jax.metrics.report import Row, expect
-from dln_jax.runs.learned_swing_ups import Obtained, errors_along, obtain, test_motions
+from dln_jax.training.swing_ups.learned import Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError
 from scripts.reports.case import Findings
 

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dln_jax.command_line.running import run
+from dln_jax.cli.running import run
 from dln_jax.control import first_plan, receding
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
-from dln_jax.deploy.low_latency import enable_low_latency
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import InputError
 from scripts.reports.control.receding import HANGING, RATE, cart_pole_problem, field, starts

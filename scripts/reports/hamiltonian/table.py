@@ -9,12 +9,12 @@ import numpy as np
 
 from dln_jax.files import write_figure
 from dln_jax.metrics.report import Row, markdown_table, unit_of
-from dln_jax.runs.hamiltonian import pixels
-from dln_jax.runs.hamiltonian.choice import description_of, models_of
-from dln_jax.runs.hamiltonian.predictions import Seen, figure_of, measured_once
-from dln_jax.runs.hamiltonian.recipes import RECIPES
-from dln_jax.runs.hamiltonian.tasks import PIXELS, REAL, problem_of
-from dln_jax.runs.hamiltonian.training import train
+from dln_jax.training.hamiltonian import pixels
+from dln_jax.training.hamiltonian.model_selection import description_of, models_of
+from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once
+from dln_jax.training.hamiltonian.recipes import RECIPES
+from dln_jax.training.hamiltonian.tasks import PIXELS, REAL, problem_of
+from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import require_positive
 from scripts.reports.case import Case, Findings, by_case, rows_of
 from scripts.reports.published import HAMILTONIAN, published

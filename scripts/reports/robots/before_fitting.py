@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 
-from dln_jax.excitation.candidates import Design, random_designs
-from dln_jax.excitation.design import CRITERIA, best_design, make_optimiser
-from dln_jax.excitation.limits import MotionLimits
-from dln_jax.excitation.task import Task, make_task
+from dln_jax.identification.excitation.candidates import Design, random_designs
+from dln_jax.identification.excitation.design import CRITERIA, best_design, make_optimiser
+from dln_jax.identification.excitation.limits import MotionLimits
+from dln_jax.identification.excitation.task import Task, make_task
 from dln_jax.metrics.report import Row, expect
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.scenes.panda import panda

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dln_jax.data.robots import Robot
-from dln_jax.datasets.robot_arms import arm_torques
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial
 from dln_jax.precision import in_float64
+from dln_jax.scenes.datasets.robot_arms import arm_torques
 from dln_jax.scenes.robot_arms import Arm
 
 Arrays = dict[str, Any]

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.schema import Trajectories
-from dln_jax.datasets.robot_arms import lip_trajectories
 from dln_jax.learning.kernel import fit_kernel
 from dln_jax.learning.kinematics import Search, fit_tree
 from dln_jax.learning.linear import fit_linear
@@ -23,6 +22,7 @@ from dln_jax.metrics.report import Row
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.serial_tree import make_serial_tree
 from dln_jax.precision import in_float64
+from dln_jax.scenes.datasets.robot_arms import lip_trajectories
 from dln_jax.scenes.panda import panda
 from dln_jax.scenes.robot_arms import Arm, skew_arm, sliding_arm
 from dln_jax.types import FrictionLaw

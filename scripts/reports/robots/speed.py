@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.deploy.c.families import functions_of_system
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.trees import tree_system
 from dln_jax.metrics.latency import medians_in_turns

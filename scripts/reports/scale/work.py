@@ -11,7 +11,6 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
-from dln_jax.datasets.generators import uniform
 from dln_jax.learning.engine import descent, newton
 from dln_jax.learning.engine.optimisers import Adam, GaussNewton
 from dln_jax.learning.engine.problem import Problem, unmonitored
@@ -20,6 +19,7 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.models.lagrangian import make_delan
 from dln_jax.rollout import rollout
 from dln_jax.scale.mesh import program, replicate, spread
+from dln_jax.scenes.datasets.generators import uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.softbody.scene import State
 from dln_jax.softbody.step import make_step

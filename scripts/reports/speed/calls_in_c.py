@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.deploy.c.load import FLAGS, STANDARD, compile_c
+from dln_jax.export.c.load import FLAGS, STANDARD, compile_c
 from dln_jax.types import InputError
 
 SMALLEST, LARGEST = 8, 64

@@ -17,9 +17,9 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from dln_jax.deploy.c.families import functions_of_system
-from dln_jax.deploy.c.load import FLAGS, load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import FLAGS, load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.figures.benchmarks import call_times
 from dln_jax.metrics.report import Row, expect
 from dln_jax.precision import data_type

@@ -13,9 +13,9 @@ from dln_jax.mechanics.equations import hamiltonian_of
 from dln_jax.mechanics.integrators import Step
 from dln_jax.metrics.latency import medians_in_turns
 from dln_jax.metrics.report import Row
-from dln_jax.runs.hamiltonian.choice import description_of
-from dln_jax.runs.hamiltonian.tasks import Problem, problem_of
-from dln_jax.runs.hamiltonian.training import train
+from dln_jax.training.hamiltonian.model_selection import description_of
+from dln_jax.training.hamiltonian.tasks import Problem, problem_of
+from dln_jax.training.hamiltonian.training import train
 from dln_jax.types import Hamiltonian
 from dln_jax.zoo.descriptions import build
 from scripts.reports.case import Findings

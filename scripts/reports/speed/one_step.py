@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dln_jax.command_line.running import run
+from dln_jax.cli.running import run
 from dln_jax.data.splits import Split
-from dln_jax.deploy.c.load import FLAGS, STANDARD, compile_c, load_c
-from dln_jax.deploy.c.run import export_run
-from dln_jax.deploy.low_latency import enable_low_latency, low_latency
+from dln_jax.export.c.load import FLAGS, STANDARD, compile_c, load_c
+from dln_jax.export.c.run import export_run
+from dln_jax.export.low_latency import enable_low_latency, low_latency
 from dln_jax.figures.benchmarks import EXACT, cost_points
 from dln_jax.learning.dynamics import problem
 from dln_jax.learning.engine.fit import fit
@@ -32,7 +32,7 @@ from dln_jax.learning.objectives import objective_of
 from dln_jax.metrics.errors import errors, predictions
 from dln_jax.metrics.latency import one_step
 from dln_jax.metrics.report import Row, unit_of
-from dln_jax.runs.low_latency_calls import last_line
+from dln_jax.training.low_latency_calls import last_line
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load, save

@@ -8,7 +8,6 @@ import numpy as np
 
 from dln_jax.data import schema
 from dln_jax.data.functions import FunctionSamples
-from dln_jax.datasets import generators
 from dln_jax.learning.linear import fit_linear
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.standardisation import standard_units, to_units
@@ -19,6 +18,7 @@ from dln_jax.models.baselines import make_feed_forward
 from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.models.trigonometric import make_trigonometric
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.double_pendulum import double_pendulum
 from dln_jax.types import InputError, Needs
 from scripts.reports.case import Findings

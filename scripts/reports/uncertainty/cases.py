@@ -15,7 +15,6 @@ from dln_jax.data.joints import with_joints
 from dln_jax.data.schema import Trajectories, load
 from dln_jax.data.splits import in_blocks, partition_labels, select
 from dln_jax.data.splits import split as split_by_labels
-from dln_jax.datasets.generators import characters, uniform
 from dln_jax.learning import dynamics as problems
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
@@ -30,6 +29,7 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import make_rigid_tree
 from dln_jax.models.uncertainty import outside, predictive
 from dln_jax.precision import in_float64
+from dln_jax.scenes.datasets.generators import characters, uniform
 from dln_jax.scenes.two_link_arm import two_link_arm
 from scripts.reports.case import Case, Findings
 from scripts.reports.uncertainty.arms import UR10, VELOCITY_SCALE, arm, motions, plant

@@ -10,8 +10,8 @@ from dln_jax.control.optimal.action_costs import limited_atan
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem, rates
 from dln_jax.control.optimal.value_networks import value_network
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 
 HIGH = np.array([np.pi, 8.0])
 POLE = ControlProblem(

@@ -11,10 +11,10 @@ from dln_jax.data.checks.energies import OF_BODY, STRONGEST, WEAKEST, covariance
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
 from dln_jax.data.robots import Robot
-from dln_jax.datasets import generators
 from dln_jax.mechanics import trees
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.cart_pole import cart_pole
+from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.two_link_arm import two_link_arm
 from dln_jax.types import InputError, Needs
 

@@ -6,8 +6,8 @@ import pytest
 
 from dln_jax.control import Gains, Problem, Reference, feed_forward, first_plan
 from dln_jax.control import receding as predicting
-from dln_jax.deploy.c.load import load_c
-from dln_jax.deploy.c.source import export_c
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from scripts.reports.control import arm_loop, laws_in_c, receding, tracking

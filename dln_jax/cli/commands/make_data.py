@@ -1,0 +1,81 @@
+"""Generate trajectories of a textbook scene, with exact rates, torques and force decomposition, as an npz file.
+
+Kinds: `characters` (the two-link arm writes 20 letters), `uniform` (independent random states in a box), and
+`free-swing` (motions from rest without torque, integrated to 1e-10).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from dln_jax.cli.arguments import Unstated, refuse_given
+from dln_jax.cli.running import SceneName
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.registry import scene_named
+from dln_jax.types import InputError
+
+OF_KIND = {
+    "characters": ("dt",),
+    "uniform": ("samples", "position_bound", "rate_bound", "acceleration_bound", "control_bound", "seed"),
+    "free-swing": ("trajectories", "steps", "dt", "seed"),
+}
+"""Options of each kind; what is not given is the generator's own choice."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to generate."""
+
+    out: Path
+    """File to write; its name ends in .npz."""
+    scene: SceneName = "two-link-arm"
+    """What moves."""
+    kind: Literal["characters", "uniform", "free-swing"] = "characters"
+    """How to sample the scene."""
+    samples: Unstated[int] = None
+    """uniform: states (default: 3000)."""
+    position_bound: Unstated[float] = None
+    """uniform: half the box of q, rad or m (default: pi)."""
+    rate_bound: Unstated[float] = None
+    """uniform: half the box of qd, 1/s (default: 5)."""
+    acceleration_bound: Unstated[float] = None
+    """uniform, fully actuated scenes: half the box of qdd, 1/s² (default: 20)."""
+    control_bound: Unstated[float] = None
+    """uniform, under-actuated scenes: half the box of the controls, N m or N (default: 10)."""
+    trajectories: Unstated[int] = None
+    """free-swing: motions (default: 10)."""
+    steps: Unstated[int] = None
+    """free-swing: samples per motion (default: 400)."""
+    dt: Unstated[float] = None
+    """characters, free-swing: time between samples, s (default: 0.04 for characters, 0.02 for free-swing)."""
+    seed: Unstated[int] = None
+    """uniform, free-swing: of everything that is drawn (default: 0)."""
+    overwrite: bool = False
+    """Replace the file if it exists."""
+
+
+def main(given: Arguments) -> None:
+    """Generates, writes and says what was written."""
+    data = generate(given)
+    schema.save(given.out, data, overwrite=given.overwrite)
+    count = len(set(data.trajectory.tolist()))
+    print(f"{given.out}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} degrees of freedom")
+
+
+def generate(given: Arguments) -> Trajectories:
+    """The trajectories that the arguments ask for."""
+    scene = scene_named(given.scene)
+    unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[given.kind])
+    refuse_given(given, sorted(unused), f"not used for --kind {given.kind}")
+    chosen = {name: getattr(given, name) for name in OF_KIND[given.kind] if getattr(given, name) is not None}
+    if given.kind == "characters":
+        if scene.name != "two-link-arm":
+            raise InputError(f"characters are written by the two-link-arm, not by {scene.name}; choose another --kind")
+        return generators.characters(**chosen)
+    if given.kind == "uniform":
+        actuated = scene.needs.actuation is None
+        refuse_given(given, ["control_bound" if actuated else "acceleration_bound"], f"not used for {given.scene}")
+        return generators.uniform(scene, **chosen)
+    return generators.free_swing(scene, **chosen)

@@ -1,0 +1,243 @@
+"""Simulate a soft body by implicit time steps: a cantilever, a twisted bar, a sliding block, a falling body, a crawler.
+
+Prints the speed and how well the steps were solved, and writes a run folder: motion.gif, energy.png (energies against
+time: what the implicit step damps is seen), moments.png, metrics.json, report.json and config.json. Bodies have 1000
+kg/m³; in the plane they are 1 m thick.
+
+Your own mesh: --mesh FILE.npz for the scenes beam and drop, with `vertices` [n, 2 or 3] in m, the last axis up,
+`elements` [m, 3 or 4] (triangles or tetrahedra, indices from 0) and, for the beam, optionally `held` [k] (vertices;
+by default those of least x). Inverted elements are turned, and it says how many.
+"""
+
+import dataclasses
+import functools
+import inspect
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.cli.arguments import Unstated, resolved
+from dln_jax.cli.options import Drawn, Folder
+from dln_jax.cli.progress import progress
+from dln_jax.cli.stored_arguments import stored_arguments
+from dln_jax.data import meshes
+from dln_jax.figures.soft_bodies import Moments, moments_figure
+from dln_jax.files import write_figure, write_json
+from dln_jax.metrics.report import conditions, write_report
+from dln_jax.precision import data_type
+from dln_jax.rollout import rollout
+from dln_jax.sizes import require_memory, require_within
+from dln_jax.softbody.driven import Example, drive, driven_step
+from dln_jax.softbody.examples import EXAMPLES
+from dln_jax.softbody.mesh.mesh import components, overlaps
+from dln_jax.softbody.scene import Params, State
+from dln_jax.softbody.step import INTEGRATORS, Stepper
+from dln_jax.softbody.terms.strain_energies import corotated, neo_hookean, st_venant_kirchhoff, stable_neo_hookean
+from dln_jax.softbody.verdict import Info
+from dln_jax.training.results import print_numbers
+from dln_jax.training.simulation_results import Motion, draw, line, results, warn
+from dln_jax.types import InputError, require_positive
+from dln_jax.zoo.run_folder import CONFIG, run_folder
+
+MATERIALS = {
+    energy.__name__.replace("_", "-"): energy
+    for energy in (stable_neo_hookean, neo_hookean, st_venant_kirchhoff, corotated)
+}
+FACETS = {2: "edges", 3: "triangles"}
+CHUNKS = 20
+"""Programs called for a motion, after each of which progress is shown."""
+LARGEST_SIZE = 10.0
+"""Length in m above which a mesh is probably in millimetres."""
+ALL = "all"
+GALLERY = (0, 3, 2, 1, 4)
+"""Order of the scenes in the picture of all."""
+
+
+@dataclass(frozen=True)
+class Arguments(Folder, Drawn):
+    """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
+
+    scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
+    """What to simulate; all: each in a folder of its own, with one picture of them."""
+    integrator: Literal["backward-euler", "bdf2", "midpoint"] = "backward-euler"
+    """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
+    dt: Unstated[float] = None
+    """Time step in s."""
+    seconds: Unstated[float] = None
+    """Length of the motion in s."""
+    cells: Unstated[int] = None
+    """Cells across the body (drop: rings of the disc); not for the creature."""
+    dimension: Unstated[int] = None
+    """2 or 3, for beam and drop."""
+    youngs_modulus: Unstated[float] = None
+    """E in Pa; not for the creature."""
+    poisson_ratio: Unstated[float] = None
+    """Between -1 and 0.5; not for the creature."""
+    friction: Unstated[float] = None
+    """Coulomb's coefficient, for slope and drop."""
+    turns: Unstated[float] = None
+    """Turns of one end against the other, for twist."""
+    material: Unstated[Literal["stable-neo-hookean", "neo-hookean", "st-venant-kirchhoff", "corotated"]] = None
+    """Not for the creature (default: stable-neo-hookean)."""
+    mesh: Unstated[Path] = None
+    """Your own mesh, for beam and drop: see above."""
+    precision: Literal["f32", "f64"] = "f64"
+    """Floating-point type."""
+    seed: int = 0
+    """Of the turning rate in drop, and of its box's tilt; nothing else is random."""
+
+
+class Prepared(NamedTuple):
+    """A scene that is ready to be simulated."""
+
+    given: Arguments
+    example: Example
+    stepper: Stepper
+    dt: float
+    """In s."""
+    steps: int
+
+
+def main(given: Arguments) -> None:
+    """Simulates one scene into the run folder, or all, each into a folder of its own, with one picture of them."""
+    several = given.scene == ALL
+    prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
+    with run_folder(given.out, "simulate") as folder:
+        pictures = []
+        for each in prepared:
+            own = folder / each.given.scene if several else folder
+            own.mkdir(exist_ok=True)
+            pictures.append(simulate(each, own))
+        if several and given.figures:
+            gallery = moments_figure([pictures[i] for i in GALLERY], columns=3)
+            write_figure(folder / "soft-bodies.png", gallery)
+        print(f"run folder: {folder}")
+
+
+def prepare(given: Arguments) -> Prepared:
+    """What is to be simulated; every mistake of the command line is found here, before anything is written."""
+    example = example_of(given)
+    dt, seconds = resolved(given, {"dt": example.dt, "seconds": example.seconds}).values()
+    require_positive(dt=dt, seconds=seconds)
+    if not dt <= seconds < math.inf:
+        raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
+    steps = round(seconds / dt)
+    require_within({"steps (--seconds / --dt)": steps})
+    # Positions and velocities of every step, twice: they are joined from chunks.
+    require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
+    stepper = driven_step(example, dt, INTEGRATORS[given.integrator])
+    return Prepared(given, example, stepper, dt, steps)
+
+
+def simulate(prepared: Prepared, folder: Path) -> Moments:
+    """Simulates one scene and writes its folder; gives its picture."""
+    given, example, _, dt, steps = prepared
+    write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
+    mesh = example.scene.mesh
+    pieces, size = int(components(mesh).max()) + 1, np.ptp(mesh.vertices, axis=0)
+    print(
+        f"{given.scene}: {len(mesh.vertices)} vertices, {len(mesh.elements)} elements in {pieces} "
+        f"component{'s' * (pieces > 1)}, {' x '.join(f'{length:.4g}' for length in size)} m, "
+        f"{int(example.scene.free.sum())} unknowns; {given.integrator}, dt {dt:.4g} s, {given.precision}"
+    )
+    if pieces > 1:
+        loose = "no two elements share a vertex" if pieces == len(mesh.elements) else f"{pieces} parts share no vertex"
+        print(
+            f"warning: {loose}: they move apart, or through one another, for there is no contact between them; if the "
+            "body is one, merge vertices at the same position before you save the mesh"
+        )
+    if size.max() > LARGEST_SIZE:
+        print(
+            f"warning: the body is {size.max():.4g} m long; expected lengths in metres: if the mesh is in millimetres, "
+            "divide its vertices by 1000"
+        )
+    if mesh.turned:
+        print(f"{mesh.turned} of {len(mesh.elements)} elements were inverted and have been turned")
+    if count := len(overlaps(mesh)):
+        print(f"elements overlap at {count} of their {FACETS[mesh.dimension]}: there, mass and stiffness add up")
+    motion = run_motion(prepared)
+    rows = results(given.scene, mesh, motion)
+    write_json(folder / "metrics.json", {row.quantity: row.value for row in rows if math.isfinite(row.value)})
+    dtype = jnp.dtype(data_type(given.precision)).name
+    facts = conditions(dtype=dtype, seeds=[given.seed], integrator=given.integrator, dt=dt)
+    write_report(folder / "report.json", rows, facts)
+    print_numbers(map(line, rows))
+    warn(motion)
+    title = f"{given.scene}: {given.integrator}, dt = {dt:.4g} s"
+    return draw(given.scene, example, motion, folder, title=title, figures=given.figures)
+
+
+def example_of(given: Arguments) -> Example:
+    """The scene with what was chosen for it.
+
+    Raises:
+        InputError: an unknown name, a choice that the scene does not have, or a value that cannot be.
+    """
+    scene = EXAMPLES[given.scene]
+    names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
+    choices: dict[str, Any] = {name: getattr(given, name) for name in names}
+    choices["strain_energy"] = None if given.material is None else MATERIALS[given.material]
+    choices = {name: value for name, value in choices.items() if value is not None}
+    known = inspect.signature(scene).parameters
+    for name in choices:
+        if name not in known:
+            option = "material" if name == "strain_energy" else name.replace("_", "-")
+            raise InputError(f"--{option} is no choice of the {given.scene} scene; leave it out")
+    if given.mesh is not None:
+        if beside := [name for name in ("cells", "dimension") if name in choices]:
+            raise InputError(f"--{beside[0]} is for the scene's own mesh; leave it or --mesh out")
+        try:
+            choices["mesh"], held = meshes.load(given.mesh)
+        except InputError as error:
+            raise InputError(f"--mesh {error}") from None
+        if held is not None and "held" in known:
+            choices["held"] = held
+    if given.seed < 0:
+        raise InputError(f"--seed is {given.seed}; expected 0 or a positive integer")
+    if "seed" in known:
+        choices["seed"] = given.seed
+    example = scene(**choices)
+    params = in_precision(example.scene.params, data_type(given.precision))
+    return example._replace(scene=example.scene._replace(params=params))
+
+
+def in_precision(tree: Any, precision: Any) -> Any:
+    """Floating point arrays in this precision."""
+    return jax.tree.map(lambda leaf: leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
+
+
+def run_motion(prepared: Prepared) -> Motion:
+    """The motion, in chunks of one compiled program; compilation is timed apart, and results are waited for."""
+    given, example, (init, step), dt, steps = prepared
+    count = max(1, steps // CHUNKS)
+    params = example.scene.params
+    start = state = in_precision(init(), data_type(given.precision))
+
+    def observe(state: State, info: Info) -> tuple[Any, Any, Info]:
+        return state.x, state.v, info
+
+    def advance(state: State, params: Params, driven: Any) -> tuple[State, Any]:
+        return rollout(functools.partial(step, params), state, driven, observe=observe)
+
+    with progress(steps) as show:
+        began = time.perf_counter()
+        program = jax.jit(advance).lower(state, params, drive(example, dt, count)).compile()
+        compiled = time.perf_counter() - began
+        seen, spent, done = [], 0.0, 0
+        while done < steps:
+            driven = drive(example, dt, count, first=done)
+            began = time.perf_counter()
+            state, chunk = jax.block_until_ready(program(state, params, driven))
+            spent += time.perf_counter() - began
+            done += count
+            seen.append(jax.tree.map(np.asarray, chunk))
+            show(min(done, steps), f"t = {min(done, steps) * dt:.2f} s")
+    x, v, info = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:steps], *seen)
+    x, v = (np.concatenate([np.asarray(first)[None], rest]) for first, rest in ((start.x, x), (start.v, v)))
+    return Motion(dt * np.arange(steps + 1), x, v, info, compiled, done / spent)

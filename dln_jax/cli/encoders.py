@@ -1,0 +1,146 @@
+"""Options of commands that read logs, and what is said of a log before it is learned from."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dln_jax.cli.arguments import Unstated, refuse_given
+from dln_jax.data.checks import quick
+from dln_jax.data.encoders import Smoothed, smooth
+from dln_jax.data.robots import Robot
+from dln_jax.data.schema import Trajectories
+from dln_jax.types import InputError
+
+AUTO = "auto"
+FILTERED = (
+    "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
+    "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated",
+)  # fmt: skip
+"""Checks of what a filter of q replaces or repairs."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What a log does not say of itself."""
+
+    rate: Unstated[float] = None
+    """Hz, at which a file without t was sampled."""
+    units: Unstated[Literal["si", "degrees"]] = None
+    """CSV: units of titles that state none; degrees: of angles, and SI for the rest."""
+
+
+@dataclass(frozen=True)
+class Checked(Logged):
+    """What becomes of a log with errors."""
+
+    accept_log: bool = False
+    """Go on although the check of the log found errors, which then are warnings."""
+
+
+@dataclass(frozen=True)
+class Filtered(Checked):
+    """How rates come about where a log has none that can be trusted."""
+
+    cutoff: Unstated[str] = None
+    """Low-pass q without delay at so many Hz, and derive the rates from it; auto: a cut-off chosen from the data
+    (default: the rates of the file, by finite differences where it has none)."""
+    decimate: Unstated[int] = None
+    """With --cutoff: keep every so manyth sample, of filtered torques too (default: 1, and torques as they are)."""
+
+
+def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
+    """What the options make of a log; `None` where they leave it as it is.
+
+    Raises:
+        InputError: what is no cut-off, a decimation without one, or what `data.encoders.smooth` refuses.
+    """
+    if given.cutoff is None:
+        refuse_given(given, ["decimate"], "for filtered data: add --cutoff auto")
+        return None
+    cutoff = None if given.cutoff == AUTO else _hertz(given.cutoff)
+    decimate = 1 if given.decimate is None else given.decimate
+    try:
+        return smooth(data, cutoff, decimate=decimate)
+    except InputError as error:
+        raise InputError(f"--cutoff {given.cutoff}: {error}") from None
+
+
+def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
+    """Lines on where rates and torques come from, and how noisy they are."""
+    if found is None:
+        estimated = [key for key in data.estimated if key != "tau"]
+        lines = [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
+        if estimated:
+            lines[0] += "; rates are raw finite differences, which amplify noise: --cutoff auto filters q first"
+        return lines
+    kept = f"{found.rate / found.decimate:.4g} Hz in {found.parts} parts"
+    how = "given" if found.choice is None else "chosen from the spectra of q"
+    lines = [
+        f"rates: q is not filtered, as its noise is too small; derivatives of splines, {kept}"
+        if np.isinf(found.cutoff)
+        else f"rates: q filtered without delay at {found.cutoff:.3g} Hz ({how}), {kept}"
+    ]
+    torque = "filtered alike" if found.filtered_torque else "not filtered"
+    sizes = [", ".join(f"{each:.2g}" for each in noise) for noise in (found.noise_q, found.noise_tau)]
+    lines.append(f"noise of q {sizes[0]}; of tau {sizes[1]} ({torque})")
+    if count := int((found.repeats.q | found.repeats.tau).sum()):
+        lines.append(f"{count} samples repeat the one before and are resampled over")
+    if found.left_out:
+        lines.append(f"{found.left_out} stretches are too short for the filter and left out")
+    return lines
+
+
+def fitted_torque(found: Smoothed | None) -> str:
+    """Which torque a model is fitted to and its bands are of, in words."""
+    if found is None or not found.filtered_torque:
+        return "measured torques"
+    return f"torques low-passed at {found.cutoff:.3g} Hz (measured ones scatter more)"
+
+
+def checked(
+    given: Checked,
+    data: Trajectories,
+    path: Path,
+    *,
+    robot: Robot | None = None,
+    without: Collection[str] = (),
+) -> list[str]:
+    """What the quick part of `check_data` finds, a line each; none where nothing is found.
+
+    Args:
+        given: options; with a cut-off, what concerns the rates of the file only is left out.
+        data: as they are in the file.
+        path: of the file.
+        robot: whose file the log is compared with, if there is one.
+        without: names of checks that say nothing to this command.
+
+    Raises:
+        InputError: an error was found, and --accept-log was not given.
+    """
+    filtered = isinstance(given, Filtered) and given.cutoff is not None
+    settled = {*without, *(FILTERED if filtered else ())}
+    found = [finding for finding in quick(data, robot) if finding.check not in settled]
+    if not found:
+        return []
+    more = f"python -m scripts.check_data --data {path}"
+    if getattr(given, "robot", None) is not None:
+        more += f" --robot {getattr(given, 'robot')}"  # noqa: B009  only some commands have it
+        more += f" --hold '{hold}'" if (hold := getattr(given, "hold", None)) else ""
+    errors = [f"{finding.said}; {finding.remedy}" for finding in found if finding.severity == "error"]
+    if errors and not given.accept_log:
+        raise InputError(f"{path}: {'; also '.join(errors)}; or go on with --accept-log ({more} says more)")
+    lines = [f"warning: {finding.said}; {finding.remedy}" for finding in found if finding.severity == "error"]
+    return [*lines, *(finding.line for finding in found if finding.severity != "error"), f"{more} says more"]
+
+
+def _hertz(text: str) -> float:
+    try:
+        value: Any = float(text)
+    except ValueError:
+        value = -1.0
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"--cutoff is {text!r:.40}; expected Hz, a positive number, or auto")
+    return value

@@ -1,0 +1,18 @@
+"""Trained models as jitted functions."""
+
+from dln_jax.export.c import export_c, export_run, functions_of_run, functions_of_system, load_c
+from dln_jax.export.low_latency import enable_low_latency, low_latency
+from dln_jax.export.stablehlo import export_dynamics, export_stablehlo, load_stablehlo
+
+__all__ = [
+    "enable_low_latency",
+    "export_c",
+    "export_dynamics",
+    "export_run",
+    "export_stablehlo",
+    "functions_of_run",
+    "functions_of_system",
+    "load_c",
+    "load_stablehlo",
+    "low_latency",
+]

@@ -1,0 +1,254 @@
+"""Exported C as functions of Python: a source that is compiled with the export, and what makes functions of it.
+
+A call through ctypes takes longer than the dynamics of a small arm. The source declares those few functions of Python's
+stable interface (PEP 384; buffers are in it from 3.11 on) that it calls, so that Python's own headers are not needed.
+"""
+
+import collections
+import ctypes
+import functools
+from collections.abc import Mapping
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from dln_jax.export.c.interface import KINDS, Leaf, Signature
+from dln_jax.export.c.kinds import NUMPY_TYPES
+from dln_jax.export.c.text import PRECISIONS
+from dln_jax.export.low_latency import as_shaped
+from dln_jax.types import InputError
+
+_C = {**KINDS, "real": "real"}
+_TYPES = {**NUMPY_TYPES, "bool": np.int32}
+_GIVES = {"real": "PyFloat_FromDouble((double){})", "unsigned_long": "PyLong_FromUnsignedLongLong({})"}
+_START = Template("""\
+#include <stddef.h>
+
+#include "$name.h"
+
+typedef $real real;
+typedef struct _object PyObject;
+typedef ptrdiff_t Py_ssize_t;
+typedef struct {
+    void *buf;
+    PyObject *obj;
+    Py_ssize_t len, itemsize;
+    int readonly, ndim;
+    char *format;
+    Py_ssize_t *shape, *strides, *suboffsets;
+    void *internal;
+} Py_buffer;
+typedef PyObject *method(PyObject *, PyObject *const *, Py_ssize_t, PyObject *);
+typedef struct {
+    const char *name;
+    method *called;
+    int flags;
+    const char *text;
+} PyMethodDef;
+enum { CONTIGUOUS_WITH_FORMAT = 0x3C, WRITABLE = 1, FAST_WITH_KEYWORDS = 0x82, MOST = $most };
+
+extern PyObject PyFloat_Type;
+int PyObject_GetBuffer(PyObject *, Py_buffer *, int);
+void PyBuffer_Release(Py_buffer *);
+void PyErr_Clear(void);
+PyObject *PyErr_Occurred(void);
+void Py_DecRef(PyObject *);
+void Py_IncRef(PyObject *);
+double PyFloat_AsDouble(PyObject *);
+PyObject *PyFloat_FromDouble(double);
+PyObject *PyLong_FromLongLong(long long);
+PyObject *PyLong_FromUnsignedLongLong(unsigned long long);
+PyObject *PyCMethod_New(PyMethodDef *, PyObject *, PyObject *, PyObject *);
+PyObject *PyObject_CallFunctionObjArgs(PyObject *, ...);
+PyObject *PyObject_CallObject(PyObject *, PyObject *);
+int PyObject_IsInstance(PyObject *, PyObject *);
+PyObject *PyTuple_GetItem(PyObject *, Py_ssize_t);
+PyObject *PyTuple_New(Py_ssize_t);
+int PyTuple_SetItem(PyObject *, Py_ssize_t, PyObject *);
+Py_ssize_t PyTuple_Size(PyObject *);
+
+typedef struct {
+    char format;
+    int axes;
+    Py_ssize_t shape[$axes];
+} leaf;
+typedef struct {
+    int arguments, results;
+    PyObject *(*run)(void **); /* the number that is returned, or NULL where results are arrays */
+    leaf leaves[MOST];
+} function;
+
+/* Whether an object is an array of this type and shape; its buffer is to be released then */
+static int fits(PyObject *given, Py_buffer *buffer, const leaf *expected, int flags)
+{
+    int axis = 0;
+    if (PyObject_GetBuffer(given, buffer, flags)) {
+        PyErr_Clear();
+        return 0;
+    }
+    if (buffer->ndim == expected->axes && buffer->format[0] == expected->format && !buffer->format[1]) {
+        while (axis < expected->axes && buffer->shape[axis] == expected->shape[axis]) ++axis;
+        if (axis == expected->axes) return 1;
+    }
+    PyBuffer_Release(buffer);
+    return 0;
+}
+
+/* Results of arguments; NULL without an error where an argument does not fit */
+static PyObject *results_of(const function *f, PyObject *self, PyObject *const *given)
+{
+    Py_buffer buffers[MOST];
+    void *memory[MOST];
+    real numbers[MOST];
+    PyObject *results = PyTuple_New(f->results), *result = NULL;
+    int held[MOST], k = 0;
+    for (; results && k < f->arguments + f->results; ++k) {
+        const leaf *expected = &f->leaves[k];
+        const int place = k - f->arguments;
+        PyObject *each = place < 0 ? given[k] : PyObject_CallObject(PyTuple_GetItem(self, place + 2), NULL);
+        if (!each) break;
+        if (place >= 0) (void)PyTuple_SetItem(results, place, each);
+        held[k] = expected->axes || expected->format != '$format' || !PyObject_IsInstance(each, &PyFloat_Type);
+        if (held[k] && !fits(each, &buffers[k], expected, CONTIGUOUS_WITH_FORMAT | (place < 0 ? 0 : WRITABLE))) break;
+        if (!held[k]) numbers[k] = (real)PyFloat_AsDouble(each);
+        memory[k] = held[k] ? buffers[k].buf : &numbers[k];
+    }
+    if (k == f->arguments + f->results) {
+        result = f->run(memory);
+        if (!result && f->results == 1) Py_IncRef(result = PyTuple_GetItem(results, 0));
+        else if (!result) result = PyObject_CallObject(PyTuple_GetItem(self, 1), results);
+    }
+    while (k-- > 0)
+        if (held[k]) PyBuffer_Release(&buffers[k]);
+    if (results) Py_DecRef(results);
+    return result;
+}
+
+/* A call; `self` has what converts arguments, what makes several results one, and what makes an array for each */
+static PyObject *called(const function *f, PyObject *self, PyObject *const *given, Py_ssize_t count, PyObject *names)
+{
+    PyObject *result = names || count != f->arguments ? NULL : results_of(f, self, given), *all, *converted = NULL;
+    if (result || PyErr_Occurred()) return result;
+    if (names) count += PyTuple_Size(names);
+    all = PyTuple_New(count);
+    for (Py_ssize_t k = 0; all && k < count; ++k) {
+        Py_IncRef(given[k]);
+        (void)PyTuple_SetItem(all, k, given[k]);
+    }
+    if (all) converted = PyObject_CallFunctionObjArgs(PyTuple_GetItem(self, 0), all, names, NULL);
+    if (converted) {
+        PyObject *fitting[MOST];
+        for (int k = 0; k < f->arguments; ++k) fitting[k] = PyTuple_GetItem(converted, k);
+        result = results_of(f, self, fitting);
+        Py_DecRef(converted);
+    }
+    if (all) Py_DecRef(all);
+    return result;
+}
+""")
+
+
+def binding(name: str, functions: Mapping[str, Signature], precision: str) -> str:
+    """Text of the source, to be compiled together with that of the export."""
+    leaves = [leaf for each in functions.values() for leaf in (*each.arguments, *each.results)]
+    text = _START.substitute(
+        name=name,
+        real=PRECISIONS[precision][1],
+        format=_format("real", precision),
+        axes=max([1, *(len(leaf.shape) for leaf in leaves)]),
+        most=max(1, *(len(each.arguments) + len(each.results) for each in functions.values())),
+    )
+    for number, (key, each) in enumerate(functions.items()):
+        text += _function(number, f"{name}_{key}", each, precision)
+    methods = "".join(
+        f'    {{"{key}", call_{number}, FAST_WITH_KEYWORDS, "{_described(key, each)}"}},\n'
+        for number, (key, each) in enumerate(functions.items())
+    )
+    made = f"PyObject *{name}_python(int k, PyObject *self)"
+    returned = "return PyCMethod_New(&methods[k], self, NULL, NULL);"
+    return f"{text}\nstatic PyMethodDef methods[] = {{\n{methods}}};\n\n{made};\n{made}\n{{\n    {returned}\n}}\n"
+
+
+def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], precision: str) -> Any:
+    """A named tuple of the functions of a library that was built with the binding."""
+    make = library[f"{name}_python"]
+    make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
+    made = {}
+    for number, (key, each) in enumerate(functions.items()):
+        group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in each.results])
+        results = () if each.returns else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in each.results]
+        convert = functools.partial(_converted, key, each.arguments, precision)
+        made[key] = make(number, (convert, group, *(array.copy for array in results)))
+    return collections.namedtuple("Functions", made)(**made)
+
+
+def _type(kind: str, precision: str) -> Any:
+    return {**_TYPES, "real": PRECISIONS[precision][0]}[kind]
+
+
+def _format(kind: str, precision: str) -> str:
+    """Of the buffer of an array."""
+    return np.zeros(1, _type(kind, precision)).data.format
+
+
+def _function(number: int, name: str, signature: Signature, precision: str) -> str:
+    """What calls one function with pointers, and what Python calls."""
+    passed = [
+        f"memory[{k}]" if leaf.shape else f"*(const {_C[leaf.kind]} *)memory[{k}]"
+        for k, leaf in enumerate(signature.arguments)
+    ]
+    leaves = [*signature.arguments]
+    if not signature.returns:
+        passed += [f"memory[{len(leaves) + k}]" for k in range(len(signature.results))]
+        leaves += signature.results
+    call = f"{name}({', '.join(passed)})"
+    if signature.returns:
+        call = f"return {_GIVES.get(signature.results[0].kind, 'PyLong_FromLongLong({})').format(call)};"
+    else:
+        call = f"{call};\n    return NULL;"
+    described = ", ".join(
+        f"{{'{_format(leaf.kind, precision)}', {len(leaf.shape)}, {{{', '.join(map(str, leaf.shape or (0,)))}}}}}"
+        for leaf in leaves
+    )
+    results = len(leaves) - len(signature.arguments)
+    about = f"{{{len(signature.arguments)}, {results}, run_{number}, {{{described}}}}}"
+    return f"""
+static PyObject *run_{number}(void **memory)
+{{
+    {call}
+}}
+
+static PyObject *call_{number}(PyObject *self, PyObject *const *given, Py_ssize_t count, PyObject *names)
+{{
+    static const function f = {about};
+    return called(&f, self, given, count, names);
+}}
+"""
+
+
+def _described(key: str, signature: Signature) -> str:
+    arguments, results = (
+        ", ".join(f"{leaf.name} {list(leaf.shape)}" if leaf.shape else leaf.name for leaf in leaves)
+        for leaves in (signature.arguments, signature.results)
+    )
+    return f"{key}({arguments}) -> {results}"
+
+
+def _converted(
+    name: str, leaves: tuple[Leaf, ...], precision: str, given: tuple[Any, ...], names: tuple[str, ...] = ()
+) -> tuple[np.ndarray, ...]:
+    """Arguments in order, as arrays of their types; InputError where they are none."""
+    expected = [leaf.name for leaf in leaves]
+    placed = dict(zip([*expected[: len(given) - len(names)], *names], given, strict=False))
+    if len(placed) < len(given) or set(placed) != set(expected):
+        others = len(given) - len(set(placed) & set(expected))
+        raise InputError(f"{name} takes {', '.join(expected)}; got {len(given)} of them{' and others' * bool(others)}")
+    return tuple(_array(leaf, placed[leaf.name], precision) for leaf in leaves)
+
+
+def _array(leaf: Leaf, given: Any, precision: str) -> np.ndarray:
+    if leaf.kind == "bool":
+        given = np.asarray(given)
+        given = given.astype(np.int32) if given.dtype == bool else given
+    return np.array(as_shaped(leaf.name, given, leaf.shape), _type(leaf.kind, precision), order="C")

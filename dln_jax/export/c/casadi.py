@@ -1,0 +1,274 @@
+"""JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
+
+CasADi (3.6 and later) looks beside a function f for these, and takes what they give for its derivatives:
+
+| symbol | inputs | outputs |
+|---|---|---|
+| `f` | x | y |
+| `jac_f` | x, y | dy_j/dx_i, of all i for each j in turn |
+| `fwd1_f` | x, y, seeds of x | (dy/dx) seeds |
+| `adj1_f` | x, y, seeds of y | (dy/dx)ᵀ seeds |
+| `jac_adj1_f` | x, y, seeds of y, outputs of `adj1_f` | derivatives of these outputs with respect to all inputs |
+
+Outputs among the inputs are declared without elements, and so are derivatives with respect to them. Everything else is
+dense and column-major, vectors are n x 1, and pointers may be null: an input of zeros, an output that nobody wants.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import accumulate, pairwise, takewhile
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.export.c import sensitivities
+from dln_jax.export.c.body import Body, Source
+from dln_jax.export.c.emit import region, written
+from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
+from dln_jax.export.c.jaxprs import traced
+from dln_jax.export.c.lowering import program_of
+from dln_jax.export.c.plan import plan_of
+from dln_jax.types import InputError
+
+_DECLARATIONS = """
+typedef double casadi_real;
+typedef long long int casadi_int;
+
+#ifdef __cplusplus
+#define EXPORTED extern "C"
+#else
+#define EXPORTED
+#endif
+/* What CasADi asks about a function, which has no state that would need counting, and no workspace but the stack. */
+#define DESCRIBED(f, inputs, outputs) \\
+    EXPORTED void f##_incref(void) {} \\
+    EXPORTED void f##_decref(void) {} \\
+    EXPORTED casadi_int f##_n_in(void) { return inputs; } \\
+    EXPORTED casadi_int f##_n_out(void) { return outputs; } \\
+    EXPORTED const char *f##_name_in(casadi_int i) { return f##_names[i]; } \\
+    EXPORTED const char *f##_name_out(casadi_int i) { return f##_names[inputs + i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_in(casadi_int i) { return f##_sparsities[i]; } \\
+    EXPORTED const casadi_int *f##_sparsity_out(casadi_int i) { return f##_sparsities[inputs + i]; } \\
+    EXPORTED int f(const casadi_real **arg, casadi_real **res, casadi_int *integers, casadi_real *reals, int memory)
+"""
+_TEXT = """
+/* {operations} floating-point operations, {bytes} bytes of stack */
+static const char *const {symbol}_names[] = {{{names}}};
+static const casadi_int {symbol}_sparsities[][{length}] = {{{sparsities}}};
+DESCRIBED({symbol}, {inputs}, {outputs})
+{{
+{lines}
+}}
+"""
+ABOUT = """{name}_casadi.c: functions of {name}.h with exact derivatives, for CasADi 3.6 and later.
+{written_by}
+
+cmake -B build && cmake --build build, then in Python, with the name of one of the functions for F:
+F = casadi.external("casadi_{name}_F", "build/lib{name}.so")
+
+acados loads the same library; its folder is model_external_shared_lib_dir, and its name, {name},
+model_external_shared_lib_name among the solver's options."""
+BUILD = """
+# The library that CasADi and acados load
+add_library({name}_casadi SHARED {name}.c {name}_casadi.c)
+set_target_properties({name}_casadi PROPERTIES OUTPUT_NAME {name} ARCHIVE_OUTPUT_NAME {name}_casadi
+  C_STANDARD 99 C_EXTENSIONS OFF WINDOWS_EXPORT_ALL_SYMBOLS ON)
+if(UNIX)
+  target_link_libraries({name}_casadi PRIVATE m)
+endif()
+"""
+
+
+class Block(NamedTuple):
+    """An input or output: a matrix with all elements, or none."""
+
+    name: str
+    rows: int
+    columns: int
+    dense: bool = True
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return self.rows * self.columns if self.dense else 0
+
+
+def external_functions(
+    name: str, functions: Mapping[str, Any], *, libm: bool, stack: int, leave_out: bool = False
+) -> tuple[Source, str, list[str]]:
+    """The source with the tables that `casadi_NAME_F` and its derivatives read for each function F, and their C text.
+
+    Third is why functions are left out, if they may be.
+
+    Args:
+        name: of the export.
+        functions: as `export_c` takes them.
+        libm: call the C library's elementary functions.
+        stack: bytes that a function may take.
+        leave_out: functions that would be refused.
+
+    Raises:
+        InputError: what CasADi cannot take: numbers that are not real, more than two axes, some names; or a function
+            without arguments, without derivatives, or that takes more stack.
+    """
+    source, texts, largest, left_out = Source("f64", libm), [], 1, []
+    for key, (function, examples) in functions.items():
+        try:
+            source, text, size = _with_derivatives(source, f"casadi_{name}_{key}", function, examples, stack)
+        except InputError as error:
+            if not leave_out:
+                raise
+            left_out.append(str(error))
+            continue
+        texts.append(text)
+        largest = max(largest, size)
+    zeros = f"\nstatic const casadi_real zeros[{largest}] = {{0}};\n"
+    return source, _DECLARATIONS + zeros + "".join(texts), left_out
+
+
+def _with_derivatives(
+    source: Source, symbol: str, function: Callable[..., Any], examples: Sequence[Any], stack: int
+) -> tuple[Source, str, int]:
+    """The source, the text of a function and its derivatives, and the elements of the largest input."""
+    try:
+        inputs, outputs, flat = _flat(function, examples)
+        _check_names(symbol, [*inputs, *outputs])
+    except InputError as error:
+        raise InputError(f"{symbol}: {error}") from error
+    texts, largest = "", 1
+    for prefix, given, results, ways in _derivatives(inputs, outputs, flat):
+        largest = max(largest, *(each.size for each in given))
+        source, text = _function(source, prefix + symbol, given, results, ways, stack)
+        texts += text
+    return source, texts, largest
+
+
+def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[Block], list[Block], Any]:
+    """Inputs, outputs, and the function from all inputs, column-major and end to end, to all outputs likewise."""
+    leaves, tree = jax.tree.flatten(tuple(examples))
+    arguments = argument_leaves(function, examples)
+    inputs, shapes = [_block(leaf) for leaf in arguments], [np.shape(leaf) for leaf in leaves]
+    if not inputs:
+        raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
+    outputs = [_block(leaf) for leaf in result_leaves(jax.eval_shape(function, *examples), arguments)]
+    cuts = np.cumsum([each.size for each in inputs])[:-1]
+
+    def flat(x: jax.Array) -> jax.Array:
+        # A matrix that is read in column-major order is its transpose.
+        given = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
+        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
+        return jnp.concatenate([jnp.ravel(jnp.asarray(each).T).astype(x.dtype) for each in results])
+
+    return inputs, outputs, flat
+
+
+def _block(leaf: Leaf) -> Block:
+    if leaf.kind != "real" or len(leaf.shape) > 2 or 0 in leaf.shape:
+        raise InputError(
+            f"{leaf.name} is {leaf.kind} of shape {list(leaf.shape)}; CasADi takes real numbers of at most two axes, "
+            "none of them empty, so export it without casadi"
+        )
+    rows, columns = (*leaf.shape, 1, 1)[:2]
+    return Block(leaf.name, rows, columns)
+
+
+def _check_names(symbol: str, blocks: list[Block]) -> None:
+    names = [prefix + each.name for prefix in ("", "out_", "adj_", "fwd_") for each in blocks]
+    for each in (symbol, *names):
+        if "__" in each or each.endswith("_") or each in ("null", "jac", "hess") or names.count(each) > 1:
+            raise InputError(f"CasADi has no such name as {each}, or derivatives have it too; choose another")
+
+
+def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
+    """Prefix, inputs and outputs of each function, and ways to compute it from inputs and seeds, the best first."""
+    x_parts, y_parts = (
+        [slice(*ends) for ends in pairwise([0, *accumulate(each.size for each in blocks)])]
+        for blocks in (inputs, outputs)
+    )
+
+    # Rows of a transposed Jacobian are a block's columns.
+    def slopes(way: Any, x: jax.Array, _: Any) -> jax.Array:
+        transposed = way(flat, x)
+        return jnp.concatenate([transposed[i, j].ravel() for j in y_parts for i in x_parts])
+
+    def curvature(pull: Any, x: jax.Array, seeds: jax.Array) -> jax.Array:
+        hessian, transposed = sensitivities.second(flat, x, seeds, pull)
+        blocks = [[*(hessian[k, i] for k in x_parts), *(transposed[i, j].T for j in y_parts)] for i in x_parts]
+        return jnp.concatenate([block.ravel() for row in blocks for block in row])
+
+    def of(prefix: str, blocks: list[Block]) -> list[Block]:
+        return [each._replace(name=f"{prefix}_{each.name}", dense=prefix != "out") for each in blocks]
+
+    def jacobians(results: list[Block], given: list[Block]) -> list[Block]:
+        return [
+            Block(f"jac_{result.name}_{each.name}", result.size, each.rows * each.columns, each.dense)
+            for result in results
+            for each in given
+        ]
+
+    both, adjoints = [*inputs, *of("out", outputs)], of("adj", inputs)
+    seeded, pulls = [*both, *of("adj", outputs)], (sensitivities.pull, sensitivities.pull_forward)
+    more_inputs = sum(each.size for each in inputs) > sum(each.size for each in outputs)
+    directions = (sensitivities.forward, sensitivities.reverse)[:: -1 if more_inputs else 1]
+    yield "", inputs, outputs, [lambda x, _: flat(x)]
+    yield "jac_", both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]
+    yield "fwd1_", [*both, *of("fwd", inputs)], of("fwd", outputs), [partial(sensitivities.push, flat)]
+    yield "adj1_", seeded, adjoints, [partial(pull, flat) for pull in pulls]
+    given = [*seeded, *of("out", adjoints)]
+    yield "jac_adj1_", given, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
+
+
+def _function(
+    source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Any], stack: int
+) -> tuple[Source, str]:
+    """The source and the C text of the first way that can be compiled."""
+    failure: Exception | None = None
+    for way in ways:
+        try:
+            body = _body(source.copy(), inputs, outputs, way)
+        except (TypeError, ValueError, NotImplementedError) as error:  # what JAX cannot differentiate, or has no C
+            failure = error
+            continue
+        if body.bytes <= stack:
+            blocks = [*inputs, *outputs]
+            return body.source, _TEXT.format(
+                symbol=symbol,
+                names=", ".join(f'"{each.name}"' for each in blocks),
+                length=3 + max(0 if each.dense else each.columns for each in blocks),
+                sparsities=", ".join(f"{{{each.rows}, {each.columns}, {int(each.dense)}}}" for each in blocks),
+                operations=body.operations, bytes=body.bytes, inputs=len(inputs), outputs=len(outputs),
+                lines="\n".join(body.lines),
+            )  # fmt: skip
+        kib = body.bytes / 1024
+        failure = InputError(f"it would take {kib:.0f} KiB of stack; generated C suits up to {stack // 1024} KiB")
+    reason = str(failure).strip().partition("\n")[0]
+    raise InputError(f"{symbol}: {reason}; export it without casadi") from failure
+
+
+def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callable[..., jax.Array]) -> Body:
+    cuts = np.cumsum([each.size for each in outputs if each.dense])[:-1]
+    dense = [k for k, each in enumerate(inputs) if each.dense]
+    n = sum(each.size for each in takewhile(lambda each: each.dense, inputs))
+
+    def evaluate(*columns: jax.Array) -> list[jax.Array]:
+        x, seeds = jnp.split(jnp.concatenate(columns), [n])
+        return jnp.split(way(x, seeds), cuts)
+
+    closed, _ = traced(evaluate, [np.zeros(inputs[k].size) for k in dense])
+    program, arguments, results = program_of(closed)
+    names = {place: (f"in_{k}", False) for place, k in enumerate(dense)}
+    body = Body(source, program, plan_of(program, results), names)
+    for k, node in zip(dense, arguments, strict=True):
+        if body.uses(node):
+            body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
+    body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
+    region(body, ())
+    writers = written(body, results, apart=False)
+    for j, write in zip((j for j, each in enumerate(outputs) if each.dense), writers, strict=True):
+        body.opened(f"if (res[{j}])")
+        write(f"res[{j}]")
+        body.closed()
+    body.line("return 0;")
+    return body

@@ -1,0 +1,287 @@
+"""Elementary functions of exported C: plain C99 without branches or tables, which compilers turn into vector code.
+
+Each is right to two units in the last place over its range, with the usual values at zeros, infinities and NaN; only
+`exp` rounds to zero what is below the smallest normal number. The ideas are standard (Cody and Waite, Software Manual
+for the Elementary Functions, 1980; Muller, Elementary Functions, 2016):
+
+    exp, expm1  x = n ln 2 + r, a polynomial in r, 2ⁿ by its bits
+    tanh        1 - 2 e / (1 + e) with e = exp(-2|x|), near 0 a rational function; one division for both
+    sin, cos    |x| = n pi/2 + r with pi/2 in parts whose products with n are exact; two polynomials, n chooses one
+    log, log1p  x = 2ᵏ (1 + s), log(1 + s) = 2 artanh(s / (2 + s))
+
+A number is rounded to an integer n by adding 1.5 2⁵² (float: 1.5 2²³), which leaves n in the low bits of the sum: this
+needs IEEE arithmetic rounded to the nearest, so no -ffast-math.
+"""
+
+import functools
+import math
+import re
+from collections.abc import Iterable, Mapping
+from textwrap import TextWrapper
+
+import numpy as np
+
+from dln_jax.export.c.text import PRECISIONS, fill, number
+
+# From the constant term up: interpolation at Chebyshev nodes in 60 digits (mpmath), then rounded. In r or in r²,
+#   exp  (e^r - 1 - r) / r², |r| <= ln(2)/2           sin, cos  (sin(r)/r - 1) / r², ((cos(r) - 1) / r² + 1/2) / r²
+#   log  (2 artanh(r)/r - 2) / r², r <= 3 - 2 sqrt(2) tanh      (tanh(r)/r - 1) / r² = tanh / tanh_below, r <= 0.56
+_POLYNOMIALS = {
+    "f64": {
+        "exp": (
+            *(0.5000000000000001, 0.16666666666666669, 0.041666666666623824, 0.008333333333330039),
+            *(0.0013888888917367081, 0.00019841269863171557, 2.4801521057868204e-05, 2.7557268276905696e-06),
+            *(2.7620201591031547e-07, 2.5100472505694996e-08),
+        ),
+        "tanh": (-0.3333333333333333, -0.020501566345638482, -0.00019930065261747755),
+        "tanh_below": (1.0, 0.46150469903691427, 0.023295019667899867, 0.00020666505951855979),
+        "sin": (
+            *(-0.16666666666666666, 0.008333333333330925, -0.00019841269836722418),
+            *(2.755731608381636e-06, -2.5051127944014188e-08, 1.5917848524808262e-10),
+        ),
+        "cos": (
+            *(0.041666666666666664, -0.0013888888888887382, 2.480158729874307e-05),
+            *(-2.7557317260008837e-07, 2.0876143827993133e-09, -1.1382456778061306e-11),
+        ),
+        "log": (
+            *(0.666666666666667, 0.3999999999989827, 0.2857142862653362, 0.22222211043776857),
+            *(0.18182895750119193, 0.1533150161114533, 0.1461916613488797),
+        ),
+    },
+    "f32": {
+        "exp": (0.5, 0.16666667, 0.041666463, 0.0083333105, 0.0013933731, 0.0001989108),
+        "tanh": (-0.3333333, -0.0015581064),
+        "tanh_below": (1.0, 0.40467018),
+        "sin": (-0.16666667, 0.008333332, -0.00019840083, 2.7249314e-06),
+        "cos": (0.041666664, -0.00138883, 2.4547437e-05),
+        "log": (0.66666687, 0.39988735, 0.29582024),
+    },
+}
+# ln 2 and pi/2 in parts: all but the last are short enough for exact products with the n that occur.
+_LN2 = {"f64": (0.6931471805598903, 5.497923018708371e-14), "f32": (0.69314575, 1.4286068e-06)}
+_HALF_PI = {
+    "f64": (1.5707963267923333, 2.5633441515839558e-12, 1.0562999066987428e-23),
+    "f32": (1.5703125, 0.0004837513, 7.5495336e-08, 2.563344e-12),
+}
+# Where e^x is the smallest normal number, and the largest.
+_EXP_RANGE = {"f64": (-708.3964185322641, 709.782712893384), "f32": (-87.33654, 88.72283)}
+
+BOUNDS: Mapping[str, Mapping[str, float]] = {name: {"f64": 2e5, "f32": 1e4} for name in ("sin", "cos")}
+"""|x| beyond which <math.h> must be called instead, for want of digits of pi; functions not named have no bound."""
+
+# A choice is made by bits: gcc moves what only one side of ?: needs into a branch, and then cannot vectorise.
+_COMMON = """
+/* Elementary functions: the bits of a number and back, and condition ? x : y without a branch */
+typedef $word elementary_word;
+typedef union { real number; elementary_word word; } elementary_union;
+static inline elementary_word elementary_word_of(real x) { elementary_union u; u.number = x; return u.word; }
+static inline real elementary_number_of(elementary_word w) { elementary_union u; u.word = w; return u.number; }
+static inline real elementary_choice(int condition, real x, real y)
+{
+    const elementary_word a = elementary_word_of(x), b = elementary_word_of(y), mask = 0 - (elementary_word)condition;
+    return elementary_number_of(b ^ ((a ^ b) & mask));
+}
+"""
+_EVALUATION = """
+#if defined(FLT_EVAL_METHOD) && FLT_EVAL_METHOD != 0$or_double
+#error "FLT_EVAL_METHOD: extended precision makes exp and others wrong; give -mfpmath=sse -msse2, or export with --libm"
+#endif
+"""
+# The nearest number with fewer bits, ties to even, as XLA rounds it: small ones to zero, large ones to infinity.
+_ROUNDED = """static inline real elementary_rounded(real x, int exponent_bits, int mantissa_bits)
+{
+    const elementary_word bits = elementary_word_of(x), sign = bits & $sign, unit = 1;
+    const elementary_word last = unit << ($mantissa - mantissa_bits), range = (unit << (exponent_bits - 1)) - 1;
+    const elementary_word below = ((bits / last) & 1) + last / 2, size = (bits ^ sign) + (below ? below - 1 : 0);
+    const elementary_word kept = size & ~(last - 1), exponent = kept >> $mantissa;
+    if (x != x) return x;
+    if (exponent_bits == $exponent_bits) return elementary_number_of(sign | kept);
+    if (exponent > $bias_of_exponent + range) return x < 0 ? -(real)INFINITY : (real)INFINITY;
+    if (exponent <= $bias_of_exponent - range) return elementary_number_of(sign);
+    return elementary_number_of(sign | kept);
+}
+"""
+# Whole numbers in the total order of the real ones: -0 before 0, NaN of either sign outside the infinities.
+_ORDERED = """static inline elementary_word elementary_ordered(real x)
+{
+    const elementary_word bits = elementary_word_of(x);
+    return bits & $sign ? ~bits : bits | $sign;
+}
+"""
+_BOUNDED = """static inline real elementary_$name(real x)
+{
+    return fabs${f}(x) <= $bound ? elementary_${name}_within(x) : $name${f}(x);
+}
+"""
+_EACH = """static void elementary_${name}_each(int n, const real *RESTRICT x, real *RESTRICT y)
+{
+    for (int i = 0; i < n; ++i) y[i] = elementary_$name(x[i]);
+}
+"""
+_EACH_BOUNDED = """static void elementary_${name}_each(int n, const real *RESTRICT x, real *RESTRICT y)
+{
+    int beyond = 0;
+    for (int i = 0; i < n; ++i) {
+        y[i] = elementary_${name}_within(x[i]);
+        beyond |= !(fabs${f}(x[i]) <= $bound);
+    }
+    for (int i = 0; beyond && i < n; ++i) y[i] = elementary_$name(x[i]);
+}
+"""
+# t = n ln 2 + r
+_REDUCED = """
+const real shifted = MULTIPLY_ADD(t, $log2e, $magic), n = shifted - $magic;
+const real head = MULTIPLY_ADD(-n, $ln2_high, t), tail = n * $ln2_low, r = head - tail$exp_powers;
+"""
+_QUADRANT = """
+const real a = fabs${f}(x), shifted = MULTIPLY_ADD(a, $two_over_pi, $magic), n = shifted - $magic;
+const real head = $head, middle = MULTIPLY_ADD(-n, $next_part, head);
+const real lost = MULTIPLY_ADD(-n, $next_part, head - middle), r = middle - MULTIPLY_ADD(n, $last_part, -lost);
+const real z = r * r$sin_powers;
+const real sine = MULTIPLY_ADD(r * z, $sin, r), cosine = MULTIPLY_ADD(z, MULTIPLY_ADD(z, $cos, -$half), 1);
+const elementary_word quadrant = elementary_word_of(shifted) + QUARTER, odd = elementary_word_of(x) & ODD;
+const elementary_word value = elementary_word_of(elementary_choice((int)(quadrant & 1), cosine, sine));
+return elementary_number_of(value ^ ((quadrant & 2) << $to_sign) ^ odd);
+"""
+# y = 2ᵏ f for a positive normal number
+_SCALED = """
+const elementary_word centred = elementary_word_of(y) + ($one - $root_half), exponent = centred >> $mantissa;
+const elementary_word fraction = (centred & $fraction_mask) + $root_half, counted = exponent | $counting;
+const real f = elementary_number_of(fraction);
+"""
+# log(y) = k ln 2 + log(1 + s)
+_LOGARITHM = """
+const real u = s / (2 + s), z = u * u, half_square = $half * s * s$log_powers;
+const real tail = MULTIPLY_ADD(u, MULTIPLY_ADD(z, $log, half_square), k * $ln2_low);
+const real value = MULTIPLY_ADD(k, $ln2_high, s) - (half_square - tail);
+const real not_zero = elementary_choice(y == 0, -(real)INFINITY, value);
+const real not_negative = elementary_choice(y < 0, (real)NAN, not_zero);
+const real result = elementary_choice(y < (real)INFINITY, not_negative, x);
+"""
+# What is computed with integers stands in lines of `elementary_word`: `OPERATIONS` counts the others.
+_BODIES = {
+    "exp": f"""const real t = x, above = x + (real)INFINITY;{_REDUCED}
+const real power = 1 + MULTIPLY_ADD(r2, $exp, r);
+const elementary_word scaled = elementary_word_of(power) + (elementary_word_of(shifted) << $mantissa);
+const real value = elementary_choice(x <= $exp_largest, elementary_number_of(scaled), above);
+return elementary_choice(x < $exp_smallest, 0, value);
+""",
+    "expm1": f"""const real t = x, above = x + (real)INFINITY;{_REDUCED}
+const elementary_word half_power = (elementary_word_of(shifted) << $mantissa) + $one_half;
+const real scale = elementary_number_of(half_power), rest = MULTIPLY_ADD(r2, $exp, (head - r) - tail);
+const real value = 2 * MULTIPLY_ADD(scale, rest, MULTIPLY_ADD(scale, r, scale - $half));
+const real bounded = elementary_choice(x <= $exp_largest, value, above);
+return copysign${{f}}(elementary_choice(x < -40, -1, bounded), x);
+""",
+    "tanh": f"""const real size = fabs${{f}}(x), a = elementary_choice(size > 20, 20, size), t = -2 * a;{_REDUCED}
+const elementary_word power = (elementary_word_of(shifted) << $mantissa) + $one;
+const real scale = elementary_number_of(power), e = MULTIPLY_ADD(scale, MULTIPLY_ADD(r2, $exp, r), scale);
+const real z = a * a$tanh_below_powers;
+const real small = a * z * $tanh, small_below = $tanh_below, large = -2 * e, large_below = 1 + e;
+const real numerator = elementary_choice(a < $split, small, large);
+const real denominator = elementary_choice(a < $split, small_below, large_below);
+return copysign${{f}}(elementary_choice(a < $split, a, 1) + numerator / denominator, x);
+""",
+    "sin": _QUADRANT.replace("QUARTER", "0").replace("ODD", "$sign"),
+    "cos": _QUADRANT.replace("QUARTER", "1").replace("ODD", "0"),
+    "log": f"""const real grown = x * $growth, y = elementary_choice(x < $smallest, grown, x);{_SCALED}
+const real bias = elementary_choice(x < $smallest, $grown_bias, $bias), k = elementary_number_of(counted) - bias;
+const real s = f - 1;{_LOGARITHM}
+return result;
+""",
+    # What rounding 1 + x lost joins s, times 2⁻ᵏ: by halves, since 2⁻ᵏ may be subnormal.
+    "log1p": f"""const real y = 1 + x, lost = x - (y - 1);{_SCALED}
+const elementary_word twice_inverse_power = ($exponent_mask - exponent) << $mantissa;
+const real k = elementary_number_of(counted) - $bias, scale = elementary_number_of(twice_inverse_power);
+const real s = (f - 1) + $half * lost * scale;{_LOGARITHM}
+return copysign${{f}}(result, x);
+""",
+}
+_wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="        ", break_on_hyphens=False)
+VECTORISED: tuple[str, ...] = tuple(_BODIES)
+"""Names of the functions."""
+
+
+def definitions(names: Iterable[str], precision: str, *, arrays: Iterable[str] = ()) -> str:
+    """C text of `elementary_NAME(x)` for the names, `elementary_NAME_each(n, x, y)` for arrays, and what they need.
+
+    The name `choice` stands for the choice between two numbers alone, which the others need too, `rounded` for
+    rounding to fewer bits, and `ordered` for comparisons in the total order.
+
+    Before it, the source has <float.h>, <math.h>, <stdint.h>, the type `real`, and `MULTIPLY_ADD(a, b, c)`, which is
+    a b + c, fused or not. Beyond their bound, the functions of angles call <math.h>. Arrays are functions of their own
+    because gcc vectorises the loop around a call only where it inlines the call, and it inlines some sixty a source.
+    """
+    arrays = set(arrays)
+    needed = set(names) | arrays
+    chosen = needed & set(VECTORISED)
+    if not chosen and not needed & {"choice", "rounded", "ordered"}:
+        return ""  # clang warns of what is not used
+    facts = _values(precision)
+    # By method 1 float is computed in double, which is wrong for the functions of float alone.
+    text = [fill(_EVALUATION, precision, or_double=" && FLT_EVAL_METHOD != 1" * (precision == "f64"))] * bool(chosen)
+    text.append(fill(_COMMON, precision, **facts))
+    text += [fill(_ROUNDED, precision, **facts)] * ("rounded" in needed)
+    text += [fill(_ORDERED, precision, **facts)] * ("ordered" in needed)
+    for name in (name for name in VECTORISED if name in chosen):
+        bounded = name in BOUNDS
+        text.append(_function(name, precision, "_within" * bounded))
+        facts = {"name": name, "bound": number(BOUNDS[name][precision], precision) if bounded else ""}
+        if bounded:
+            text.append(fill(_BOUNDED, precision, **facts))
+        if name in arrays:
+            text.append(fill(_EACH_BOUNDED if bounded else _EACH, precision, **facts))
+    return "\n".join(text)
+
+
+def _function(name: str, precision: str, ending: str = "") -> str:
+    lines = fill(_BODIES[name], precision, **_values(precision)).splitlines()
+    body = "\n".join(_wrapper.fill(line) for line in lines if line)
+    return f"static inline real elementary_{name}{ending}(real x)\n{{\n{body}\n}}\n"
+
+
+def _values(precision: str) -> dict[str, str]:
+    """What the texts leave open."""
+    numpy_type = PRECISIONS[precision][0]
+    mantissa, bias = np.finfo(numpy_type).nmant, np.finfo(numpy_type).maxexp - 1
+    word, suffix = {"f64": ("uint64_t", "ULL"), "f32": ("uint32_t", "U")}[precision]
+    root_half = int(numpy_type(math.sqrt(0.5)).view({"f64": np.uint64, "f32": np.uint32}[precision]))
+    words = {"one": bias << mantissa, "one_half": (bias - 1) << mantissa, "root_half": root_half}
+    words |= {"fraction_mask": (1 << mantissa) - 1, "exponent_mask": 2 * bias + 1, "sign": (2 * bias + 2) << mantissa}
+    words["counting"] = (bias + mantissa) << mantissa  # 2^mantissa, to which the low bits add what they count
+    numbers = {"magic": 1.5 * 2.0**mantissa, "half": 0.5, "split": 0.55}
+    numbers |= {"log2e": 1 / math.log(2), "two_over_pi": 2 / math.pi}
+    numbers |= dict(zip(("ln2_high", "ln2_low"), _LN2[precision], strict=True))
+    numbers |= dict(zip(("exp_smallest", "exp_largest"), _EXP_RANGE[precision], strict=True))
+    numbers |= {"bias": 2.0**mantissa + bias, "grown_bias": 2.0**mantissa + bias + mantissa + 2}
+    numbers |= {"smallest": 2.0 ** (1 - bias), "growth": 2.0 ** (mantissa + 2)}
+    values = {"word": word, "mantissa": str(mantissa), "to_sign": str(mantissa + bias.bit_length())}
+    values |= {"exponent_bits": str(bias.bit_length() + 1), "bias_of_exponent": str(bias)}
+    values |= {key: f"{value:#x}{suffix}" for key, value in words.items()}
+    values |= {key: number(value, precision) for key, value in numbers.items()}
+    *first_parts, values["next_part"], values["last_part"] = (number(part, precision) for part in _HALF_PI[precision])
+    values["head"] = functools.reduce(lambda rest, part: f"MULTIPLY_ADD(-n, {part}, {rest})", first_parts, "a")
+    for name, coefficients in _POLYNOMIALS[precision].items():
+        x, degree = "r" if name == "exp" else "z", len(coefficients) - 1
+        values[name] = _polynomial(x, [number(coefficient, precision) for coefficient in coefficients])
+        halves = [(f"{x}{2 ** (j - 1)}" if j > 1 else x, f"{x}{2**j}") for j in range(1, degree.bit_length())]
+        values[f"{name}_powers"] = "".join(f", {power} = {half} * {half}" for half, power in halves)
+    return values
+
+
+def _polynomial(x: str, coefficients: list[str]) -> str:
+    """Estrin's scheme: the halves are independent; x2, x4, ... are the powers of x."""
+    if len(coefficients) == 1:
+        return coefficients[0]
+    power = 2 ** ((len(coefficients) - 1).bit_length() - 1)
+    high, low = _polynomial(x, coefficients[power:]), _polynomial(x, coefficients[:power])
+    return f"MULTIPLY_ADD({x}{power if power > 1 else ''}, {high}, {low})"
+
+
+def _operations(name: str) -> int:
+    text = re.sub("const elementary_word[^;]*;", "", _function(name, "f64"))
+    return 2 * text.count("MULTIPLY_ADD") + len(re.findall(r"\s[-+*/]\s", text))
+
+
+OPERATIONS: Mapping[str, int] = {name: _operations(name) for name in VECTORISED}
+"""Floating-point operations of one evaluation, a multiply-add as 2 (float: fewer; comparisons are none)."""

@@ -1,0 +1,129 @@
+"""C of elementwise operations, small products and short sums: element by element, or in loops over arrays."""
+
+import numpy as np
+
+from dln_jax.export.c import kernels, products
+from dln_jax.export.c.body import Body
+from dln_jax.export.c.kinds import C_TYPES, NUMPY_TYPES
+from dln_jax.export.c.moves import merged
+from dln_jax.export.c.nodes import Node, is_constant, values
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED
+from dln_jax.export.c.operations import written as written_c
+from dln_jax.export.c.plan import strides
+
+_CHOICES = {
+    "select": "elementary_choice({0}, {1}, {2})",
+    "max": "elementary_choice(({0} > {1}) | ({0} != {0}), {0}, {1})",
+    "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
+}
+"""In loops without a branch, which would keep them from being vectorised."""
+
+
+def written_out(body: Body, node: Node) -> None:
+    """The elements of a node that something reads, one by one."""
+    dtype = C_TYPES[node.dtype]
+    name = body.kept(node) if node in body.plan.arrays else body.name(node)
+    for k in np.flatnonzero(body.plan.needed[node]):
+        text = _element(body, node, int(k))
+        if node in body.plan.arrays:
+            body.line(f"{name}[{k}] = {text};")
+        else:
+            body.bytes += 8
+            body.line(f"const {dtype} {name}{f'_{k}' if node.size > 1 else ''} = {text};")
+
+
+def _element(body: Body, node: Node, k: int) -> str:
+    if node.op == "contract":
+        a, b = node.args
+        (_, m, count), n = a.shape, b.shape[2]
+        batch, row, column = np.unravel_index(k, node.shape)
+        first = [body.read(a, np.array((batch * m + row) * count + each)) for each in range(count)]
+        second = [body.read(b, np.array((batch * count + each) * n + column)) for each in range(count)]
+        body.spend((2 * count - 1) * (node.dtype == "real"))
+        return products.chain(list(zip(first, second, strict=True)), node.dtype)
+    if node.op.startswith("reduce_"):
+        (a,) = node.args
+        count = a.shape[1]
+        terms = [body.read(a, np.array(k * count + each)) for each in range(count)]
+        return kernels.combined(body, node, k, terms)
+    if node.op == "take":
+        return f"{body.name(node.args[0])}[{body.read(node.args[1], np.array(k))}]"
+    return _expression(body, node, [body.read(each, np.array(k if each.size > 1 else 0)) for each in node.args])
+
+
+def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
+    """C of an elementwise operation."""
+    operation = OPERATIONS[node.op]
+    body.spend(operation.cost * (node.dtype == "real" or node.args[0].dtype == "real"))
+    if operation.function in VECTORISED and not body.source.libm:
+        body.source.functions.add(node.op)
+        return f"elementary_{node.op}({args[0]})"
+    if looped and node.dtype == "real" and node.op in _CHOICES:
+        body.source.functions.add("choice")
+        return _CHOICES[node.op].format(*args)
+    if node.op in ("rounded", "lt_to", "le_to"):
+        body.source.functions.add("rounded" if node.op == "rounded" else "ordered")
+    if name := _checked(node):
+        body.source.integers.add(name)
+        return f"elementary_{name}({', '.join(args)})"
+    # What is compared has a kind of its own.
+    return written_c(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
+
+
+def _checked(node: Node) -> str | None:
+    """The function of whole numbers that an operation needs, so that it cannot trap."""
+    if node.op.startswith("shift_"):
+        return f"{node.op}_{node.dtype}"
+    if node.op in ("integer_div", "integer_rem"):
+        divisor = node.args[1]
+        if is_constant(divisor) and not np.isin(values(divisor), (0, ~NUMPY_TYPES[node.dtype](0))).any():
+            return None
+        return f"{'quotient' if node.op == 'integer_div' else 'remainder'}_{node.dtype}"
+    if node.op.startswith("to_") and node.args[0].dtype == "real" and node.dtype != "bool":
+        return f"{node.dtype}_of"
+    return None
+
+
+def looped(body: Body, node: Node) -> None:
+    """A loop of elementwise operations that ends in a node."""
+    inside = sorted(
+        {node, *(each for each, root in body.plan.root.items() if root is node)}, key=lambda each: each.number
+    )
+    where: dict[Node, np.ndarray] = {}
+    index = np.arange(node.size).reshape(node.shape)
+    for each in inside:
+        for arg in each.args[1:] if each.op == "take" else each.args:
+            if arg not in inside:
+                where[arg] = index if arg.size == node.size else np.zeros_like(index)
+    name = body.kept(node)
+    if node.op in VECTORISED and not body.source.libm:
+        body.spend(OPERATIONS[node.op].cost * node.size)
+        body.source.arrays.add(node.op)
+        body.line(f"elementary_{node.op}_each({node.size}, {body.name(node.args[0])}, {name});")
+        return
+    shape = merged(node.shape, [_steps(body, arg, positions) for arg, positions in where.items()])
+
+    def statements(names: list[str]) -> None:
+        text = {arg: body.read(arg, positions.reshape(shape), names) for arg, positions in where.items()}
+        for each in inside:
+            if each.op == "take":
+                written = f"{body.name(each.args[0])}[{text[each.args[1]]}]"
+            else:
+                written = _expression(body, each, [text[arg] for arg in each.args], looped=True)
+            text[each] = f"v{each.number}"
+            if each is node:
+                body.line(f"{name}[{body.index(index.reshape(shape), names)}] = {written};")
+            elif each.dtype == "bool":
+                text[each] = written
+            else:
+                body.line(f"const {C_TYPES[each.dtype]} v{each.number} = {written};")
+
+    body.looped(shape, statements)
+
+
+def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
+    """How far a reading moves along each axis; None where it is a table."""
+    if node.op == "arrange" and node not in body.plan.arrays:
+        positions = np.asarray(np.asarray(node.value).ravel()[positions])
+    found = strides(positions)
+    return None if found is None else found[1]

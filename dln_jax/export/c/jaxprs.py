@@ -1,0 +1,148 @@
+"""What jaxprs say about themselves: how they are made, what they call, and where each equation comes from."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+from dln_jax.types import InputError
+
+_LARGE_CALL = 600
+"""Equations from which on a jitted function that is called several times is a C function of its own."""
+
+
+def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
+    """The closed jaxpr of a function, and the tree of its results.
+
+    Raises:
+        InputError: side effects, or whole numbers beyond 64 bits.
+    """
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    except OverflowError as error:
+        raise InputError(f"a whole number is out of range ({error}); C has those of 64 bits") from error
+    if closed.effects:
+        raise InputError(f"the function has side effects ({', '.join(map(str, closed.effects))}); C export takes none")
+    return closed, shapes
+
+
+def repeated_calls(every: Sequence[Any]) -> set[int]:
+    """Jaxprs, by `id`, of jitted functions that are large and that these closed ones seem to call several times.
+
+    Calls that look alike here become one function only if their programs are identical, see `Program.identity`.
+    """
+    known: dict[int, tuple[int, bytes]] = {}
+    counts: Counter[bytes] = Counter()
+
+    def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
+        """Number of equations, those of calls included, and a digest of primitives, types and constants."""
+        size, digest = 0, hashlib.sha256()
+        for each in consts:
+            digest.update(np.asarray(each).tobytes())
+        for equation in jaxpr.eqns:
+            within = 0
+            literals = [variable.val for variable in equation.invars if hasattr(variable, "val")]
+            types = [
+                (each.aval.shape, str(each.aval.dtype)) for each in equation.outvars if hasattr(each.aval, "dtype")
+            ]
+            digest.update(repr((equation.primitive.name, types)).encode())
+            digest.update(b"".join(np.asarray(each).tobytes() for each in literals))
+            values = equation.params.values() if _of_jax(equation.primitive) else ()
+            for inner in (each for value in values for each in _jaxprs(value)):
+                inside, likeness = called(inner)
+                within += inside
+                digest.update(likeness)
+            size += max(1, within)
+        return size, digest.digest()
+
+    def called(inner: Any) -> tuple[int, bytes]:
+        if id(inner) not in known:
+            closed = closed_jaxpr(inner)
+            known[id(inner)] = visit(closed.jaxpr, closed.consts)
+        size, likeness = known[id(inner)]
+        if size >= _LARGE_CALL:
+            counts[likeness] += 1
+        return size, likeness
+
+    for closed in every:
+        visit(closed.jaxpr, closed.consts)
+    return {each for each, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
+
+
+def _jaxprs(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return [each for one in value for each in _jaxprs(one)]
+    return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
+
+
+def expanded(primitive: Any) -> Any:
+    """What JAX 0.11 keeps of a function with derivatives of its own, such as `custom_root`, in other primitives."""
+
+    def expand(*leaves: Any) -> list[Any]:
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
+
+    examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
+    return jax.make_jaxpr(expand)(*examples)
+
+
+def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
+    """What a primitive of another library, such as Equinox, is in JAX's own: its `impl`; None for one of JAX's own.
+
+    Args:
+        known: the numbers of each argument that is constant, None for others; only those are arguments of the jaxpr.
+    """
+    primitive = equation.primitive
+    if _of_jax(primitive):
+        return None
+
+    def run(*unknown: Any) -> list[Any]:
+        left = iter(unknown)
+        args = [next(left) if each is None else each for each in known]
+        return jax.tree.leaves(primitive.impl(*args, **equation.params))
+
+    avals = [variable.aval for variable, each in zip(equation.invars, known, strict=True) if each is None]
+    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(each.shape, each.dtype) for each in avals))
+
+
+def _of_jax(primitive: Any) -> bool:
+    """Whether a primitive is one of JAX's own."""
+    return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
+
+
+def is_error_of_equinox(equation: Any) -> bool:
+    """Whether an equation is the callback that raises the error of `equinox.error_if`."""
+    if equation.primitive.name != "pure_callback":
+        return False
+    callback = equation.params["callback"]
+    return getattr(callback, "callback_func", callback).__module__ == "equinox._errors"
+
+
+def closed_jaxpr(jaxpr: Any) -> Any:
+    """With its constants, which an open one has not."""
+    return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
+
+
+def made_at(equation: Any) -> str:
+    """File and line of the user's code that made an equation, nothing where the call around it knows."""
+    traceback = equation.source_info.traceback
+    frames = [] if traceback is None else list(traceback.frames)
+    users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
+    return f" (made at {users[0].file_name}:{users[0].line_num})" if users else ""
+
+
+def scanned(equation: Any) -> dict[str, int]:
+    """How many arguments of a scan are the same in each turn, and carried: releases of JAX state it differently.
+
+    What is stacked has another shape outside than inside.
+    """
+    inner = closed_jaxpr(equation.params["jaxpr"]).jaxpr
+
+    def alike(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        return sum(a.aval.shape == b.aval.shape for a, b in zip(outside, inside, strict=True))
+
+    carried = alike(equation.outvars, inner.outvars)
+    return {"fixed": alike(equation.invars, inner.invars) - carried, "carried": carried}

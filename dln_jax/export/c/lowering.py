@@ -1,0 +1,242 @@
+"""A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from jax.dtypes import float0
+
+from dln_jax.export.c import indexing, linear_algebra, primitives, reductions
+from dln_jax.export.c.jaxprs import closed_jaxpr, expanded, implementation, is_error_of_equinox, made_at, scanned
+from dln_jax.export.c.kinds import NUMPY_TYPES, kind_of
+from dln_jax.export.c.nodes import Loop, Node, is_constant, values
+from dln_jax.export.c.program import Part, Program
+from dln_jax.export.c.text import PRECISIONS
+from dln_jax.types import InputError
+
+_CALLS = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat": "jaxpr",
+    "checkpoint": "jaxpr", "eval_jaxpr": "call_jaxpr", "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr", "remat2": "jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "custom_vmap_call": "call",
+}  # fmt: skip
+_REFUSED = {
+    "random": "random numbers; draw them outside and pass them as arguments",
+    "threefry": "random numbers; draw them outside and pass them as arguments",
+    "callback": "a callback into Python, which a robot has not",
+    "debug_print": "printing, a side effect",
+}
+_RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
+_TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
+
+
+def program_of(
+    closed: Any, repeated: Collection[int] = (), *, precision: str = "f64"
+) -> tuple[Program, list[Node], list[Node]]:
+    """The program of a closed jaxpr, its inputs and its results.
+
+    Args:
+        closed: as `jaxprs.traced`.
+        repeated: calls of these jaxprs, by `id`, are calls in the program too.
+        precision: of real numbers.
+
+    Raises:
+        InputError: what has no C: an unsupported primitive, with the line that made it, random numbers, another type of
+            number, a shape that is not known.
+    """
+    program = Program(real=PRECISIONS[precision][0], repeated=repeated)
+    inputs = [
+        program.make("input", variable.aval.shape, kind_of(variable.aval.dtype), attribute=number)
+        for number, variable in enumerate(closed.jaxpr.invars)
+    ]
+    return program, inputs, _inline(program, closed, inputs)
+
+
+def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
+    """Results of a closed jaxpr."""
+    jaxpr = closed.jaxpr
+    known: dict[Any, Node] = {}
+
+    def read(variable: Any) -> Node:
+        if hasattr(variable, "val"):
+            return _constant(program, variable.val, variable.aval)
+        return known[variable]
+
+    known.update(zip(jaxpr.invars, args, strict=True))
+    for variable, value in zip(jaxpr.constvars, closed.consts, strict=True):
+        known[variable] = _constant(program, value, variable.aval)
+    for equation in jaxpr.eqns:
+        try:
+            results = _apply(program, equation, [read(variable) for variable in equation.invars])
+        except InputError as error:
+            text = str(error)
+            where = "" if " (made at " in text else made_at(equation)
+            raise InputError(text + where) from error
+        for variable, result in zip(equation.outvars, results, strict=True):
+            expected = tuple(variable.aval.shape), kind_of(variable.aval.dtype)
+            assert (result.shape, result.dtype) == expected, f"{equation.primitive.name} became {result}"
+            known[variable] = result
+    return [read(variable) for variable in jaxpr.outvars]
+
+
+def _constant(program: Program, value: Any, aval: Any) -> Node:
+    kind = kind_of(aval.dtype)
+    if aval.dtype == float0:
+        value = np.zeros(aval.shape, bool)
+    return program.constant(np.asarray(value).reshape(aval.shape), kind)
+
+
+def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
+    name, parameters = equation.primitive.name, equation.params
+    for variable in equation.outvars:
+        if not all(isinstance(size, int | np.integer) for size in getattr(variable.aval, "shape", ())):
+            raise InputError(f"an array has shape {variable.aval.shape}; expected sizes that are known beforehand")
+    if name in _CALLS:
+        inner = parameters[_CALLS[name]]
+        if id(inner) in program.repeated:
+            return _call(program, inner, args)
+        return _inline(program, closed_jaxpr(inner), args)
+    if name == "call_hi_primitive":
+        return _inline(program, expanded(parameters["_prim"]), args)
+    if name == "scan":
+        parameters = {**parameters, **scanned(equation)}
+    if is_error_of_equinox(equation):
+        return [_failed(program, variable.aval) for variable in equation.outvars]
+    if name in _CONTROL:
+        return _CONTROL[name](program, parameters, args)
+    if name in _TYPED_RULES:
+        dtype = kind_of(equation.outvars[0].aval.dtype)
+        return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
+    if name not in _RULES:
+        why = next((reason for part, reason in _REFUSED.items() if part in name), None)
+        inner = (
+            None if why else implementation(equation, [values(each) if is_constant(each) else None for each in args])
+        )
+        if inner is not None:
+            return _inline(program, inner, [each for each in args if not is_constant(each)])
+        raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
+    results = _RULES[name](program, parameters, *args)
+    return list(results) if isinstance(results, list | tuple) else [results]
+
+
+def _failed(program: Program, aval: Any) -> Node:
+    """What stands for an error that C cannot raise: NaN, the largest whole number, or true, as by EQX_ON_ERROR=nan."""
+    kind = kind_of(aval.dtype)
+    value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
+    return program.broadcast(program.constant(value, kind), aval.shape)
+
+
+def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
+    """A call of a function of its own, which has the constants among its arguments inside."""
+    fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
+    call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
+    if call not in program.lowered:
+        part = Program(real=program.real, repeated=program.repeated, parts=program.parts, lowered=program.lowered)
+        inside = [
+            part.constant(values(arg), arg.dtype)
+            if k in fixed
+            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(each < k for each in fixed))
+            for k, arg in enumerate(args)
+        ]
+        results = _inline(part, closed, inside)
+        program.lowered[call] = part.identity(results)
+        program.parts.setdefault(program.lowered[call], Part(part, results))
+    key = program.lowered[call]
+    shapes = [(each.shape, each.dtype) for each in program.parts[key].results]
+    passed = [arg for k, arg in enumerate(args) if k not in fixed]
+    node = program.make("call", (), "int", passed, attribute=key)
+    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
+
+
+def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    lengths, jaxprs = parameters["const_lengths"], parameters["jaxprs"]
+    before = lengths.matvec + lengths.vecmat
+    constants, right = args[before : before + lengths.solve], args[sum(lengths) :]
+    return _inline(program, jaxprs.solve, [*constants, *right])
+
+
+def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], int]:
+    """Where a loop over these nodes is, and its number."""
+    number = len(program.loops)
+    program.loops[number] = Loop([], [], [])
+    return max((program.floor, *(node.region for node in nodes)), key=len), number
+
+
+def _carries(program: Program, number: int, outer: tuple[int, ...], start: Sequence[Node]) -> list[Node]:
+    region = (*outer, number)
+    return [
+        program.make("carry", each.shape, each.dtype, attribute=(number, index), region=region)
+        for index, each in enumerate(start)
+    ]
+
+
+def _projections(program: Program, op: str, number: int, outer, start, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
+    loop = program.make(op, (), "int", start, attribute=number, region=outer)
+    return [
+        program.make("project", shape, dtype, [loop], attribute=index) for index, (shape, dtype) in enumerate(shapes)
+    ]
+
+
+def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    split = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
+    of_condition, of_body, start = args[: split[0]], args[split[0] : split[1]], args[split[1] :]
+    outer, number = _region(program, args)
+    carries = _carries(program, number, outer, start)
+    (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
+    results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
+    program.loops[number] = Loop(carries, [condition], results)
+    return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
+
+
+def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    constants, count = parameters["fixed"], parameters["carried"]
+    fixed, start, stacked = args[:constants], args[constants : constants + count], args[constants + count :]
+    length, reverse = parameters["length"], parameters["reverse"]
+    if length == 0:
+        left = parameters["jaxpr"].out_avals[count:]
+        return [*start, *(program.constant(np.zeros((0, *each.shape)), kind_of(each.dtype)) for each in left)]
+    outer, number = _region(program, args)
+    carries = _carries(program, number, outer, start)
+    turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
+    slices = []
+    for each in stacked:
+        size = each.size // max(length, 1)
+        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "index")
+        first = program.elementwise("mul", turn, program.constant(size, "index"))
+        slices.append(indexing.take(program, each, program.elementwise("add", first, offsets)))
+    results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
+    program.loops[number] = Loop(carries, [], results, length, reverse)
+    shapes = [(each.shape, each.dtype) for each in start]
+    shapes += [((length, *each.shape), each.dtype) for each in results[count:]]
+    return _projections(program, "repeat", number, outer, start, shapes)
+
+
+def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
+    which, *operands = args
+    branches = parameters["branches"]
+    if len(branches) == 1 or which.op == "const":
+        chosen = int(np.clip(which.value, 0, len(branches) - 1)) if which.value is not None else 0
+        return _inline(program, branches[chosen], operands)
+    outer, number = _region(program, args)
+    floor, every = program.floor, []
+    for branch, closed in enumerate(branches):
+        inside = number if branch == 0 else _region(program, [])[1]
+        program.floor = (*outer, inside)
+        every.append((inside, _inline(program, closed, operands)))
+    program.floor = floor
+    for inside, results in every:
+        program.loops[inside] = Loop([], [], results)
+    shapes = [(each.shape, each.dtype) for each in every[0][1]]
+    numbers = tuple(inside for inside, _ in every)
+    branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
+    return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
+
+
+def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
+    """Which branch is that of a processor: the one for all others, where none is its own."""
+    places = [k for k, each in enumerate(parameters["platforms"]) if each is None or "cpu" in each]
+    return [program.constant(np.int32(places[0]), "int")]
+
+
+_CONTROL = {"platform_index": _platform, "while": _while, "scan": _scan, "cond": _cond}
+_CONTROL["custom_linear_solve"] = _custom_linear_solve

@@ -1,0 +1,250 @@
+"""Which nodes of a program become scalars, loops or nothing at all, where they are kept, and in which order.
+
+Small arrays are written out, element by element, so that moving elements costs nothing and a compiler keeps them in
+registers. Others are loops over arrays; elementwise ones that nothing else reads are part of the loop that reads them.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.export.c.nodes import Loop, Node, Region, is_constant
+from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
+from dln_jax.export.c.program import Program
+
+WRITTEN_OUT = 64
+"""Elements of a result, or products of a sum, up to which they may be written out one by one."""
+_VECTOR = 8
+_VECTOR_OF_FUNCTIONS = 4
+_FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
+PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
+"""What reads arguments through a pointer."""
+
+
+class Plan(NamedTuple):
+    """What is decided about the nodes that the results need."""
+
+    order: dict[Region, list[Node]]
+    """Nodes of each region as they are computed."""
+    written_out: set[Node]
+    """Computed element by element."""
+    arrays: set[Node]
+    """Kept in an array; scalars otherwise."""
+    root: dict[Node, Node]
+    """The loop that an elementwise node is computed in, of each that has a loop."""
+    needed: dict[Node, np.ndarray]
+    """Of what is written out, the elements that something reads."""
+    levels: dict[Node, int]
+    """Number of products that come before, one after the other."""
+    reads: dict[Node, set[Node]]
+    """Arrays of its region that each step reads; a loop reads what is read inside."""
+    readers: dict[Node, set[Node | None]]
+    """Steps that read an array, and None for the results."""
+
+
+def plan_of(program: Program, results: Iterable[Node]) -> Plan:
+    """The plan for a program with these results."""
+    results = list(results)
+    nodes, readers, whole, contiguous = _reached(program, results)
+    written_out = {node for node in nodes if _is_written_out(node)}
+    arrays, followed = set(contiguous), set()
+    # What loops read is an array; of an arrange whose elements a loop cannot follow, a copy is.
+    for node in reversed(nodes):
+        looped = any(
+            reader in followed if reader.op == "arrange" else reader not in written_out for reader in readers[node]
+        )
+        if node.op == "arrange" and node not in contiguous and not (looped and not is_direct(node)):
+            followed |= {node} if looped or node in whole else set()
+        elif node.op == "arrange":
+            arrays.add(node)
+            (written_out if node.size <= WRITTEN_OUT else followed).add(node)
+        elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
+            arrays.add(node)
+    arrays = {node for node in arrays if node.op not in ("input", "const")}
+    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), written_out)
+    arrays -= {node for node, into in root.items() if into is not node}
+    levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
+    order: dict[Region, list[Node]] = {}
+    for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
+        ends = root.get(node, node)
+        if needed[ends].any() and (node in written_out or ends is node):
+            order.setdefault(node.region, []).append(node)
+    reads = _reads(program, nodes, arrays, root)
+    steps: dict[Node, set[Node | None]] = {}
+    of_results = {source for node in results for source in sources(node, arrays)}
+    every: list[tuple[Node | None, set[Node]]] = [*reads.items(), (None, of_results)]
+    for step, read in every:
+        for source in read:
+            steps.setdefault(source, set()).add(step)
+    return Plan(order, written_out, arrays, root, needed, levels, reads, steps)
+
+
+def inner(program: Program, node: Node) -> list[Loop]:
+    """What is inside of a loop or branch."""
+    if node.op == "branch":
+        return [program.loops[number] for number in node.attribute]
+    return [program.loops[node.attribute]] if node.op in ("while", "repeat") else []
+
+
+def is_direct(node: Node) -> bool:
+    """Whether a loop follows an arrange with an index that is linear in its own."""
+    return len(node.args) == 1 and strides(node.value) is not None
+
+
+def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
+    """(first, steps) with positions = first + sum_a steps_a i_a, or None."""
+    assert positions is not None
+    if positions.size == 0:
+        return 0, (0,) * positions.ndim
+    first = int(positions.flat[0])
+    steps = []
+    expected = np.array(first)
+    for axis, extent in enumerate(positions.shape):
+        corner = (0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)
+        steps.append(int(positions[corner]) - first if extent > 1 else 0)
+        expected = expected[..., None] + steps[-1] * np.arange(extent)
+    return (first, tuple(steps)) if np.array_equal(positions, expected) else None
+
+
+def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
+    """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
+    found, waiting = set(), list(results)
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.add(node)
+            waiting += node.args
+            for loop in inner(program, node):
+                waiting += [*loop.carries, *loop.conditions, *loop.results]
+    nodes = sorted(found, key=lambda node: node.number)
+    readers: dict[Node, list[Node]] = {node: [] for node in nodes}
+    whole, contiguous = {node for node in results if node.size > WRITTEN_OUT}, set()
+    for node in nodes:
+        for each in node.args:
+            readers[each].append(node)
+        if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_written_out(node)):
+            contiguous |= set(node.args[:1] if node.op == "take" else node.args)
+        for loop in inner(program, node):
+            whole |= {*loop.results, *loop.conditions, *node.args}
+    return nodes, readers, whole, contiguous
+
+
+def _is_written_out(node: Node) -> bool:
+    if node.op == "contract":
+        count, columns = node.args[1].shape[1:]
+        beside = is_constant(node.args[1]) and columns >= _VECTOR_OF_FUNCTIONS
+        return node.size * count <= WRITTEN_OUT and not beside
+    if node.op.startswith(("reduce_", "arg")):
+        return node.args[0].size <= WRITTEN_OUT and node.op.startswith("reduce_")
+    if node.op == "take":
+        return node.size < _VECTOR
+    if node.op not in OPERATIONS:
+        return False
+    if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
+        return True
+    scattered = any(each.op == "arrange" and not is_direct(each) for each in node.args)
+    return node.size <= WRITTEN_OUT and scattered and node.op not in TRANSCENDENTAL
+
+
+def _is_scalar(node: Node) -> bool:
+    """Whether what computes it can leave it without memory."""
+    return node.size == 1 and node.op not in ("contract", *_FACTORED) and node.op[:4] != "put_"
+
+
+def _is_product(node: Node, written_out: set[Node]) -> bool:
+    return node.op == "contract" and node not in written_out
+
+
+def _fused(nodes, readers, whole, written_out) -> dict[Node, Node]:
+    """The loop that each elementwise node is in."""
+    root: dict[Node, Node] = {}
+    for node in reversed(nodes):
+        if node.op not in OPERATIONS or node in written_out:
+            continue
+        into = {root.get(reader) for reader in readers[node]}
+        alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
+        same = all(reader.shape == node.shape and reader.region == node.region for reader in readers[node])
+        root[node] = next(iter(into)) or node if len(into) == 1 and same and not alone and readers[node] else node
+    return root
+
+
+def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
+    levels: dict[Node, int] = {}
+    highest: dict[int, int] = {}
+    for node in nodes:
+        level = max((levels[each] for each in node.args), default=0)
+        for number in (node.attribute if node.op == "branch" else (node.attribute,)) if inner(program, node) else ():
+            level = max(level, highest.get(number, 0))
+        levels[node] = level + (node.op == "contract")
+        for number in node.region:
+            highest[number] = max(highest.get(number, 0), levels[node])
+    return levels
+
+
+def sources(node: Node, arrays: set[Node]) -> set[Node]:
+    """Arrays that a reading of a node reads."""
+    if node.op == "arrange" and node not in arrays:
+        return {source for each in node.args for source in sources(each, arrays)}
+    return {node} & arrays
+
+
+def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
+    reads: dict[Node, set[Node]] = {}
+    loops = {number: node for node in nodes if inner(program, node) for number in np.ravel(node.attribute)}
+    for node in nodes:
+        if node.op == "arrange" and node not in arrays:
+            continue
+        read = [*node.args]
+        for loop in inner(program, node):
+            read += [*loop.results, *loop.conditions]
+        for each in read:
+            for source in sources(each, arrays):
+                # Where a loop inside of the array's region reads it, the loop does.
+                depth = len(source.region)
+                step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
+                reads.setdefault(step, set()).add(source)
+    return reads
+
+
+def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
+    """Elements that something reads, of each node."""
+    needed = {node: np.zeros(node.size, bool) for node in nodes}
+    projected: dict[Node, set[int]] = {}
+    for node in results:
+        needed[node][:] = True
+    for node in reversed(nodes):
+        mask = needed[node]
+        if not mask.any():
+            continue
+        if node in arrays:
+            mask[:] = True
+        for loop in inner(program, node):
+            for k, each in enumerate(loop.results):
+                if k < len(loop.carries) or k in projected.get(node, ()):
+                    needed[each][:] = True
+            for each in (*loop.conditions, *loop.carries):
+                needed[each][:] = True
+        if node.op == "project":
+            projected.setdefault(node.args[0], set()).add(node.attribute)
+        if node.op == "arrange":
+            starts = np.cumsum([0, *(each.size for each in node.args)])
+            positions = np.asarray(node.value).ravel()[mask]
+            for each, start in zip(node.args, starts, strict=False):
+                needed[each][positions[(positions >= start) & (positions < start + each.size)] - start] = True
+        elif node in written_out and node.op == "take":
+            needed[node.args[0]][:] = True
+            needed[node.args[1]][...] |= mask
+        elif node in written_out and node.op in OPERATIONS:
+            for each in node.args:
+                needed[each][...] |= mask if each.size == node.size else mask.any()
+        elif node in written_out and node.op == "contract":
+            rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
+            for each, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
+                needed[each][...] |= np.broadcast_to(used, each.shape).ravel()
+        elif node in written_out and node.op.startswith("reduce_"):
+            needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
+        else:
+            for each in node.args:
+                needed[each][:] = True
+    return needed

@@ -1,0 +1,146 @@
+"""Motions within a robot's limits, what they show of a model's parameters, and random ones.
+
+A motion is checked at ten times the samples at which it is designed, and keeps a margin for the times between.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.identification.excitation.fourier import FourierMotion, harmonic_functions, rest_basis
+from dln_jax.identification.excitation.limits import worst
+from dln_jax.identification.excitation.task import Task
+from dln_jax.types import InputError, require_positive, require_seed
+
+FINER = 10
+"""Times as many samples where motions are checked."""
+MARGIN = 1e-3
+"""Of every limit, in m of clearances, that the samples checked keep free for the times between them."""
+DRAWS = 50
+"""Of a random motion, before none is said to be within the limits."""
+SMALLEST, BISECTIONS = 0.05, 8
+"""Amplitude, relative to that drawn, to which a motion is shrunk at most to keep the limits, and how closely."""
+
+
+class Design(NamedTuple):
+    """A motion that keeps the limits, and what it shows."""
+
+    motion: FourierMotion
+    information: Float[np.ndarray, "B B"]
+    """A, on average of one sample."""
+    condition: float
+    """Of the regressor of base parameters, columns of unit length."""
+    log_determinant: float
+    """Of A."""
+    slack: float
+    """Smallest distance to a limit, relative to it."""
+    nearest: str
+    """Limit that it is closest to."""
+
+
+def functions_at(task: Task, t: Float[np.ndarray, " N"]) -> list[np.ndarray]:
+    """Harmonic functions and their derivatives at all times, each [N, 2 H]."""
+    return [np.asarray(each) for each in jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t)]
+
+
+def grid(task: Task, finer: int = 1) -> Float[np.ndarray, " N"]:
+    """Times where motions are designed, or as many times more: one period, equally spaced, without its end."""
+    return task.period * np.arange(finer * task.steps) / (finer * task.steps)
+
+
+def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple[Any, Any, Any]:
+    """q, qd, qdd [N, d]."""
+    q, qd, qdd = (each @ jnp.asarray(coefficients).T for each in functions)
+    return offset + q, qd, qdd
+
+
+def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
+    """The largest excess on the fine grid, and of which limit."""
+    motions = states(functions_at(task, grid(task, FINER)), motion.offset, motion.coefficients)
+    parts = zip(*(np.split(np.asarray(each), FINER) for each in motions), strict=True)
+    return max(worst(task.samples(*part)[2]) for part in parts)
+
+
+def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
+    """The motion as a design, shrunk towards its mean posture as little as its limits ask for; `None` if too little.
+
+    In words, which limit is the last that it breaks.
+    """
+
+    def shrunk(amplitude: float) -> FourierMotion:
+        return motion._replace(coefficients=amplitude * np.asarray(motion.coefficients))
+
+    beyond, _ = furthest(task, motion)
+    if beyond <= -MARGIN:
+        return measured(task, motion), ""
+    beyond, kind = furthest(task, shrunk(SMALLEST))
+    if beyond > -MARGIN:
+        return None, f"{kind} by {100 * beyond:.2g} %" if kind != "clearance" else f"clearance by {beyond:.2g} m"
+    amplitude, broken = SMALLEST, 1.0
+    for _ in range(BISECTIONS):
+        middle = (amplitude + broken) / 2
+        if furthest(task, shrunk(middle))[0] <= -MARGIN:
+            amplitude = middle
+        else:
+            broken = middle
+    return measured(task, shrunk(amplitude)), ""
+
+
+def weighted(task: Task, Phi: Any) -> Any:
+    """Rows over the noise of their joint, of the base parameters alone: [N, d, B] of [N, d, P]."""
+    return Phi[..., task.columns] / task.noise[:, None]
+
+
+def measured(task: Task, motion: FourierMotion) -> Design:
+    """A motion and what it shows."""
+    at = states(functions_at(task, grid(task)), motion.offset, motion.coefficients)
+    W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
+    lengths = np.linalg.norm(W, axis=0)
+    sizes = np.linalg.svd(W / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
+    with np.errstate(divide="ignore"):
+        logarithm = 2 * np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)) - len(sizes) * np.log(task.steps)
+    beyond, kind = furthest(task, motion)
+    condition = float(sizes[0] / sizes[-1]) if sizes[-1] > 0 else np.inf
+    return Design(motion, W.T @ W / task.steps, condition, float(logarithm), -beyond, kind)
+
+
+def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
+    """Random motions that use the limits: each joint as far as one of its own allows, then all as forces ask for.
+
+    Raises:
+        InputError: 50 draws gave no motion within the limits, with the one that was broken.
+    """
+    require_positive(count=count)
+    require_seed(seed)
+    drawn, found, why = _draws(task, np.random.default_rng(seed)), [], ""
+    failed = 0
+    while len(found) < count:
+        design, why = kept(task, next(drawn))
+        if design is not None:
+            found.append(design)
+        else:
+            failed += 1
+        if failed >= DRAWS * max(1, len(found)):
+            raise InputError(f"{failed} random motions broke the limits even when small, the last of {why}; widen it")
+    return found
+
+
+def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
+    limits, basis = task.limits, rest_basis(task.harmonics)
+    functions = functions_at(task, grid(task, FINER))
+    lower, upper = limits.position.T
+    # Velocities of all harmonics are alike.
+    spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
+    while True:
+        coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T
+        q, qd, qdd = (each @ coefficients.T for each in functions)
+        sizes = [np.ptp(q, axis=0) / (upper - lower)]
+        sizes += [abs(rate).max(axis=0) / bound for rate, bound in ((qd, limits.velocity), (qdd, limits.acceleration))]
+        scale = (1 - 2 * MARGIN) / np.max(sizes, axis=0)
+        free = (upper - lower) - scale * np.ptp(q, axis=0)
+        offset = lower - scale * q.min(axis=0) + free * random.uniform(0.1, 0.9, len(lower))
+        yield FourierMotion(offset, scale[:, None] * coefficients, task.period)

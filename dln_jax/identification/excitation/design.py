@@ -1,0 +1,229 @@
+"""Motions that show a model's parameters best, within a robot's limits, by gradients.
+
+Unknowns are the series of each joint. The criterion is one of A, the information of a sample (`excitation_task`):
+
+    information    log det A: all parameters' errors in product, whatever their units (D-optimal)
+    condition      largest over smallest singular value of the regressor with columns of unit length
+
+and every limit at every sample is an inequality of an augmented Lagrangian. Both have many minima: several random
+starts are taken. What is returned keeps the limits at ten times as many samples, designed anew with more margin or
+shrunk where it does not.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dln_jax.data.schema import Trajectories
+from dln_jax.identification.excitation.candidates import (
+    MARGIN,
+    Design,
+    functions_at,
+    furthest,
+    grid,
+    kept,
+    states,
+    weighted,
+)
+from dln_jax.identification.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled
+from dln_jax.identification.excitation.task import Task
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.model import Model, Parameters
+from dln_jax.solvers.augmented_lagrangian import make_minimiser
+from dln_jax.types import InputError, Needs, Scalar, require_positive
+
+SHARPNESS = 4
+"""Power of the means that stand for the largest and the smallest eigenvalue."""
+FIRST_MARGIN, TIGHTENINGS = 0.01, 3
+"""Of limits, relative to them, where a motion is designed, for what it does between its samples; and how often it is
+designed, with more where that was too little."""
+Criterion = Callable[[Array], Array]
+"""A [B, B] -> scalar, smaller is better."""
+Optimiser = Callable[[Design, Any], Design | None]
+"""(start, information that is there already [B, B]) -> design within the limits, `None` if it came to none."""
+
+
+def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
+    """A with ones on its diagonal, and the roots of that which it had."""
+    lengths = jnp.sqrt(jnp.diagonal(A))
+    return A / lengths[:, None] / lengths, lengths
+
+
+def information(A: Float[Array, "B B"]) -> Scalar:
+    """-log det A / 2 B: the mean logarithm of standard errors, along axes in which they are independent."""
+    scaled, lengths = _scaled(A)
+    return -(0.5 * jnp.linalg.slogdet(scaled)[1] + jnp.sum(jnp.log(lengths))) / A.shape[0]
+
+
+def condition(A: Float[Array, "B B"]) -> Scalar:
+    """Logarithm of the condition of the regressor with columns of unit length, by smooth means of eigenvalues."""
+    sizes = jnp.log(jnp.maximum(jnp.linalg.eigvalsh(_scaled(A)[0]), jnp.finfo(A.dtype).eps))
+    largest, smallest = (jax.nn.logsumexp(sign * SHARPNESS * sizes) / SHARPNESS for sign in (1, -1))
+    return 0.5 * (largest + smallest)
+
+
+CRITERIA: dict[str, Criterion] = {"information": information, "condition": condition}
+
+
+class _Scale(NamedTuple):
+    """Of the unknowns, which are dimensionless."""
+
+    middle: np.ndarray
+    half: np.ndarray
+
+
+def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
+    """An optimiser that is compiled once for all starts.
+
+    Args:
+        task: limits, model, series.
+        criterion: of the information, such as one of `CRITERIA`.
+        rounds: of the augmented Lagrangian, at most.
+        iterations: of L-BFGS in each.
+    """
+    functions, basis = functions_at(task, grid(task)), rest_basis(task.harmonics)
+    scale = _Scale(task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2)
+
+    def series(x: Any) -> tuple[Any, Any]:
+        unknowns = x.reshape(len(scale.half), -1)
+        return scale.middle + scale.half * unknowns[:, 0], scale.half[:, None] * (unknowns[:, 1:] @ basis.T)
+
+    def problem(x: Array, known: Array, margin: Array) -> tuple[Array, Array]:
+        motion = states(functions, *series(x))
+        Phi, _, beyond = jax.vmap(task.observe)(*motion)
+        W = weighted(task, Phi).reshape(-1, task.columns.size)
+        A = known + W.T @ W / task.steps
+        return criterion(A), jnp.concatenate([each.ravel() + margin for each in jax.tree.leaves(beyond)])
+
+    minimise = make_minimiser(problem, rounds=rounds, iterations=iterations)
+
+    def optimise(start: Design, known: Any = None) -> Design | None:
+        given = start.motion
+        place = (np.asarray(given.offset) - scale.middle) / scale.half
+        x = np.column_stack([place, np.asarray(given.coefficients) / scale.half[:, None] @ basis]).ravel()
+        there, margin = np.zeros_like(start.information) if known is None else np.asarray(known), FIRST_MARGIN
+        motion = given
+        for _ in range(TIGHTENINGS):
+            x = minimise(x, there, margin).x
+            offset, coefficients = series(x)
+            motion = FourierMotion(np.asarray(offset), np.asarray(coefficients), task.period)
+            beyond = furthest(task, motion)[0]
+            if beyond <= -MARGIN:
+                break
+            margin += beyond + 2 * MARGIN
+        return kept(task, motion)[0]
+
+    return optimise
+
+
+def best_design(
+    task: Task, optimise: Optimiser, criterion: Criterion, starts: Sequence[Design], *, known: Any = None
+) -> Design:
+    """The best of what several starts come to; a start itself where nothing is better.
+
+    Args:
+        task: of the starts.
+        optimise: by `make_optimiser`, of the same task and criterion.
+        criterion: to choose by.
+        starts: such as `random_designs`.
+        known: information that is there already, from other motions [B, B].
+
+    Raises:
+        InputError: no starts.
+    """
+    if not starts:
+        raise InputError("there are no starts; expected at least one design")
+    found = [optimise(start, known) for start in starts]
+    there = np.zeros_like(starts[0].information) if known is None else known
+    every = [*(each for each in found if each is not None), *starts]
+    return min(every, key=lambda each: _worth(criterion, there + each.information))
+
+
+def _worth(criterion: Criterion, A: np.ndarray) -> float:
+    value = float(criterion(jnp.asarray(A)))
+    return value if np.isfinite(value) else np.inf
+
+
+def design_set(
+    task: Task,
+    drawn: Sequence[Design],
+    *,
+    trajectories: int = 3,
+    criterion: str = "information",
+    say: Callable[[int, str], None] = lambda done, text: None,
+) -> tuple[list[Design], Design]:
+    """Motions to identify from, each the best beside those before it, and one to validate on, from starts of its own.
+
+    Args:
+        task: limits, model, series.
+        drawn: starts, such as `random_designs`, of which each motion has as many.
+        trajectories: to identify from.
+        criterion: a name in `CRITERIA`.
+        say: is told how many of all motions are done, and what came of the last.
+
+    Raises:
+        InputError: an unknown criterion, no trajectories, or fewer starts than motions.
+    """
+    if criterion not in CRITERIA:
+        raise InputError(f"criterion is '{criterion}'; choose from {', '.join(CRITERIA)}")
+    require_positive(trajectories=trajectories)
+    starts = len(drawn) // (trajectories + 1)
+    if not starts:
+        raise InputError(f"{len(drawn)} starts are fewer than the {trajectories + 1} motions; expected one for each")
+    judge = CRITERIA[criterion]
+    optimise = make_optimiser(task, judge)
+    found: list[Design] = []
+    for place in range(trajectories + 1):
+        own = drawn[place * starts : (place + 1) * starts]
+        known = sum(each.information for each in found) if 0 < place < trajectories else None
+        found.append(best_design(task, optimise, judge, own, known=known))
+        say(place + 1, f"condition {found[-1].condition:.3g}")
+    return found[:-1], found[-1]
+
+
+def together(designs: Sequence[Design]) -> tuple[float, float]:
+    """Condition and log det A of several motions of one length, taken as one."""
+    A = np.mean([each.information for each in designs], axis=0)
+    lengths = np.sqrt(np.diag(A))
+    sizes = np.linalg.eigvalsh(A / lengths[:, None] / lengths)
+    if not sizes[0] > 0:
+        return np.inf, -np.inf
+    return float(np.sqrt(sizes[-1] / sizes[0])), float(np.sum(np.log(sizes)) + 2 * np.sum(np.log(lengths)))
+
+
+def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
+    """Standard errors after some motions over those after others, as many: their geometric mean over parameters."""
+    count = designs[0].information.shape[0]
+    return float(np.exp((together(others)[1] - together(designs)[1]) / (2 * count)))
+
+
+def as_trajectories(
+    designs: Sequence[Design], labels: Sequence[str], model: Model, parameters: Parameters, *, rate: float, needs: Needs
+) -> Trajectories:
+    """The motions at equal steps, from rest to rest, with the forces that the nominal model takes for them.
+
+    Args:
+        designs: of one period.
+        labels: a name for each.
+        model: of the parameters.
+        parameters: nominal ones.
+        rate: samples in a second.
+        needs: of the data, whose torques are with friction if the model's are.
+
+    Raises:
+        InputError: the rate is too low for the harmonics.
+    """
+    motions = [design.motion for design in designs]
+    for motion in motions:
+        require_sampling(period=motion.period, harmonics=motion.harmonics, rate=rate)
+    period = motions[0].period
+    t = np.linspace(0.0, period, round(period * rate) + 1)
+    q, qd, qdd = (np.concatenate(each) for each in zip(*(sampled(motion, t) for motion in motions), strict=True))
+    force = jax.jit(jax.vmap(dynamics(model.energies(parameters)).inverse_dynamics))
+    index = np.repeat(np.arange(len(motions)), len(t))
+    states = {"q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(force(q, qd, qdd))}
+    return Trajectories(t=np.tile(t, len(motions)), trajectory=index, label=np.array(labels), needs=needs, **states)

@@ -1,0 +1,154 @@
+"""What a motion shows of a model's parameters, and whether a robot can do it.
+
+With Phi the derivative of the model's force by its parameters, of which only independent columns ("base parameters")
+are kept, and the deviation of each joint's noise as weights, the information of one sample of a motion is on average
+
+    A = 1 / N sum over samples of Phiᵀ diag(1 / noise²) Phi,   so that least squares has the covariance A⁻¹ / N
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.identification.excitation.fourier import rest_basis
+from dln_jax.identification.excitation.limits import Clearance, Excess, MotionLimits, excess, require_limits
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.linearisation import linearised
+from dln_jax.models.model import Model, Parameters
+from dln_jax.precision import require_double_precision
+from dln_jax.types import InputError, require_positive, require_seed
+
+SAMPLES = 20
+"""Of the shortest period, where motions are designed."""
+DEPENDENT = 1e-2
+"""Part of a column that others do not explain, relative to it, up to which it is taken to depend on them: right angles
+that a file writes as 1.57 leave 8e-4 each."""
+NEGLIGIBLE = 1e-12
+"""Columns shorter than this times the longest are zeros that terms leave which cancel."""
+STATES = 300
+"""Random ones that tell which columns are independent."""
+
+
+class Task(NamedTuple):
+    """A model whose parameters are wanted, and what the motions that show them must keep to."""
+
+    observe: Callable[..., tuple[Array, Array, Excess]]
+    """(q, qd, qdd) -> of one state Phi [d, P], tau [d] and how far it is beyond the limits; differentiable."""
+    samples: Callable[..., tuple[Array, Array, Excess]]
+    """The same for `steps` states at once, compiled."""
+    steps: int
+    """N, samples of one period where motions are designed."""
+    columns: Int[np.ndarray, " B"]
+    """Places of the base parameters among all of the model's."""
+    noise: Float[np.ndarray, " d"]
+    limits: MotionLimits
+    period: float
+    """s."""
+    harmonics: int
+
+
+def make_task(
+    model: Model,
+    parameters: Parameters,
+    limits: MotionLimits,
+    *,
+    period: float = 20.0,
+    harmonics: int = 5,
+    clearance: Clearance | None = None,
+    noise: Any = 1.0,
+    dependent: float = DEPENDENT,
+    seed: int = 0,
+) -> Task:
+    """A task for a model whose force is linear in its parameters, such as `models.rigid_tree.make_rigid_tree`.
+
+    Friction with a sharp step at rest is best smoothed here, on a scale of velocities that motions pass slowly.
+
+    Args:
+        model: whose parameters the motions are to show.
+        parameters: nominal ones, which tell the forces that the limits are for.
+        limits: of joints.
+        period: of the motions, s.
+        harmonics: of their series, at least 2.
+        clearance: q -> [K], m, that are to stay positive.
+        noise: deviation of the measured force of each joint [d], or one for all; only their ratios matter.
+        dependent: as `DEPENDENT`; what shows by less is not designed for.
+        seed: of the states that tell the base parameters.
+
+    Raises:
+        InputError: limits that are absent, a setting out of range, or no parameter that shows.
+    """
+    require_double_precision("excitation")
+    limits = MotionLimits(*(np.asarray(each, float) for each in limits))
+    d = limits.velocity.size
+    require_limits(limits, d)
+    require_positive(period=period)
+    require_seed(seed)
+    rest_basis(harmonics)
+    deviation = np.broadcast_to(np.asarray(noise, float), (d,))
+    if not (deviation > 0).all():
+        raise InputError(f"noise is {noise}; expected positive numbers, one for each of the {d} joints or for all")
+    regressor, theta = linear_force(model, parameters)
+
+    def observe(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Excess]:
+        Phi = regressor(q, qd, qdd)
+        tau = Phi @ theta
+        return Phi, tau, excess(limits, clearance, q, qd, qdd, tau)
+
+    samples = jax.jit(jax.vmap(observe), compiler_options=quick_compilation())
+    random, steps, seen = np.random.default_rng(seed), SAMPLES * harmonics, []
+    for _ in range(-(-STATES // steps)):
+        q = random.uniform(limits.position[:, 0], limits.position[:, 1], (steps, d))
+        qd, qdd = (bound * random.uniform(-1, 1, (steps, d)) for bound in (limits.velocity, limits.acceleration))
+        seen.append(np.asarray(samples(q, qd, qdd)[0]).reshape(steps * d, -1))
+    columns = independent_columns(np.concatenate(seen), dependent=dependent)
+    if not columns.size:
+        raise InputError("no parameter of the model shows in its force; expected some that do")
+    return Task(observe, samples, steps, columns, deviation, limits, float(period), harmonics)
+
+
+def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Array], Float[np.ndarray, " P"]]:
+    """(q, qd, qdd) -> Phi [d, P], and theta, with tau = Phi theta.
+
+    The slope of a function of Phi by the state is that of d forces, with its slopes by the rows of Phi as parameters:
+    a third of the program that derivatives of derivatives would be.
+    """
+    theta, unravel = ravel_pytree(parameters)
+
+    def weighted_force(rows: Array, q: Array, qd: Array, qdd: Array) -> Array:
+        def force(row: Array) -> Array:
+            return dynamics(model.energies(unravel(row))).inverse_dynamics(q, qd, qdd)
+
+        return jnp.trace(jax.vmap(force)(rows))
+
+    @jax.custom_vjp
+    def regressor(q: Array, qd: Array, qdd: Array) -> Array:
+        return linearised(model, parameters, q, qd, qdd)[0]
+
+    def forward(*state: Array) -> tuple[Array, tuple[Array, ...]]:
+        return regressor(*state), state
+
+    def backward(state: tuple[Array, ...], rows: Array) -> tuple[Array, ...]:
+        return jax.grad(weighted_force, argnums=(1, 2, 3))(rows, *state)
+
+    regressor.defvjp(forward, backward)
+    return regressor, np.asarray(theta)
+
+
+def independent_columns(A: Float[np.ndarray, "N P"], *, dependent: float = DEPENDENT) -> Int[np.ndarray, " B"]:
+    """Places, sorted, of columns that are independent and explain all others, by QR with pivoting of scaled columns."""
+    from scipy.linalg import qr
+
+    lengths = np.linalg.norm(A, axis=0)
+    seen = np.flatnonzero(lengths > NEGLIGIBLE * lengths.max(initial=0.0))
+    if not seen.size:
+        return seen
+    factors: Any = qr(A[:, seen] / lengths[seen], mode="r", pivoting=True)
+    triangle, order = factors[-2:]
+    left = np.abs(np.diagonal(triangle))
+    return np.sort(seen[order[: len(left)][left > dependent * left[0]]])

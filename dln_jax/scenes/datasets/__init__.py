@@ -1,0 +1,25 @@
+"""Data that are generated from scenes, and the published tasks."""
+
+from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST
+from dln_jax.scenes.datasets.generators import characters, free_swing, uniform, uniform_tests
+from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
+from dln_jax.scenes.datasets.letters import LETTERS, LetterPath, letter_path
+from dln_jax.scenes.datasets.pendulum_frames import Frames, swinging_rod
+from dln_jax.scenes.datasets.phase_samples import Part, Task, reference_motion
+
+__all__ = [
+    "CHARACTERS_TEST",
+    "LETTERS",
+    "PROTOCOLS",
+    "Frames",
+    "LetterPath",
+    "Part",
+    "Task",
+    "characters",
+    "free_swing",
+    "letter_path",
+    "reference_motion",
+    "swinging_rod",
+    "uniform",
+    "uniform_tests",
+]

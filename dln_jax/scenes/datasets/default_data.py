@@ -1,0 +1,22 @@
+"""The data that scripts use when they are given none: generated once, then read from the cache."""
+
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories
+from dln_jax.files import cache_folder
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.scene import Scene
+
+CHARACTERS_TEST = ("e", "q", "v")
+"""Test letters of the published protocol."""
+
+_VERSION = 1  # of the generators' output; a change makes a new file instead of reading a stale one
+
+
+def default_data(scene: Scene) -> Trajectories:
+    """Letters for the two-link arm; for any other scene random states, which exercise every term."""
+    kind = "characters" if scene.name == "two-link-arm" else "uniform"
+    path = cache_folder() / f"{scene.name}-{kind}-{_VERSION}.npz"
+    if not path.exists():
+        data = generators.characters() if kind == "characters" else generators.uniform(scene)
+        schema.save(path, data, overwrite=True)  # two processes may generate at the same time: one rename wins
+    return schema.load(path)

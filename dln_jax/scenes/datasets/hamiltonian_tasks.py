@@ -1,0 +1,201 @@
+"""The data of Hamiltonian tasks: four published ones, the damped oscillators, and two with two coordinates.
+
+Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
+
+| task | H | trajectories x samples | t | starts | noise | test |
+|---|---|---|---|---|---|---|
+| `spring` | q² + p² | 50 x 30 | 0..3 | radius 0.1..1 of (q, p) | sd 0.1 on q and p | the second half |
+| `pendulum` | 3 (1 - cos q) + p² | 50 x 45 | 0..3 | radius 1.3..2.3 of (q, p) | sd 0.1 on q and p | the second half |
+| `two_body` | ½ p² - 1/r | 1000 x 50 | 0..20 | ±x, x in [0.5, 1.5]² | none | the first fifth |
+| `three_body` | ½ p² - sum 1/r_ij | 5000 x 20 | 0..5 | equilateral, 0.9..1.2 from the centre | none | the first fifth |
+
+Directions of (q, p), and of the triangle, are those of a point drawn in a square, so that diagonals are likelier. Two
+bodies start on a circular orbit with speeds times 1 + 0.05 normal; three with each component of each velocity times
+1 + 0.2 uniform(-1, 1), so that their centre drifts. All times are evenly spaced, both ends included.
+
+The convention of derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p beside them are
+noisy. The true field therefore misses them by the noise: with seed 0 its test loss is 3.82e-2 on the spring and
+3.56e-2 on the pendulum. What tells models apart is `field`, the exact field at the noisy point. Units are those of the
+table, with masses and G of one.
+
+Of this project, by the same conventions: `damped_spring` and `damped_pendulum` (the first two with a friction of 0.1 by
+velocity), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
+
+| task | starts | t |
+|---|---|---|
+| `henon_heiles` | within 0.25 of the centre, with an energy of 0.05..0.125 (it escapes from 1/6 on) | 0..10 |
+| `double_pendulum` | at rest, each angle within 1.2 rad of hanging | 0..2.5 |
+
+The draws are made in the published order from the generator that numpy keeps frozen, so that a seed gives the
+published starts and noise. The published motions were integrated to about 1e-6; here energies are constant to 1e-9.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.mechanics import hamiltonian
+from dln_jax.precision import in_float64
+from dln_jax.scenes.datasets.phase_samples import Task, make_task
+from dln_jax.scenes.double_pendulum import double_pendulum as double_pendulum_scene
+from dln_jax.scenes.n_body import n_body
+from dln_jax.scenes.oscillators import henon_heiles as henon_heiles_scene
+from dln_jax.scenes.oscillators import mass_spring
+from dln_jax.scenes.pendulum import pendulum as pendulum_scene
+from dln_jax.scenes.scene import Scene
+from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
+
+
+@in_float64
+def spring(
+    seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
+) -> Task:
+    """The mass on a spring, H = q² + p²: mass ½, stiffness 2; with `friction` (force by velocity) damped."""
+    scene = mass_spring(mass=0.5, stiffness=2.0, friction=friction)
+    return _oscillator(scene, _circle, _circle, 30, (0.1, 1.0), seed, trajectories, noise, tolerance)
+
+
+@in_float64
+def pendulum(
+    seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
+) -> Task:
+    """The pendulum, H = 3 (1 - cos q) + p²: mass ½, length 1, acceleration 6; with `friction` damped."""
+    scene = pendulum_scene(mass=0.5, length=1.0, acceleration=6.0, friction=friction)
+    return _oscillator(scene, _swing, _circle, 45, (1.3, 2.3), seed, trajectories, noise, tolerance)
+
+
+@in_float64
+def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-12) -> Task:
+    """Two bodies on orbits that are almost circular; q = (x1, y1, x2, y2), and p is the velocity."""
+    random = np.random.RandomState(seed)
+    starts = []
+    for _ in range(trajectories):
+        x = 0.5 + random.rand(2)
+        velocity = _turned(x, np.pi / 2) / (2 * np.hypot(*x) ** 1.5) * (1 + 0.05 * random.randn())
+        starts.append(([*x, *-x], [*velocity, *-velocity]))
+    return _without_noise(*_attracting(2), np.array(starts), np.linspace(0, 20, 50), tolerance)
+
+
+@in_float64
+def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e-12) -> Task:
+    """Three bodies that leave a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
+    random = np.random.RandomState(seed)
+    third = 2 * np.pi / 3
+    starts = []
+    for _ in range(trajectories):
+        direction = 2 * random.rand(2) - 1
+        radius = 0.9 + 0.3 * random.rand()
+        x = direction * radius / np.hypot(*direction)
+        # Each is pulled inward by 1 / (sqrt(3) radius²), which a circle takes at this velocity.
+        velocity = _turned(x, np.pi / 2) / (radius**1.5 * 3**0.25)
+        change = 1 + 0.2 * (2 * random.rand(3, 2) - 1)
+        q, p = (np.array([_turned(vector, k * third) for k in range(3)]) for vector in (x, velocity))
+        starts.append((q.ravel(), (change * p).ravel()))
+    return _without_noise(*_attracting(3), np.array(starts), np.linspace(0, 5, 20), tolerance)
+
+
+damped_spring = functools.partial(spring, friction=0.1)
+damped_pendulum = functools.partial(pendulum, friction=0.1)
+
+
+@in_float64
+def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+    """A unit mass in the well of Hénon and Heiles, on orbits that stay in it."""
+    scene, H = _system(henon_heiles_scene)
+    random = np.random.default_rng(seed)
+    angle, direction = random.uniform(0, 2 * np.pi, (2, trajectories))
+    radius = 0.25 * np.sqrt(random.uniform(size=trajectories))
+    q = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    kinetic = random.uniform(0.05, 0.125, trajectories) - np.asarray(jax.vmap(_potential(scene))(jnp.asarray(q)))
+    p = np.sqrt(2 * kinetic)[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return _without_noise(scene, H, np.stack([q, p], axis=1), np.linspace(0, 10, 50), tolerance)
+
+
+@in_float64
+def double_pendulum(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
+    """The double pendulum of 1 kg and 1 m, released from rest."""
+    q = np.random.default_rng(seed).uniform(-1.2, 1.2, (trajectories, 2))
+    starts = np.stack([q, np.zeros_like(q)], axis=1)
+    return _without_noise(*_system(double_pendulum_scene), starts, np.linspace(0, 2.5, 50), tolerance)
+
+
+def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarray, tolerance: float) -> Task:
+    return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
+
+
+# One object for each, by which compiled functions are found again.
+@functools.cache
+def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
+    scene = make()
+    # Exact in one step: the kinetic energy is quadratic.
+    return scene, hamiltonian.legendre(scene.lagrangian, iterations=1)
+
+
+@functools.cache
+def _attracting(n: int) -> tuple[Scene, Hamiltonian]:
+    scene = n_body(n)
+    potential = _potential(scene)
+    return scene, lambda q, p: 0.5 * jnp.sum(p**2) + potential(q)
+
+
+def _potential(scene: Scene) -> Potential:
+    if scene.potential is None:
+        raise InputError(f"{scene.name} has no potential; expected a scene with one")
+    return scene.potential
+
+
+def _circle(q: Vector, p: Vector) -> Scalar:
+    return jnp.sum(q**2 + p**2)
+
+
+def _swing(q: Vector, p: Vector) -> Scalar:
+    return jnp.sum(3 * (1 - jnp.cos(q)) + p**2)
+
+
+def _turned(vector: np.ndarray, angle: float) -> np.ndarray:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
+
+
+def _oscillator(
+    scene: Scene,
+    H: Hamiltonian,
+    published_energy: Hamiltonian,
+    samples: int,
+    radii: tuple[float, float],
+    seed: int,
+    trajectories: int,
+    noise: float,
+    tolerance: float,
+) -> Task:
+    if not noise >= 0:
+        raise InputError(f"noise is {noise}; expected a standard deviation, zero for none")
+    random = np.random.RandomState(seed)
+    starts, errors = [], []
+    for _ in range(trajectories):
+        direction = 2 * random.rand(2) - 1
+        radius = radii[0] + (radii[1] - radii[0]) * random.rand()
+        starts.append(direction * radius / np.hypot(*direction))
+        errors.append(noise * random.randn(2, samples))
+    half = trajectories // 2
+    t = np.linspace(0, 3, samples)
+    starts, errors = np.array(starts).reshape(-1, 2, 1), np.array(errors).reshape(-1, 2, samples, 1)
+    return make_task(scene, H, published_energy, starts, errors, t, slice(0, half), tolerance)
+
+
+Protocol = Callable[..., Task]
+"""(seed, *, trajectories, tolerance, ...) -> data."""
+PROTOCOLS: dict[str, Protocol] = {
+    "spring": spring,
+    "pendulum": pendulum,
+    "damped-spring": damped_spring,
+    "damped-pendulum": damped_pendulum,
+    "henon-heiles": henon_heiles,
+    "double-pendulum": double_pendulum,
+    "two-body": two_body,
+    "three-body": three_body,
+}
+"""By the names that command lines use."""

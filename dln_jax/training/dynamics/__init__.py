@@ -1,0 +1,1 @@
+"""Training models of a robot's torques: options, data, model, fit, evaluation."""

@@ -1,0 +1,119 @@
+"""--target: structured networks of growing size, until one is as accurate as asked; of those, the fastest."""
+
+import itertools
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax import learning
+from dln_jax.files import write_json
+from dln_jax.learning.engine.checkpoint import Checkpoint
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import Optimiser
+from dln_jax.learning.engine.problem import Training
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.precision import data_type
+from dln_jax.scale.mesh import of_first_process
+from dln_jax.time_limit import SOON
+from dln_jax.training.dynamics.results import latency_of
+from dln_jax.training.dynamics.task import Task
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import compiled
+
+WIDTHS = (4, 8, 16, 32)
+DEPTHS = (1, 2)
+
+
+class Candidate(NamedTuple):
+    """A network that was tried."""
+
+    width: int
+    depth: int
+    networks: int
+    """1 where factor and potential share one, else 2."""
+    parameters: int
+    validation_error: float
+    train_seconds: float
+    """Compilation included."""
+    one_step_us: float
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return f"{self.depth} x {self.width}, {'one network' if self.networks == 1 else 'two networks'}"
+
+
+def grow_to_target(
+    task: Task, optimiser: Optimiser, target: float, folder: Path, *, resume: bool, mesh: Mesh | None
+) -> tuple[Task, Training]:
+    """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
+
+    Chosen is the fastest that meets it, or, if none does, the most accurate. Writes `candidates.json` and a table.
+    """
+    tried: list[tuple[Candidate, Task, Training]] = []
+    enough: list[tuple[Candidate, Task, Training]] = []
+    kinds = list(itertools.product(DEPTHS, (True, False) if task.needs.gravity else (False,)))
+    ended = ""
+    for width in WIDTHS:
+        for depth, shared in kinds:
+            if tried and of_first_process(task.seconds <= SOON, mesh):
+                ended = f"out of time: networks of width {width} and more were not all tried"
+                break
+            description = {**task.description, "width": width, "depth": depth, "shared_trunk": shared}
+            tried.append(_try(task._replace(description=description), optimiser, folder, resume=resume, mesh=mesh))
+            candidate = tried[-1][0]
+            met = candidate.validation_error <= target
+            enough += tried[-1:] * met
+            verdict = "met" if met else "not met"
+            print(f"{candidate.name}: validation {candidate.validation_error:.2e}, target {verdict}")
+        if enough or ended:
+            break
+    if ended:
+        print(ended)
+    fastest = min(enough, key=lambda each: each[0].one_step_us, default=None)
+    chosen = fastest or min(tried, key=lambda each: each[0].validation_error)
+    write_json(folder / "candidates.json", {"candidates": [candidate._asdict() for candidate, *_ in tried]})
+    columns = ("network", "parameters", "validation error", "training, s", "one step, µs", "")
+    table = Table(*columns, title=f"grown until the validation error is {target:g}")
+    for each, *_ in tried:
+        numbers = f"{each.parameters:,}", f"{each.validation_error:.2e}", f"{each.train_seconds:.1f}"
+        verdict = "kept" if each == chosen[0] else "met" if each.validation_error <= target else ""
+        table.add_row(each.name, *numbers, f"{each.one_step_us:.1f}", verdict)
+    Console(highlight=False, soft_wrap=True).print(table)
+    if fastest is None:
+        print(f"no candidate meets {target:g}; kept is the most accurate. More --steps or --seconds may help")
+    return chosen[1], chosen[2]
+
+
+def _try(
+    task: Task, optimiser: Optimiser, folder: Path, *, resume: bool, mesh: Mesh | None
+) -> tuple[Candidate, Task, Training]:
+    """Trains one candidate and measures it."""
+    model, wanted = build(task.description), task.description
+    networks = 1 if wanted["shared_trunk"] else 2
+    name = f"checkpoint_{wanted['width']}x{wanted['depth']}_{networks}"
+    identity = learning.dynamics.identity_of(optimiser, task.sets, task.objective, seeds=task.seeds)
+    training = fit(
+        learning.dynamics.problem(model, task.sets, task.objective, seeds=task.seeds),
+        optimiser,
+        checkpoint=Checkpoint(folder, identity, resume, name),
+        seconds=task.seconds,
+        mesh=mesh,
+    )
+    system = compiled(dynamics(model.energies(training.parameters)), data_type(task.precision))
+    candidate = Candidate(
+        width=wanted["width"],
+        depth=wanted["depth"],
+        networks=networks,
+        parameters=sum(jnp.size(leaf) for leaf in jax.tree.leaves(training.parameters)),
+        validation_error=float(training.validation),
+        train_seconds=training.train_seconds + training.compile_seconds,
+        # By it a model is chosen, and in all processes the same.
+        one_step_us=of_first_process(latency_of(system, task, calls=2000).p50_us, mesh),
+    )
+    return candidate, task, training

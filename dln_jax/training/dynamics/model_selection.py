@@ -1,0 +1,224 @@
+"""--model auto: the ladder of models for these data, and the one that validation chooses."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax.sharding import Mesh
+from rich.console import Console
+from rich.table import Table
+
+from dln_jax.data.encoders.noise import noise_of
+from dln_jax.data.robots import Robot
+from dln_jax.data.splits import every
+from dln_jax.files import write_json
+from dln_jax.identification.identify import identify, parameters_of
+from dln_jax.identification.residual import fit_residual
+from dln_jax.learning.engine.problem import Training
+from dln_jax.learning.ladder import Climb, Fitted, Rung, Step, climb
+from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
+from dln_jax.learning.objectives import SCALED_TORQUE
+from dln_jax.mechanics.trees import tree_to_json
+from dln_jax.models.model import Model, Parameters
+from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
+from dln_jax.models.serial_tree import tree_of
+from dln_jax.time_limit import deadline, seconds_left
+from dln_jax.training.dynamics.direct_fits import fit_directly, training_of
+from dln_jax.training.dynamics.network import train
+from dln_jax.training.dynamics.options import NETWORK, ArmOptions, Options
+from dln_jax.training.dynamics.recorded import Recorded
+from dln_jax.training.dynamics.task import Task, needs_of_tree, task_of
+from dln_jax.training.identification.additions import with_network
+from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
+from dln_jax.zoo.descriptions import Description, build, describe
+
+LADDER_SECONDS, RUNG_SECONDS = 300.0, 120.0
+"""Of the whole ladder, and of one search or training of a network in it, where --seconds says nothing."""
+MOST_SAMPLES = 4_000
+"""That networks beside other models are fitted to."""
+EXPLICIT, KERNEL = "trigonometric", "trigonometric-kernel"
+BESIDE = "-residual"
+"""Behind the name of a model to which a network is added."""
+
+
+def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+    """The model that validation chooses, trained; prints the ladder, and writes it as `ladder.json`.
+
+    Devices of a mesh share the network of the last rung; the others are fits that one device does.
+
+    Raises:
+        InputError: no model could be fitted.
+    """
+    train_set, validation, _ = recorded.sets
+    needs = recorded.needs
+    if needs.friction:
+        # Every model has the same friction, so that none is better for that alone.
+        laws = needs.joint_friction or USUAL
+        recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
+        print(f"friction of every model: {', '.join(laws)} in each joint")
+    noise = noise_of(train_set.tau, train_set.trajectory)
+    found = climb(
+        _rungs(given, recorded, folder, mesh),
+        train_set,
+        validation,
+        noise=noise if np.isfinite(noise).all() and noise.all() else None,
+        seconds=LADDER_SECONDS if given.seconds is None else seconds_left(deadline(given.seconds)),
+        report=report,
+    )
+    print_ladder(found)
+    write_json(folder / "ladder.json", as_json(found))
+    return found.fitted.outcome
+
+
+def report(step: Step) -> None:
+    """Prints a rung as soon as it is done with."""
+    if not step.tried:
+        return
+    if step.nmse is None:
+        print(f"{step.name}: {step.reason}")
+    else:
+        worst = f"worst joint {step.nmse.max():.3g}"
+        print(f"{step.name}: validation nMSE {step.nmse.mean():.3g}, {worst}, {step.seconds:.1f} s")
+
+
+def print_ladder(found: Climb) -> None:
+    """The table of all rungs, and why the climb ended."""
+    title = "the ladder, by errors on validation motions"
+    table = Table("model", "nMSE, mean", "nMSE, worst joint", "s", "", title=title)
+    for step in found.steps:
+        numbers = ["", "", ""] if step.nmse is None else [f"{each:.2e}" for each in (step.nmse.mean(), step.nmse.max())]
+        if step.nmse is not None:
+            numbers.append(f"{step.seconds:.1f}")
+        said = "kept" if step is found.chosen else "not tried" if not step.tried else "none" * (step.nmse is None)
+        table.add_row(step.name, *numbers, said)
+    Console(highlight=False, soft_wrap=True).print(table)
+    if found.ended:
+        print(f"no further model was tried: {found.ended}")
+
+
+def as_json(found: Climb) -> dict[str, Any]:
+    """What `ladder.json` holds."""
+    rungs = []
+    for step in found.steps:
+        mean = None if step.nmse is None else float(step.nmse.mean())
+        joints = None if step.nmse is None else step.nmse.tolist()
+        errors = {"validation_nmse": mean, "validation_nmse_joints": joints}
+        rungs.append({"name": step.name, "tried": step.tried, **errors, "seconds": step.seconds, "reason": step.reason})
+    return {"kept": found.chosen.name, "ended": found.ended, "rungs": rungs}
+
+
+def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Rung]:
+    """Those that state most first."""
+    bases: dict[str, Fitted] = {}
+
+    def both(name: str, fit: Callable[[float], Fitted]) -> list[Rung]:
+        def base(left: float) -> Fitted:
+            bases[name] = fit(left)
+            return bases[name]
+
+        return [Rung(name, base), Rung(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left))]
+
+    def by_name(name: str) -> Callable[[float], Fitted]:
+        return lambda left: _by_name(name, given, recorded, folder, mesh, left)
+
+    robot = recorded.robot
+    known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
+    learned = both("learned-tree", by_name("learned-tree"))
+    first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
+    # A small basis is fitted in a second, a tree of unknown frames in half a minute.
+    small = second is not None and second <= MOST_PARAMETERS
+    explicit = (
+        both(EXPLICIT, by_name(EXPLICIT))
+        if first is not None and first <= MOST_PARAMETERS
+        else [Rung(EXPLICIT, _too_large(first))]
+    )
+    kernel = [] if small else both(KERNEL, by_name(KERNEL))
+    order = [known, explicit, learned, kernel] if small else [known, learned, explicit, kernel]
+    direct = [rungs[0] for rungs in order if rungs]
+    return [*direct, *(rung for rungs in order for rung in rungs[1:]), Rung(NETWORK, by_name(NETWORK))]
+
+
+def _too_large(size: int | None) -> Callable[[float], str]:
+    """A rung of no model."""
+    number = "too many" if size is None else f"{size:,}"
+    return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
+
+
+def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
+    """A model that `--model` names, as it would be trained alone."""
+    limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
+    own = dataclasses.replace(given, model=name)
+    task = task_of(own, recorded, checked=True, until=time.perf_counter() + limit)
+    if task.solver is None:
+        task, training = fit_directly(task, own)
+    else:
+        training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    return Fitted(build(task.description), training.parameters, (task, training))
+
+
+def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
+    """The robot's tree, identified as the command `identify` does."""
+    needs = recorded.needs
+    train_set, validation, _ = recorded.sets
+    began = time.perf_counter()
+    stated = {"needs": needs, "tree": tree_to_json(robot.tree), "velocity_scale": needs.velocity_scale}
+    description = describe("rigid-tree", precision="f64", **stated)
+    sets = Sets(train_set, validation, blocks=False)
+    case = with_description(Case(robot, robot.tree.names, sets, description, None, None, None, (), ()))
+    scale = given.velocity_scale if isinstance(given, ArmOptions) else None
+    case = with_shapes(scale, case)
+    found = identify(case.model, case.known, train_set, joints=robot.tree.joints)
+    kept = parameters_of(found.theta, case.known)
+    return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)
+
+
+def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitted | str:
+    """A network beside a model, if held-out motions ask for one."""
+    if base is None:
+        return "there is no model to add a network to"
+    began = time.perf_counter()
+    if base.outcome[0].kind == "learned-tree":
+        base = _as_rigid(base, recorded)
+    train_set, validation, _ = recorded.sets
+    thin = -(-len(train_set.t) // MOST_SAMPLES)
+    added = fit_residual(
+        base.model,
+        base.parameters,
+        recorded.needs,
+        every(train_set, thin),
+        validation,
+        seconds=min(left, RUNG_SECONDS),
+    )
+    if not added.settings:
+        return "no network makes it better on validation motions"
+    description = with_network(base.outcome[0].description, added)
+    return _as_training(recorded, description, added.model, added.parameters, time.perf_counter() - began)
+
+
+def _as_rigid(learned: Fitted, recorded: Recorded) -> Fitted:
+    """A learned tree as one of known frames."""
+    task: Task = learned.outcome[0]
+    needs, given, found = needs_of_tree(recorded.needs), task.description, learned.parameters
+    tree = tree_of(found, needs, parents=given["parents"], acceleration=given["acceleration"])
+    laws = USUAL if needs.friction else ()
+    description = describe(
+        "rigid-tree",
+        precision="f64",
+        needs=needs._replace(friction=False, joint_friction=laws),
+        tree=tree_to_json(tree),
+        velocity_scale=given["velocity_scale"],
+    )
+    parameters = RigidTreeParameters(found.inertias, found.armature, found.viscous, found.coulomb, found.offset)
+    return _as_training(recorded, description, build(description), parameters, 0.0)
+
+
+def _as_training(
+    recorded: Recorded, description: Description, model: Model, parameters: Parameters, seconds: float
+) -> Fitted:
+    """A fit as a task and its training, as those of models by name."""
+    task = Task(recorded, description["name"], description, SCALED_TORQUE, None, 0, math.inf)
+    return Fitted(model, parameters, (task, training_of(task, parameters, float("nan"), seconds)))

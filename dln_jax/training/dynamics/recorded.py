@@ -1,0 +1,177 @@
+"""The data that a command names, and what they need: of joints, friction, a robot's file or a sketch of it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dln_jax.cli.arguments import names_listed, refuse_given
+from dln_jax.cli.encoders import checked, fitted_torque, preparation, smoothed
+from dln_jax.cli.running import needs_from_option
+from dln_jax.data import schema
+from dln_jax.data.encoders import labels_of_parts
+from dln_jax.data.joints import with_joints
+from dln_jax.data.robots import Robot, read_robot
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
+from dln_jax.files import read_json
+from dln_jax.learning.kinematics.sketch import Sketch, sketch_from_json
+from dln_jax.models.rigid_tree import USUAL
+from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
+from dln_jax.scenes.registry import scene_named
+from dln_jax.scenes.scene import Scene
+from dln_jax.scenes.two_link_arm import two_link_arm
+from dln_jax.training.dynamics.options import AUTO, ArmOptions, Options
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.catalogue import entry_of
+
+USES = ("training", "validation", "the test")
+"""Of the parts of a split, in their order."""
+
+
+class Recorded(NamedTuple):
+    """The data that the arguments name, and what they need."""
+
+    name: str
+    sets: Split
+    scene: Scene | None
+    needs: Needs
+    needs_origin: str
+    said: tuple[str, ...]
+    """Where rates come from, and what is wrong with the data."""
+    cutoff: float | None
+    """Hz, of the filter that was applied to q; `None` without."""
+    robot: Robot | None
+    """Whose motions they are, where its file is given."""
+    parents: tuple[int, ...] | None
+    """Link that each hangs on, where that is given."""
+    sketch: Sketch | None
+    torque: str = "measured torques"
+    """That models are fitted to and their bands are of."""
+
+
+def read(given: Options) -> Recorded:
+    """Reads and checks the data and robot that the arguments name, before anything is written."""
+    scene = scene_named(given.scene) if given.scene else None
+    labels = tuple(given.test.split(",")) if given.test else None
+    if given.data is not None:
+        data, name = schema.load(given.data, rate=given.rate, units=given.units), str(given.data)
+    else:
+        scene = scene or two_link_arm()
+        data, name = default_data(scene), f"default data of {scene.name}"
+        if labels is None and scene.name == "two-link-arm":
+            labels = CHARACTERS_TEST
+    robot = robot_of(given)
+    if robot is not None:
+        data = with_joints(data, robot.tree.names)
+    needs, origin = stated_needs(given, scene, data, robot)
+    if needs.degrees_of_freedom != data.degrees_of_freedom:
+        raise InputError(
+            f"{origin} has {needs.degrees_of_freedom} joints, but {name} has {data.degrees_of_freedom}; make them agree"
+        )
+    if "tau" in data.estimated:
+        raise InputError(
+            f"{name}: there is no tau, which models of torques are fitted to; add the measured torques, or fit motions "
+            f"without applied forces by: python -m scripts.train_hnn_task --task measured --data {name}"
+        )
+    if robot is not None and needs.joints != robot.tree.joints:
+        raise InputError(
+            f"{origin} has joints {'-'.join(needs.joints)}, the robot {'-'.join(robot.tree.joints)}; make them agree"
+        )
+    data = data._replace(needs=needs)
+    rubbing = bool(needs.friction or needs.joint_friction)
+    cut = labels is None and len(np.unique(data.trajectory)) < LEAST_TRAJECTORIES
+    settled = (*["split"] * cut, *["friction"] * rubbing)
+    found = [] if given.data is None else checked(given, data, given.data, robot=robot, without=settled)
+    filtered = smoothed(given, data)
+    said = [*preparation(data, filtered), *found]
+    if filtered is not None:
+        data = filtered.data
+        labels = None if labels is None else labels_of_parts(data, labels)
+    recordings = len(np.unique(data.trajectory))
+    if cut and recordings < LEAST_TRAJECTORIES:
+        data = in_blocks(data, BLOCKS)
+    parents = parents_of(given, needs.degrees_of_freedom)
+    sets = split(data, test=labels, seed=given.seed)
+    if len(np.unique(data.trajectory)) > recordings:
+        counts = [f"{len(np.unique(part.trajectory))} for {use}" for part, use in zip(sets, USES, strict=True)]
+        which = "one recording" if recordings == 1 else f"{recordings} recordings"
+        said.append(f"{which}: cut into blocks of time, {', '.join(counts)}")
+    return Recorded(
+        name=name,
+        sets=sets,
+        scene=scene,
+        needs=needs,
+        needs_origin=origin,
+        said=tuple(said),
+        cutoff=None if filtered is None else filtered.cutoff,
+        robot=robot,
+        parents=parents,
+        sketch=sketch_of(given, needs.degrees_of_freedom, parents),
+        torque=fitted_torque(filtered),
+    )
+
+
+def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
+    """What the plant needs, and who says so: the command line, the scene, the file, the robot, or an assumption."""
+    needs, origin = _needs_and_origin(given, scene, data, robot)
+    scale = given.velocity_scale if isinstance(given, ArmOptions) else None
+    if scale is None:
+        return needs, origin
+    trees = given.model == AUTO or entry_of(str(given.model)).properties.searched
+    if not (needs.joint_friction or (trees and needs.friction)):
+        raise InputError(
+            "--velocity-scale is for dry friction of joints, which the needs do not state; "
+            'add --needs with "joint_friction", or leave it out'
+        )
+    return needs._replace(velocity_scale=scale), origin
+
+
+def _needs_and_origin(
+    given: Options, scene: Scene | None, data: Trajectories, robot: Robot | None
+) -> tuple[Needs, str]:
+    if given.needs is not None:
+        return needs_from_option(given.needs), "--needs"
+    if scene is not None:
+        return scene.needs, f"scene {scene.name}"
+    if data.needs is not None:
+        return data.needs, "the data file"
+    if robot is not None:
+        return robot.tree.needs._replace(joint_friction=USUAL), "the robot's file, and friction"
+    needs = Needs(joints=("revolute",) * data.degrees_of_freedom, joint_friction=USUAL)
+    return needs, "assumed: neither the file nor --needs says"
+
+
+def robot_of(given: Options) -> Robot | None:
+    """The robot of --robot."""
+    if not isinstance(given, ArmOptions) or given.robot is None:
+        if isinstance(given, ArmOptions):
+            refuse_given(given, ["hold"], "for joints of --robot")
+        return None
+    return read_robot(given.robot, hold=names_listed(given.hold))
+
+
+def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
+    """The parents of --parents, counted from 0 as everywhere else."""
+    if not isinstance(given, ArmOptions) or given.parents is None:
+        return None
+    try:
+        found = tuple(int(each) - 1 for each in given.parents.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != d or any(not -1 <= parent < link for link, parent in enumerate(found)):
+        raise InputError(
+            f"--parents is {given.parents!r:.60}; expected {d} whole numbers with commas between them, each of a joint "
+            "before, counted from 1, or 0 for the ground"
+        )
+    return found
+
+
+def sketch_of(given: Options, d: int, parents: tuple[int, ...] | None) -> Sketch | None:
+    """The sketch of --sketch."""
+    if not isinstance(given, ArmOptions) or given.sketch is None:
+        return None
+    try:
+        return sketch_from_json(read_json(given.sketch, remedy="see --help"), d, parents)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if str(given.sketch) in text else f"{given.sketch}: {text}") from None

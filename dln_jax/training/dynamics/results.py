@@ -1,0 +1,225 @@
+"""What a training of dynamics comes to: its test errors and speed, figures and tables."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from dln_jax import figures as drawing
+from dln_jax.data.schema import Trajectories
+from dln_jax.data.splits import merged
+from dln_jax.files import write_figure
+from dln_jax.learning.engine.problem import Training
+from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.definiteness import Definiteness, definiteness
+from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.latency import Latency, one_step
+from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
+from dln_jax.precision import data_type
+from dln_jax.training.dynamics.task import Task
+from dln_jax.training.dynamics.uncertainty import uncertainty_metrics
+from dln_jax.training.dynamics.verdict import Judged, judge_torques
+from dln_jax.training.results import cost_metrics, print_numbers, unit_of
+from dln_jax.types import InputError
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import load
+
+SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
+"""Of the seeds' test errors."""
+CEILINGS = {
+    "vpt_seconds": "vpt_ceiling_seconds",
+    "vpt_interpolated_seconds": "vpt_ceiling_interpolated_seconds",
+    "normalised_state_error": "normalised_state_error_ceiling",
+    "energy_error_j": "energy_error_ceiling_j",
+}
+"""Metrics of a rollout, and the names of what the true plant gets."""
+MEANINGS = {
+    "torque_mse": "torque, mean square error",
+    "test_nmse": "torque, error over variance, mean of joints",
+    "validation_nmse": "the same, on validation motions",
+    "zero_nmse": "the same, of a guess of zero",
+    "noise_nmse": "the same, of the noise of the torques",
+    "file_nmse": "the same, of the robot's file",
+    "forward_mse": "acceleration, mean square error",
+    "validation_error": "validation error, sum over joints",
+    "power_mse": "power, mean square error",
+    "inertial_mse": "inertial force, mean square error",
+    "coriolis_mse": "Coriolis force, mean square error",
+    "gravity_mse": "gravity force, mean square error",
+    "smallest_mass_eigenvalue": "smallest eigenvalue of the mass matrix",
+    "share_not_definite": "states where the mass matrix is not definite",
+    "largest_condition_number": "largest condition number of the mass matrix",
+    "verdict": "verdict: 0 good, 1 doubtful, 2 refused",
+    "coverage_95_share": "torques within the 95 % band",
+    "coverage_95_worst_joint_share": "the same, at the joint furthest from 95 %",
+    "outside_share": "states outside the training data",
+    "vpt_seconds": "valid prediction time, torque held",
+    "vpt_interpolated_seconds": "valid prediction time, torque interpolated",
+    "rollout_seconds": "duration of a test motion",
+    "normalised_state_error": "state error of a rollout, in standard deviations",
+    "energy_error_j": "energy balance error of a rollout",
+    "one_step_p50_us": "one call of the inverse model, median",
+    "one_step_p99_us": "one call of the inverse model, 99 %",
+    "one_step_low_latency_p50_us": "one call in low-latency mode, median",
+    "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
+}
+"""Of the metrics' names; others say it themselves."""
+
+
+def evaluate(
+    folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
+) -> tuple[dict[str, float | int], Judged]:
+    """Loads the stored model as a user would, measures it on the test trajectories, judges it, and draws it."""
+    dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
+    functions, model = run.dynamics, build(task.description)
+    predicted = predictions(run.energies, test, dtype, mesh=mesh)
+    latency = latency_of(functions, task)
+    if figures:
+        draw(folder, task, training, functions, predicted)
+    spread = {}
+    if seeds > 1:
+        models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
+        of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
+        spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
+    judged = judge_torques(run.energies, task, predicted["tau"], mesh=mesh)
+    return {
+        **errors(predicted, test),
+        **judged.metrics,
+        **spread,
+        **definiteness_metrics(functions, task),
+        **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
+        **rollouts(functions, task),
+        **validation_metrics(training, seeds, task.best),
+        **cost_metrics(
+            training,
+            latency,
+            parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
+            best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
+        ),
+    }, judged
+
+
+def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
+    """Parameters and index of the chosen seed, by default the one with the lowest validation error."""
+    if seeds == 1:
+        return training.parameters, 0
+    if best is None or not np.isfinite(training.validation[best]):
+        best = int(np.argmin(np.nan_to_num(training.validation, nan=np.inf)))
+    return parameters_of(training, best), best
+
+
+def validation_metrics(training: Training, seeds: int, best: int | None) -> dict[str, float]:
+    """The validation error of the model that is kept."""
+    errors = np.ravel(training.validation)
+    return {"validation_error": float(errors[best_seed(training, seeds, best)[1]])} if training.history else {}
+
+
+def parameters_of(training: Training, index: int) -> Any:
+    """Parameters of one of several seeds."""
+    return jax.tree.map(lambda leaf: leaf[index], training.parameters)
+
+
+def latency_of(functions: Dynamics | PlainDynamics, task: Task, *, calls: int = 5000) -> Latency:
+    """Of one inverse-dynamics call."""
+    states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
+    return one_step(functions.inverse_dynamics, states, calls=calls)
+
+
+def latency_states(task: Task) -> tuple[np.ndarray, ...]:
+    """q, qd and qdd of the test, in the precision of the model."""
+    test, dtype = task.sets.test, data_type(task.precision)
+    return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
+
+
+def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
+    """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
+    properties = CATALOGUE[task.kind].properties
+    if properties.definite or not properties.energy:
+        return None
+    return definiteness(functions, data.q, data.qd)
+
+
+def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
+    """What the mass matrices of a model without structure are like on the test."""
+    found = definiteness_of(functions, task, task.sets.test)
+    names = {"smallest_eigenvalue": "smallest_mass_eigenvalue"}
+    return {} if found is None else {names.get(key, key): value for key, value in found._asdict().items()}
+
+
+def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
+    """Valid prediction times on the test, and the true plant's as their ceiling where the scene is known.
+
+    None for independent states, which are no motion.
+    """
+    test = task.sets.test
+    if len(np.unique(test.trajectory)) == len(test.t):
+        return {}
+    try:
+        found = rollout_metrics(functions, test, dtype=data_type(task.precision))
+    except InputError as error:
+        # The model is trained: what its test cannot tell is left out, not refused.
+        print(f"no rollouts: {error}")
+        return {}
+    if task.scene is None:
+        return found
+    plant = rollout_metrics(dynamics(task.scene.energies), test)
+    return {**found, **{ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}}
+
+
+def draw(
+    folder: Path, task: Task, training: Training, functions: Dynamics | PlainDynamics, predicted: dict[str, np.ndarray]
+) -> None:
+    """Writes what there is to draw."""
+    test = task.sets.test
+    write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
+    if training.history and task.solver is not None:
+        torque = task.objective.selects_by == "torque"
+        units = {} if torque else {"error": "loss (normalised)", "unit": "loss, in units of the data's spread"}
+        best = int(np.max(training.best_step))
+        write_figure(folder / "training.png", drawing.training_curve(training.history, best_step=best, **units))
+    if task.scene is not None and task.scene.tip is not None:
+        moving = len(np.unique(test.trajectory)) < len(test.t)
+        dtype = data_type(task.precision)
+        found = recorded_motions(functions, test, torques=["interpolated"], dtype=dtype) if moving else {}
+        motions, every = found.get("interpolated", []), merged(task.sets)
+        paths = drawing.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
+        write_figure(folder / "tip_paths.png", paths)
+
+
+def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
+    """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
+    force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
+    units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
+    units |= {key: "1" for key in metrics if key.endswith("_nmse")}
+    units |= {"power_mse": "W²", "forward_mse": "(1/s²)²", "energy_error_j": "J", "normalised_state_error": "1"}
+    units["validation_error"] = f"({force})²" if task.objective.selects_by == "torque" else "1"
+    known = any(ceiling in metrics for ceiling in CEILINGS.values())
+    rows = []
+    for key, value in metrics.items():
+        if key not in CEILINGS.values() and key != "verdict":
+            ceiling = metrics.get(CEILINGS.get(key, ""))
+            beside = ["" if ceiling is None else number(key, ceiling)] * known
+            rows.append((MEANINGS.get(key, key.replace("_", " ")), number(key, value), *beside, unit_of(key, units)))
+    calls = f"{1e6 / metrics['one_step_p50_us']:,.0f}"
+    rows.append(("calls of the inverse model", calls, *[""] * known, "1/s"))
+    columns = ("quantity", "value", *["true plant"] * known, "unit")
+    print_numbers(rows, title=f"test on {task.name}, {task.precision}", columns=columns)
+
+
+def number(metric: str, value: int | float) -> str:
+    """As a user wants to see it."""
+    if isinstance(value, int):
+        return f"{value:,}"
+    tiny = any(word in metric for word in ("_mse", "_nmse", "error", "eigenvalue", "condition"))
+    return (
+        f"{value:.2e}"
+        if tiny
+        else f"{value:,.2f}"
+        if "share" in metric or metric.startswith("vpt")
+        else f"{value:,.1f}"
+    )

@@ -1,0 +1,130 @@
+"""Whether a trained model of dynamics may be used: its torques in motions that it was not fitted to, and its search."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.encoders import torque_noise
+from dln_jax.data.robots import Robot
+from dln_jax.data.schema import Trajectories
+from dln_jax.mechanics.equations import Driven, dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.trees import tree_system
+from dln_jax.metrics.errors import predictions
+from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.precision import data_type
+from dln_jax.training.dynamics.options import Options
+from dln_jax.training.dynamics.task import Task
+
+AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
+"""Held-out errors of a tree of unknown frames, in units of the noise's variance: up to the first its frames are right,
+above the second they may be wrong."""
+
+
+class Judged(NamedTuple):
+    """A verdict, and the numbers that it rests on."""
+
+    verdict: Verdict | None
+    """`None` for a model that is not fitted to torques alone."""
+    metrics: dict[str, float | int]
+    """Entries of metrics.json."""
+    validation_nmse: float
+    """Mean over joints of the squared error over the torque's variance."""
+
+
+def judge_torques(energies: Driven, task: Task, predicted: np.ndarray, *, mesh: Mesh | None) -> Judged:
+    """The graver verdict of the test and the validation motions, and of what a search for joint frames says of itself.
+
+    Args:
+        energies: the trained model.
+        task: its data.
+        predicted: its torques in the test motions [N, d].
+        mesh: devices that share the samples.
+    """
+    if not task.objective.of_torques:
+        return Judged(None, {}, float("nan"))
+    test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
+    of_validation = predictions(energies, validation, data_type(task.precision), mesh=mesh)["tau"]
+    noise = torque_noise(task.sets.train)
+    on_test, on_validation = (
+        held_out(tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data))
+        for tau, data in ((predicted, test), (of_validation, validation))
+    )
+    names = None if robot is None else robot.tree.names
+    verdict, numbers = worst(judge(on_test, names), judge(on_validation, names)), {}
+    if task.search is not None:
+        of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, on_test)
+        verdict = verdict if of_search is None else worst(verdict, of_search)
+    nmse = {"test_nmse": _nmse(on_test), "validation_nmse": _nmse(on_validation)}
+    return Judged(verdict, {**nmse, **verdict_metrics(on_test, verdict), **numbers}, nmse["validation_nmse"])
+
+
+def say(judged: Judged) -> None:
+    """Prints the verdict, and in words an error that is no better than that of a constant torque."""
+    if judged.verdict is None:
+        return
+    if not judged.validation_nmse <= 1:
+        print(
+            f"warning: on validation motions the torque's mean square error is {judged.validation_nmse:.3g} times its "
+            "variance: a constant torque would be closer than this model"
+        )
+    print(judged.verdict.line)
+
+
+def refuse(judged: Judged, task: Task, given: Options) -> None:
+    """Raises `FitRefused` for a model that must not be used.
+
+    There is one exception: a network whose training ended at the user's own --steps or --seconds may be trained on. The
+    command then says so and succeeds.
+    """
+    if judged.verdict is None or judged.verdict.level != "refused":
+        return
+    if task.solver is None or (given.steps is None and given.seconds is None):
+        raise FitRefused(judged.verdict)
+    print(
+        "warning: refused, but training ended at your own --steps or --seconds, so the exit status is 0; "
+        "train longer before you use this model"
+    )
+
+
+def _nmse(found: HeldOut) -> float:
+    return float(np.mean(found.error / found.unit))
+
+
+def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
+    """Torques [N, d] of the robot as its file describes it, friction included."""
+    motion = dynamics(tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb)))
+    every = jax.jit(jax.vmap(motion.inverse_dynamics), compiler_options=quick_compilation())
+    return np.asarray(every(data.q, data.qd, data.qdd))
+
+
+def searched(
+    losses: np.ndarray, agreeing: int, agreement: int, found: HeldOut
+) -> tuple[Verdict | None, dict[str, float | int]]:
+    """What a search for joint frames says of itself: whether descents agree, and how far from the noise they end.
+
+    Args:
+        losses: of all descents.
+        agreeing: descents that reached the lowest.
+        agreement: how many the search wanted to.
+        found: errors on held-out motions.
+    """
+    numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}
+    above = None
+    if found.noise is not None and (found.noise > 0).all():
+        above = float(np.mean(found.error / found.noise))
+        numbers |= {"error_over_noise": above}
+        if above <= AT_NOISE:
+            return None, numbers
+    if agreeing < agreement:
+        reason = f"only {agreeing} of {len(losses)} descents reached the lowest loss, so a lower one may exist"
+        remedy = "try another --seed, more --seconds or a --sketch of the arm"
+        return Verdict("doubtful", reason, remedy), numbers
+    if above is not None and above > FAR_FROM_NOISE:
+        reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
+        remedy = "record more and different motions, or add a --sketch; friction that the tree lacks looks the same"
+        return Verdict("doubtful", reason, remedy), numbers
+    return None, numbers

@@ -1,0 +1,1 @@
+"""Training differential networks on functions."""

@@ -1,0 +1,238 @@
+"""Which model a Hamiltonian task gets, by name or chosen by validation, and the description that builds it."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from dln_jax.data.bodies import Order, arrangements, find_bodies
+from dln_jax.data.schema import Trajectories, column
+from dln_jax.data.splits import hold_out
+from dln_jax.learning import accelerations, growth
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.growth import grow
+from dln_jax.learning.rates import match_linear
+from dln_jax.training.hamiltonian.measurements import MEASURED, forces_of
+from dln_jax.training.hamiltonian.recipes import RECIPES
+from dln_jax.training.hamiltonian.stages import IN_VELOCITIES, LINEAR, first_problem, in_velocities
+from dln_jax.training.hamiltonian.tasks import Problem
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.catalogue import CATALOGUE, entry_of
+from dln_jax.zoo.descriptions import build, describe_for
+
+MODELS = ("black-box-hnn", "phase-network")
+"""Of every task in the table, beside the one that suits the scene."""
+PAIRWISE, HELMHOLTZ = "pairwise-hnn", "helmholtz-hnn"
+POLYNOMIAL = "polynomial-hamiltonian"
+"""Of tasks with one coordinate and without friction, beside."""
+DEGREES = range(2, 7)
+FRICTION_WIDTH = 4
+"""Hidden units of the friction, where a scene has it; the model that is one network has one coefficient."""
+VALIDATION_SHARE = 0.15
+"""Of the trajectories for training."""
+EXACT = 1e-8
+"""Of the mean square of measured rates: what leaves no more of them needs no other model, and no fit of motions."""
+TRIED_DEGREES = (2, 4)
+"""Of a polynomial, where the model is to be chosen, too."""
+TRIAL_STEPS = 20
+"""Iterations of Gauss-Newton by which candidates are compared."""
+MOST_POLYNOMIAL = 2
+"""Coordinates up to which a polynomial is tried: its terms grow with their power."""
+
+
+class Candidate(NamedTuple):
+    """A model that may suit measurements."""
+
+    name: str
+    needs: Needs
+    keywords: Mapping[str, Any] = MappingProxyType({})
+
+    @property
+    def words(self) -> str:
+        """Its name, and what tells it from others of that name."""
+        more = [f"{key} {value}" for key, value in self.keywords.items() if key != "friction_width"]
+        return ", ".join([self.name, *more, *(["with friction"] if self.needs.friction else [])])
+
+
+def models_of(task: str) -> tuple[str, ...]:
+    """The models that the table gives a task to; the first is what suits the scene."""
+    every = (RECIPES[task].suits, *MODELS)
+    return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
+
+
+def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
+    """The description of a model for a task, "auto" for what suits the scene.
+
+    `keywords` (width, depth, activation, degree, coordinates, order) replace the recipe's. What suits measurements is
+    chosen by `choose_model`.
+    """
+    recipe = RECIPES[problem.name]
+    if model == "auto" and problem.name == MEASURED:
+        return choose_model(problem, precision=precision, **keywords)
+    suits = model in ("auto", recipe.suits)
+    name = recipe.suits if suits else model
+    if problem.noise is not None and name in LINEAR:
+        own = {key: value for key, value in keywords.items() if value is not None and key in LINEAR[name]}
+        return describe_for(name, problem.fitted, problem.needs, precision=precision, **own)
+    if not (entry_of(name).properties.canonical or (problem.noise is not None and name in IN_VELOCITIES)):
+        known = ", ".join(name for name, entry in CATALOGUE.items() if entry.properties.canonical)
+        raise InputError(f"model '{name}' is of no phase space; choose from auto, {known}")
+    stated: dict[str, Any] = {"precision": precision, "pooled": True}
+    if name == POLYNOMIAL:
+        degree = keywords.get("degree") or polynomial_degree(problem)
+        return describe_for(name, problem.fitted, problem.needs, **stated, degree=degree)
+    bodies = stated_bodies(problem, keywords.get("order")) if name == PAIRWISE else {}
+    few = (recipe.width, recipe.depth) if suits or problem.name == MEASURED else (recipe.network, recipe.network_depth)
+    size: dict[str, Any] = {"width": few[0], "depth": few[1], "activation": "tanh"}
+    if name == HELMHOLTZ and keywords.get("field"):
+        size["field"] = keywords["field"]
+    size |= {key: value for key, value in keywords.items() if value is not None and key in size}
+    if problem.needs.friction and name in ("separable-hnn", "structured-hnn"):
+        size["friction_width"] = keywords.get("friction_width", FRICTION_WIDTH)
+    if name == PAIRWISE and "alike" in keywords:
+        bodies["alike"] = keywords["alike"]
+    return describe_for(name, problem.fitted, problem.needs, **stated, **size, **bodies)
+
+
+def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
+    """How a pairwise model is to read the coordinates: what is stated, or what balances the measured forces.
+
+    Raises:
+        InputError: measurements that decide neither, and nothing was stated.
+    """
+    if problem.name != MEASURED:
+        return {} if order is None else {"order": order}
+    if set(problem.needs.joints) != {"prismatic"} or not arrangements(problem.needs.degrees_of_freedom):
+        return {}  # for the model itself to refuse
+    found = find_bodies(forces_of(problem.fitted), order=order)
+    if found is None:
+        raise InputError(
+            f"the forces along {problem.needs.degrees_of_freedom} coordinates do not show which of them belong to one "
+            "body; state --order bodies (x1, y1, x2, y2) or --order axes (x1, x2, y1, y2), or take another model"
+        )
+    return found._asdict()
+
+
+def polynomial_degree(problem: Problem) -> int:
+    """The degree that the validation trajectories call enough."""
+    fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
+
+    def fit(degree: int):
+        description = describe_for(POLYNOMIAL, fitted, problem.needs, precision="f64", degree=degree)
+        return match_linear(build(description), fitted, validation=validation)
+
+    return grow(DEGREES, fit)[0].candidate
+
+
+def choose_model(
+    problem: Problem,
+    *,
+    networks: bool = False,
+    seconds: float = math.inf,
+    report: Callable[[str], None] | None = None,
+    **keywords: Any,
+) -> dict[str, Any]:
+    """The smallest model of measurements whose errors of validation rates no other's betters significantly.
+
+    Args:
+        problem: measured motions.
+        networks: whether only networks are to be chosen from.
+        seconds: after which no other model is tried.
+        report: called with one line for each model that was tried, or why none was.
+        keywords: as for `description_of`.
+    """
+    began = time.perf_counter()
+    say = report or (lambda line: None)
+    every = candidates(problem, networks)
+    parts = hold_out(problem.fitted, VALIDATION_SHARE, 0)
+
+    def described(candidate: Candidate) -> dict[str, Any]:
+        narrowed = problem._replace(needs=candidate.needs)
+        return description_of(narrowed, candidate.name, **keywords | dict(candidate.keywords))
+
+    def attempt(candidate: Candidate) -> tuple[dict[str, Any], np.ndarray]:
+        description = described(candidate)
+        errors = validation_errors(problem, description, parts)
+        share = float(np.mean(errors)) / mean_square_rates(problem, description, parts[1])
+        say(f"auto: {candidate.words} leaves {share:.2g} of the mean square of validation rates")
+        return description, errors
+
+    if len(every) == 1:
+        found = described(every[0])
+        if rates_are_biased(problem):
+            say(
+                f"auto: {every[0].words}; the states are noisy, so that errors of rates cannot rank models: "
+                f"try --model {POLYNOMIAL} as well"
+            )
+        return found
+    target = EXACT * mean_square_rates(problem, described(every[-1]), parts[1])
+
+    def in_time() -> Iterator[Candidate]:
+        for at, each in enumerate(every):
+            if at and time.perf_counter() - began >= seconds:
+                say(f"auto: out of time, not tried: {'; '.join(other.words for other in every[at:])}")
+                return
+            yield each
+
+    return grow(in_time(), attempt, target=target)[0].outcome
+
+
+def rates_are_biased(problem: Problem) -> bool:
+    """Whether measured rates stand beside states whose noise a fit of rates would take for the field."""
+    return problem.noise is None and problem.trust is not None and not problem.trust.free_of_noise
+
+
+def candidates(problem: Problem, networks: bool) -> list[Candidate]:
+    """The models that may suit measurements, in order of size.
+
+    Bodies whose forces balance are pairs. Models of accelerations are compared for data without momenta, and models of
+    rates for those with: but not where noise of the states biases all of them, the more flexible ones the least.
+    """
+    needs, d = problem.needs, problem.needs.degrees_of_freedom
+    free = needs._replace(friction=False)
+    if set(needs.joints) == {"prismatic"} and not needs.friction and find_bodies(forces_of(problem.fitted)):
+        return [Candidate(PAIRWISE, needs, {"alike": alike}) for alike in (True, False)]
+    if problem.noise is not None:
+        chain = ["planar-chain"] if set(needs.joints) == {"revolute"} else []
+        names = ["structured-hnn"] if networks else [*chain, "trigonometric", "structured-hnn"]
+        return [Candidate(name, needs) for name in names]
+    if rates_are_biased(problem):
+        # Friction that is only assumed is one coefficient for each coordinate.
+        friction = {"friction_width": 0} if problem.assumed else {}
+        return [Candidate("separable-hnn" if d == 1 else "structured-hnn", needs, friction)]
+    found = [Candidate(name, needs) for name in ("separable-hnn", "structured-hnn")]
+    if networks or d > MOST_POLYNOMIAL or (needs.friction and not problem.assumed):
+        return found
+    return [*(Candidate(POLYNOMIAL, free, {"degree": degree}) for degree in TRIED_DEGREES), *found]
+
+
+def validation_errors(
+    problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories]
+) -> np.ndarray:
+    """Squared errors of validation rates after a short fit: of samples, or of stretches of time for estimated rates."""
+    if description["name"] == POLYNOMIAL:
+        return match_linear(build(description), parts[0], validation=parts[1])[1]
+    task = first_problem(problem, description, parts, 0)
+    found = fit(task, GaussNewton(steps=TRIAL_STEPS), must_start=False)
+    residual = task.residual
+    assert residual is not None
+    keys = accelerations.KEYS if in_velocities(problem, description) else ("q", "p", "qd", "pd")
+    arrays = tuple(column(parts[1], key) for key in keys)
+    left = jax.jit(jax.vmap(lambda *sample: residual(found.parameters, *sample)))(*arrays)
+    errors = np.sum(np.asarray(left) ** 2, axis=1)
+    if not in_velocities(problem, description):
+        return errors
+    numbers = growth.stretches(parts[1])
+    return np.bincount(numbers, errors) / np.bincount(numbers)
+
+
+def mean_square_rates(problem: Problem, description: dict[str, Any], data: Trajectories) -> float:
+    """What the errors of a fit of rates are to be compared with: those of a model that stands still."""
+    if in_velocities(problem, description):
+        return float(data.degrees_of_freedom)  # `accelerations` divides by the spread
+    return float(np.mean(np.concatenate([data.qd, column(data, "pd")]) ** 2))

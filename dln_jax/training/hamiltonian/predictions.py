@@ -1,0 +1,109 @@
+"""What a trained Hamiltonian model predicts of a problem's motions: errors, times and the figure."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from dln_jax.figures.phase_space import Field, motion_figure
+from dln_jax.figures.style import TRUTH
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.measured_predictions import on_grid, padded, predict_measured, prediction_metrics
+from dln_jax.metrics.phase_space import Motions, energies, field_errors, field_rates, motion_errors, predict
+from dln_jax.models.model import Model, Parameters
+from dln_jax.training.hamiltonian.stages import in_velocities
+from dln_jax.training.hamiltonian.tasks import MEASURED, WINDOW, Problem
+from dln_jax.training.hamiltonian.training import Trained
+from dln_jax.zoo.descriptions import build
+
+SUBSTEPS = 4
+"""Of RK4 between two samples of a measured motion."""
+
+
+class Seen(NamedTuple):
+    """What a figure shows of a model."""
+
+    motions: Motions
+    """The first entry of the problem's, as predicted."""
+    rates: Field
+
+
+def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen, list[Motions]]:
+    """Errors and times of one run, what a figure shows of it, and the motions that it predicts."""
+    model, parameters = build(trained.description), trained.result.parameters
+    predicted, rates = predicted_motions(problem, trained), partial(field_rates, model, parameters)
+    if in_velocities(problem, trained.description):
+        rates = partial(velocity_field, model, parameters)
+    numbers = motion_errors(predicted, problem.truth, problem.energy, published_energy=problem.published_energy)
+    if problem.tests is not None:
+        numbers |= predicted_times(problem, trained)
+    if problem.train is not None and problem.test is not None:
+        fitted, tested = (field_errors(model, parameters, part) for part in (problem.train, problem.test))
+        numbers["train_loss"], numbers["test_loss"] = fitted["loss"], tested["loss"]
+        numbers["clean_field_mse"] = tested["clean_field_mse"]
+    for name in ("train_seconds", "compile_seconds"):
+        numbers[name] = sum(getattr(fit, name) for fit in trained.fits.values())
+    numbers["parameters"] = float(sum(leaf.size for leaf in jax.tree.leaves(parameters)))
+    return numbers, Seen(predicted[0], rates), predicted
+
+
+def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
+    """The problem's motions from their first states, whose momenta are velocities where a model has its own."""
+    model, parameters = build(trained.description), trained.result.parameters
+    if in_velocities(problem, trained.description):
+        given = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
+        fitted = min(WINDOW[MEASURED], *(len(true.t) - 1 for true in problem.truth))
+        moved = predict_measured(model, parameters, given, fitted=fitted, substeps=SUBSTEPS)
+        kept = [np.flatnonzero(weight) for weight in given.weight]
+        pairs = zip(problem.truth, moved.q, moved.qd, kept, strict=True)
+        return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
+    # Times of one length, so that one program predicts all.
+    longest = max(len(true.t) for true in problem.truth)
+    times = [np.pad(true.t, (0, longest - len(true.t)), mode="edge") for true in problem.truth]
+    return [
+        first_samples(predict(model, parameters, true.q[:, 0], true.p[:, 0], t), len(true.t))
+        for true, t in zip(problem.truth, times, strict=True)
+    ]
+
+
+def first_samples(motions: Motions, count: int) -> Motions:
+    """The first samples of each motion."""
+    return Motions(motions.t[:count], motions.q[:, :count], motions.p[:, :count])
+
+
+def predicted_times(problem: Problem, trained: Trained) -> dict[str, float]:
+    """For how long measured motions are predicted right, whose starts are fitted to one window."""
+    assert problem.tests is not None
+    model, fitted = build(trained.description), WINDOW[MEASURED]
+    known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(problem, trained.description)}
+    predicted = predict_measured(model, trained.result.parameters, problem.tests, **known)
+    variance = problem.fitted.q.var(axis=0)
+    return prediction_metrics(problem.tests, predicted, fitted=fitted, variance=np.where(variance > 0, variance, 1.0))
+
+
+def velocity_field(
+    model: Model, parameters: Parameters, q: np.ndarray, qd: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(qd, qdd) of states, without torques."""
+    accelerate = dynamics(model.energies(parameters)).forward_dynamics
+    qdd = jax.jit(jax.vmap(lambda q, qd: accelerate(q, qd, 0 * q)))(q, qd)
+    return np.asarray(qd), np.asarray(qdd)
+
+
+def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:
+    """The figure of a task: the first motion as each model has it, and its energy, or that of the first coordinate."""
+    motions = {TRUTH: problem.truth[0], **{name: each.motions for name, each in seen.items()}}
+    fields = {name: each.rates for name, each in seen.items()}
+    H = problem.energy
+    heights = {name: each.q[:, :, 0] if H is None else energies(H, each) for name, each in motions.items()}
+    quantity = "q1" if H is None else "true energy"
+    return motion_figure(motions, heights, fields=fields, quantity=quantity, units=units_of(problem))
+
+
+def units_of(problem: Problem) -> tuple[str, str, str]:
+    """Of the first coordinate, of its momentum, and of what the task's figure shows over time."""
+    of_q, of_p = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}[problem.needs.joints[0]]
+    return (of_q, of_p, "J") if problem.energy is not None else (of_q, f"{of_q}/s", of_q)

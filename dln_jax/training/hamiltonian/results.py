@@ -1,0 +1,101 @@
+"""Numbers and figures of a Hamiltonian training: what metrics.json holds, in words, and what is drawn."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dln_jax.data.magnitudes import spread
+from dln_jax.data.schema import column
+from dln_jax.figures import animations
+from dln_jax.figures.style import TRUTH
+from dln_jax.figures.training import training_curve
+from dln_jax.files import write_figure
+from dln_jax.metrics.latency import one_step
+from dln_jax.metrics.motion_verdict import judge_motions
+from dln_jax.metrics.verdict import Verdict
+from dln_jax.training.hamiltonian.predictions import Seen, figure_of, measured_once, units_of
+from dln_jax.training.hamiltonian.tasks import Problem
+from dln_jax.training.hamiltonian.training import MOTIONS, RATES, Trained
+from dln_jax.training.low_latency_calls import low_latency_metrics
+from dln_jax.training.results import OF_LOSSES, one_step_metrics, unit_of
+from dln_jax.zoo.run import load
+
+GIF_FRAMES = 80
+LOSSES = {
+    RATES: "rates: mean square error of (qd, pd)",
+    MOTIONS: "motions: mean square error of (q, p) over its weight",
+}
+"""The loss of each stage, in words."""
+
+
+def evaluate(
+    folder: Path, problem: Problem, trained: Trained, *, low_latency: bool
+) -> tuple[dict[str, float | int], Seen, Verdict]:
+    """Entries of metrics.json, what figures show, and the verdict of the predicted test motions."""
+    truth = problem.truth[0]
+    metrics, seen, predicted = measured_once(problem, trained)
+    verdict = judge_motions(predicted, problem.truth, **units_of_judgement(problem))
+    states = list(zip(truth.q[0, :256], truth.p[0, :256], strict=True))
+    metrics = {**metrics, **one_step_metrics(one_step(load(folder).flow.rates, states, calls=2000))}
+    if problem.noise is not None:
+        metrics |= {f"q{joint}_noise": float(sd) for joint, sd in enumerate(np.ravel(problem.noise.q), start=1)}
+    metrics["validation_error"] = float(trained.result.validation)
+    if low_latency:
+        metrics |= low_latency_metrics(folder, (truth.q[0], truth.p[0]), print, function="rates")
+    metrics = {key: value for key, value in metrics.items() if np.isfinite(value)}
+    return metrics | {"verdict": verdict.number}, seen, verdict
+
+
+def units_of_judgement(problem: Problem) -> dict[str, Any]:
+    """Spread of q and p, which of them are bounded, and their noise where it is known."""
+    data, d = problem.fitted, problem.needs.degrees_of_freedom
+    size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
+    angles = [joint == "revolute" for joint in problem.needs.joints]
+    noise = None if problem.trust is None else np.broadcast_to(problem.trust.weights.state, 2 * d)
+    return {"size": np.where(size > 0, size, 1.0), "bounded": ~np.array(angles + [False] * d), "noise": noise}
+
+
+def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
+    """Writes what there is to draw."""
+    write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
+    truth = problem.truth[0]
+    stride = max(1, len(truth.t) // GIF_FRAMES)
+    motions, units = {TRUTH: truth, name: seen.motions}, units_of(problem)[:2]
+    animations.write_motion_gif(folder / "motions.gif", motions, stride=stride, units=units)
+    history = trained.history
+    if len(history) > 1:
+        best = history[-1].step - trained.result.history[-1].step + trained.result.best_step
+        named = [at._replace(stage=LOSSES[at.stage]) for at in history]
+        curve = training_curve(named, best_step=best, unit="loss, of each stage in its own units", **OF_LOSSES)
+        write_figure(folder / "training.png", curve)
+
+
+MEANINGS = {
+    "published_energy_mse": ("published energy along predicted motions, mean square error", "units of that energy²"),
+    "energy_mse": ("energy along predicted motions, mean square error", "J²"),
+    "rollout_mse": ("(q, p) of predicted motions, mean square error", "units of q² and p²"),
+    "train_loss": ("(qd, pd) at training states, mean square error", "units of qd² and pd²"),
+    "test_loss": ("(qd, pd) at test states, mean square error", "units of qd² and pd²"),
+    "clean_field_mse": ("(qd, pd) against the exact field, mean square error", "units of qd² and pd²"),
+    "vpt": ("time for which motions are predicted right", "s"),
+    "lyapunov_seconds": ("Lyapunov time of the model", "s"),
+    "predicted_seconds": ("duration of the predicted motions", "s"),
+    "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
+    "validation_error": ("validation loss of the last stage", "see training.png"),
+}
+"""What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
+ENDINGS = {
+    **{"_standard_error": ": its standard error over starts", "_median": ": its median over starts"},
+    **{"_seconds": "", "_median_seconds": ": its median", "_lyapunov": ", in Lyapunov times of the model"},
+}
+"""The rest of such a name, in words."""
+
+
+def line(metric: str, value: float) -> tuple[str, str, str]:
+    """A metric in words, its value and its unit."""
+    quantity = next((key for key in MEANINGS if metric.startswith(key)), "")
+    meaning, unit = MEANINGS.get(quantity, (metric, unit_of(metric, {})))
+    rest = metric.removeprefix(quantity or metric)
+    unit = "1" if rest == "_lyapunov" else unit
+    return meaning.replace("_", " ") + ENDINGS.get(rest, rest), f"{value:.4g}", unit

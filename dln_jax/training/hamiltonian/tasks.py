@@ -1,0 +1,151 @@
+"""What a Hamiltonian task is, from its name: the data to fit, and the motions that a model has to predict.
+
+Generated tasks are those of `datasets.hamiltonian_tasks`. Where measurements have no momenta, models that have
+momenta p = dL/dqd of their own are fitted in coordinates and velocities, for others p is taken as qd, the momentum per
+unit of inertia. A single trajectory is predicted over its last fifth, of several every sixth, unless the
+test is stated; what is left is cut into stretches without a gap. Velocities that were not measured are those of local
+polynomials.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from dln_jax.data import schema
+from dln_jax.data.schema import Trajectories, column
+from dln_jax.data.splits import select
+from dln_jax.learning.measured_motions import MeasuredWindows, Noise
+from dln_jax.metrics.phase_space import Motions
+from dln_jax.scenes.datasets.hamiltonian_tasks import PROTOCOLS
+from dln_jax.scenes.datasets.phase_samples import Part, reference_motion
+from dln_jax.training.hamiltonian.measurements import (
+    MEASURED,
+    NOTHING,
+    REAL,
+    WINDOW,
+    Stated,
+    Trust,
+    gap_count,
+    motion_of,
+    needs_of,
+    parted,
+    pieces,
+    to_predict,
+    trust_of,
+    with_momenta,
+    with_rates,
+)
+from dln_jax.types import Hamiltonian, InputError, Needs
+
+PIXELS = "pixels"
+TASKS = (*PROTOCOLS, REAL, MEASURED)
+STARTS = 50
+"""Test motions that are predicted, at most."""
+POINTS = 251
+"""Times at which they are compared."""
+HORIZONS = {
+    **{"spring": 20.0, "pendulum": 20.0, "damped-spring": 20.0, "damped-pendulum": 20.0},
+    **{"henon-heiles": 30.0, "double-pendulum": 5.0, "two-body": 25.0, "three-body": 3.0},
+}
+"""Time in s for which motions are predicted, as published for the bodies."""
+
+
+class Problem(NamedTuple):
+    """A task's data, and the motions that a model has to predict from their first states."""
+
+    name: str
+    needs: Needs
+    fitted: Trajectories
+    """For training and validation: q, p, qd, pd."""
+    train: Part | None
+    """With the exact field; `None` for measurements."""
+    test: Part | None
+    truth: tuple[Motions, ...]
+    """Motions with times of their own; those of one entry share theirs."""
+    energy: Hamiltonian | None
+    """The true one; `None` where nobody knows it."""
+    published_energy: Hamiltonian | None
+    """Whose error was published as that of the energy."""
+    noise: Noise | None = None
+    """Of measurements without momenta; `None` for all else."""
+    tests: MeasuredWindows | None = None
+    """Recordings to predict, across their gaps, whose starts are fitted to their first `WINDOW` samples."""
+    trust: Trust | None = None
+    """Of measurements, in coordinates and momenta."""
+    assumed: bool = False
+    """Whether nothing states the needs, so that what suits the data decides between them."""
+    gaps: int = 0
+    """In the test recordings."""
+
+
+def problem_of(
+    name: str, *, trajectories: int | None = None, data: Path | None = None, stated: Stated = NOTHING
+) -> Problem:
+    """The task of a name; generated data are those of seed 0.
+
+    Args:
+        name: from `TASKS`.
+        trajectories: of generated data, in place of the task's own number.
+        data: file in the npz schema; only measurements take one, and they need it.
+        stated: of measured motions, beside.
+
+    Raises:
+        InputError: an unknown name, too few trajectories, or a file that is missing or does not suit.
+    """
+    if name not in TASKS:
+        raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}")
+    if name in PROTOCOLS:
+        if data is not None:
+            raise InputError(f"task '{name}' generates its data; for a file choose {REAL} or {MEASURED}")
+        return generated(name, trajectories)
+    if data is None:
+        raise InputError(f"task '{name}' needs its data, which are not part of this project: give their file")
+    loaded = schema.load(data, rate=stated.rate, units=stated.units)
+    if name == REAL:
+        if loaded.degrees_of_freedom != 1:
+            raise InputError(f"{data} has {loaded.degrees_of_freedom} coordinates; the task is that of one pendulum")
+        stated = Stated(Needs(joints=("revolute",), friction=True))
+    return measured(name, loaded, str(data), stated)
+
+
+def generated(name: str, trajectories: int | None) -> Problem:
+    """A task whose field is known."""
+    task = PROTOCOLS[name](0) if trajectories is None else PROTOCOLS[name](0, trajectories=trajectories)
+    clean = task.test.clean
+    first = np.flatnonzero(np.diff(clean.trajectory, prepend=-1))[:STARTS]
+    t = np.linspace(0.0, HORIZONS[name], POINTS)
+    start = clean.q[first], schema.column(clean, "p")[first]
+    q, p = reference_motion(task.hamiltonian, *start, t, dissipation=task.scene.dissipation)
+    energies = task.hamiltonian, task.published_energy
+    return Problem(name, task.scene.needs, task.train.data, task.train, task.test, (Motions(t, q, p),), *energies)
+
+
+def real_energy(q: Array, p: Array) -> Array:
+    """The published energy of the measured pendulum, in its units."""
+    return jnp.sum(2.4 * (1 - jnp.cos(q)) + p**2)
+
+
+def measured(name: str, data: Trajectories, file: str, stated: Stated = NOTHING) -> Problem:
+    """Motions that were measured, without applied forces."""
+    needs = needs_of(data, file, stated.needs)
+    fitted, test = parted(name, data, file, stated.test)
+    energy = real_energy if name == REAL else None
+    noise, tests, trust, assumed = None, None, None, stated.needs is None and data.needs is None
+    if name == MEASURED and data.p is None:
+        fitted, noise = with_rates(fitted, stated.noise)
+        test, _ = with_rates(test, stated.noise)
+    fitted, test = with_momenta(fitted), with_momenta(test)
+    fitted = pieces(fitted, WINDOW[name])
+    if name == MEASURED:
+        trust = trust_of(fitted, stated.noise)
+        tests = to_predict(test._replace(qd=column(test, "p")))
+        if tests is None and noise is not None:
+            raise InputError(f"no test motion has {WINDOW[MEASURED] + 1} samples without a gap; record longer ones")
+    present = np.unique(test.trajectory)[:STARTS]
+    truth = tuple(motion_of(select(test, np.array([index]))) for index in present)
+    return Problem(
+        name, needs, fitted, None, None, truth, energy, energy, noise, tests, trust, assumed, gap_count(test)
+    )

@@ -1,0 +1,1 @@
+"""Identifying the parameters of a robot from logs."""

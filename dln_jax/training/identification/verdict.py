@@ -1,0 +1,126 @@
+"""Whether an identified robot may be used: its torques on held-out motions, and whether such a robot can exist."""
+
+import numpy as np
+from jaxtyping import Float
+
+from dln_jax.data.encoders import torque_noise
+from dln_jax.identification.identify import Identification, parameters_of
+from dln_jax.metrics.errors import normalised_error
+from dln_jax.metrics.verdict import WORSE, Verdict, held_out, judge, verdict_metrics, worst
+from dln_jax.models.rigid_tree import RigidTreeParameters
+from dln_jax.training.identification.additions import Predict
+from dln_jax.training.identification.task import Case
+
+HEAVIER, MUCH_HEAVIER = 5.0, 50.0
+"""Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
+beyond the second refused. Payloads and rough files stay below; units (N mm, mN m) do not."""
+IMPOSSIBLE = 0.1
+"""Mean nMSE that least squares explains and bodies that exist do not, from which no such robot exists."""
+COUNTS = 0.02
+"""Share of a torque's standard deviation from which friction counts."""
+FAST = 0.9
+"""Quantile of a joint's speeds that its friction's velocity scale has to stay below."""
+SPIKE = 10.0
+"""Spreads from the median of five neighbours beyond which a single sample is a spike."""
+SPIKES = 5e-4
+"""Share of samples that are spikes from which they are mentioned."""
+
+
+def judged(
+    case: Case, found: Identification, predict: Predict, torques: dict[str, np.ndarray], kept: str, *, robust: bool
+) -> tuple[Verdict, dict[str, float | int]]:
+    """The verdict on an identified robot, and its entries of metrics.json.
+
+    Args:
+        case: the robot and its data.
+        found: the fit.
+        predict: torques by parameters.
+        torques: on the held-out motions [N, d], by "file", "least_squares" and `kept`.
+        kept: key of the torques of the model that the run keeps.
+        robust: whether held-out samples that are spikes are left out.
+    """
+    test, d = case.sets.test, case.sets.test.degrees_of_freedom
+    peaks = spikes(test.tau)
+    rows = ~peaks.any(axis=1) if robust else np.ones(len(test.t), bool)
+    noise = torque_noise(case.sets.train) if case.noise is None else case.noise
+    errors = held_out(torques[kept][rows], test.tau[rows], noise=noise, file=torques["file"][rows])
+    every = [judge(errors, case.names), existing(found, torques, kept, test.tau)]
+    mine = parameters_of(found.theta, case.known)
+    still = np.zeros_like(test.q)
+    friction = predict(mine, still, test.qd, still).friction
+    scales = case.description.get("velocity_scale") if {"coulomb", "stribeck"} & set(case.laws) else None
+    fitted = np.array(scales) if isinstance(scales, list) else None
+    every += [friction_verdict(case.names, test.qd, test.tau, friction, fitted)]
+    bodies = [predict(without_joints(each), test.q, test.qd, test.qdd).torque for each in (mine, case.known)]
+    every += [weight_verdict(*bodies)]
+    verdict = worst(*every)
+    share = spikes(case.sets.train.tau).mean(axis=0)
+    if verdict.level != "good" and not robust and share.max() > SPIKES:
+        which = ", ".join(case.names[k] for k in range(d) if share[k] > SPIKES)
+        reason = f"{share.max():.2%} of the torques of {which} are spikes: {verdict.reason}"
+        verdict = Verdict(verdict.level, reason, f"give --robust; else {verdict.remedy}")
+    return verdict, verdict_metrics(errors, verdict)
+
+
+def spikes(tau: Float[np.ndarray, "N d"]) -> np.ndarray:
+    """Which torques [N, d] are single samples far from their neighbours (Hampel's identifier, a window of five)."""
+    padded = np.pad(tau, ((2, 2), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
+    away = np.abs(tau - np.median(windows, axis=-1))
+    usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-3 * tau.std(axis=0))
+    # Jumps of the motion, such as those of dry friction, are not alone, and never larger than the torque's range.
+    size = np.median(np.abs(tau - np.median(tau, axis=0)), axis=0)
+    return away > np.maximum(SPIKE * usual, 2 * size)
+
+
+def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, tau: np.ndarray) -> Verdict:
+    """Whether bodies that exist explain the torques as well as least squares, which knows no such bound."""
+    if found.consistent is None:
+        return Verdict("good", "")
+    mine, free = (np.nanmean(normalised_error(torques[name], tau)) for name in (kept, "least_squares"))
+    if mine <= 2 * free + WORSE:
+        return Verdict("good", "")
+    level = "refused" if mine > free + IMPOSSIBLE else "doubtful"
+    reason = f"bodies that exist have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
+    reason += (
+        f", not converged after {found.consistent.iterations} iterations" if not found.consistent.converged else ""
+    )
+    remedy = "check the signs and units of tau and the robot's file: no robot has such torques"
+    return Verdict(level, reason, remedy)
+
+
+def friction_verdict(
+    names: tuple[str, ...],
+    qd: Float[np.ndarray, "N d"],
+    tau: Float[np.ndarray, "N d"],
+    friction: Float[np.ndarray, "N d"],
+    scales: Float[np.ndarray, " d"] | None,
+) -> Verdict:
+    """Whether friction takes energy away, and whether the joints reach the velocity scales that were fitted to it."""
+    every, counts = [Verdict("good", "")], np.std(friction, axis=0) > COUNTS * np.std(tau, axis=0)
+    power = np.mean(qd * (friction - friction.mean(axis=0)), axis=0)
+    for k in np.flatnonzero(counts & (power < 0)):
+        reason = f"friction of {names[k]} drives it: {-power[k]:.3g} W on average"
+        every.append(Verdict("refused", reason, "check the signs of tau and qd; keep --consistent"))
+    if scales is not None:
+        for k in np.flatnonzero(counts & (scales > np.quantile(np.abs(qd), FAST, axis=0))):
+            reason = f"{names[k]} hardly reaches {scales[k]:.3g}/s, the velocity scale of its dry friction"
+            every.append(Verdict("doubtful", reason, "state it (--velocity-scale 0.05), or record faster motions"))
+    return worst(*every)
+
+
+def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
+    """The bodies alone: no armature, no friction."""
+    return RigidTreeParameters(*(each if k == 0 or each is None else 0 * each for k, each in enumerate(parameters)))
+
+
+def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:
+    """Whether the bodies are about as heavy as those of the robot's file, by the torques that they take."""
+    sizes = np.sqrt(np.mean(np.square([mine, file]), axis=1))
+    there = sizes[1] > 1e-3 * sizes[1].max()
+    factor = float(np.median(sizes[0][there] / sizes[1][there])) if there.any() else 1.0
+    if 1 / HEAVIER <= factor <= HEAVIER:
+        return Verdict("good", "")
+    reason = f"the bodies take {factor:.3g} times the torques of those in the robot's file"
+    remedy = "check the unit of tau (N m) and its side of the gears, or correct the masses in the file"
+    return Verdict("doubtful" if 1 / MUCH_HEAVIER <= factor <= MUCH_HEAVIER else "refused", reason, remedy)

@@ -1,0 +1,1 @@
+"""Swinging up a plant: explore, learn, control, film."""

@@ -1,0 +1,159 @@
+"""From a desktop plant to its swing-up by a model that was learned from its motions: explore, learn, close the loop."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.cli.progress import progress
+from dln_jax.control import parts_of, passive_energy
+from dln_jax.control.closed_loop import Run
+from dln_jax.control.desktop_plants import NAMES, DesktopPlant, desktop_plant
+from dln_jax.control.exploration import Excitation, explore
+from dln_jax.control.friction_compensation import without_friction
+from dln_jax.control.outcomes import hanging_starts
+from dln_jax.control.swing_up_runs import SECONDS, Tried, law_of, motion_of, try_starts
+from dln_jax.data import schema
+from dln_jax.figures.closed_loop_animations import cart_pole_drawing, rotary_pendulum_drawing, write_closed_loop_gif
+from dln_jax.figures.closed_loops import MOST_SHOWN, closed_loop_traces
+from dln_jax.files import write_figure, write_json
+from dln_jax.learning.recordings import STEPS
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.sizes import require_memory
+from dln_jax.training.swing_ups.learned import MODELS, Obtained, errors_along, obtain, test_motions
+from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.zoo.run import save
+
+EPISODE = 6.0
+"""s, of an episode, about."""
+LEAST_SECONDS = 4.0
+"""Of data: two episodes, of which one is to select by."""
+UNITS = {"cart-pole": "N", "rotary-pendulum": "N m"}
+"""Of the control."""
+FILMED = 4.0
+"""s, of a run."""
+
+
+class Asked(NamedTuple):
+    """What is to be done, checked."""
+
+    plant: DesktopPlant
+    name: str
+    model: str
+    excitation: Excitation
+    starts: int
+    seed: int
+
+
+def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> Asked:
+    """The arguments of a command, refused in one line before anything is written."""
+    found = desktop_plant(plant)
+    if model not in MODELS:
+        raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
+    require_positive(starts=starts)
+    require_seed(seed)
+    if not LEAST_SECONDS <= seconds_of_data < np.inf:
+        raise InputError(
+            f"--seconds-of-data is {seconds_of_data}; expected at least {LEAST_SECONDS:g} s: two episodes, one of them "
+            "to select by"
+        )
+    require_memory(f"{seconds_of_data:.3g} s of motion at 500 Hz", 1000.0 * 500 * seconds_of_data)
+    episodes = max(2, round(seconds_of_data / EPISODE))
+    return Asked(found, NAMES[plant], model, Excitation(seconds=seconds_of_data, episodes=episodes), starts, seed)
+
+
+def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
+    """Explores, learns, swings up, and writes what came of it; gives the metrics."""
+    plant = given.plant
+    recording, _ = explore(plant, plant.numbers.gains, given.excitation, seed=given.seed)
+    schema.save(folder / "data.npz", recording)
+    print(f"{given.name}: {given.excitation.seconds:g} s of q and torques in {given.excitation.episodes} episodes")
+    with progress(STEPS) as show:
+        got = obtain(
+            plant, given.model, recording, seed=given.seed,
+            report=lambda at: show(min(int(at.step), STEPS), f"loss {float(at.loss):.3g}"),
+        )  # fmt: skip
+    store(folder, got)
+    errors = errors_along(plant, got.dynamics, test_motions(plant, seed=given.seed))
+    law = law_of(plant, got.dynamics)
+    tried = try_starts(plant, got.dynamics, starts=given.starts, seed=given.seed)
+    metrics = {
+        "learning_seconds": got.seconds,
+        "torque_nmse": errors.torque_nmse,
+        "acceleration_nmse": errors.acceleration_nmse,
+        "equilibrium_offset_rad": law.offset,
+        **metrics_of(tried),
+    }
+    write_json(folder / "metrics.json", metrics)
+    say(given, got, metrics)
+    if figures:
+        draw(given, got.dynamics, folder)
+    return metrics
+
+
+def metrics_of(tried: Tried) -> dict[str, float]:
+    """Of swing-ups from many starts."""
+    found = tried.outcomes
+    return {
+        "success_share": found.share,
+        "not_finite": float(found.failed.sum()),
+        "median_seconds": found.median,
+        "worst_seconds": found.worst,
+        "farthest": float(np.max(tried.farthest)),
+    }
+
+
+def store(folder: Path, got: Obtained) -> None:
+    """Writes the model, if it was learned."""
+    if got.fitted is not None:
+        save(folder, *got.fitted)
+
+
+def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
+    """Prints what came of it."""
+    if got.prepared is not None:
+        late = f"torques {got.prepared.delay} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
+        print(f"{given.model}: learned in {got.seconds:.0f} s; {late}")
+    print(
+        f"nMSE of motions not seen: torque {metrics['torque_nmse']:.2e}, acceleration "
+        f"{metrics['acceleration_nmse']:.2e}; the model's equilibrium is "
+        f"{metrics['equilibrium_offset_rad']:.2g} rad off"
+    )
+    failed = f", {metrics['not_finite']:.0f} not finite" if metrics["not_finite"] else ""
+    print(
+        f"{metrics['success_share']:.1%} of {given.starts} starts up after {SECONDS:g} s{failed}: median "
+        f"{metrics['median_seconds']:.2f} s, worst {metrics['worst_seconds']:.2f} s"
+    )
+
+
+def draw(given: Asked, model: Dynamics, folder: Path) -> None:
+    """Writes the figure of some runs, and the film of the first."""
+    plant, lab = given.plant, given.plant.laboratory
+    runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
+    unit, limits = UNITS[given.name], (lab.least, lab.most)
+    energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))
+    of_pole = jax.jit(jax.vmap(jax.vmap(lambda x: energy(x[:2], x[2:]))))(jnp.asarray(runs.x))
+    traces = closed_loop_traces(
+        runs, plant.scene.needs.joints, names=("driven", "pole"), limits=limits, unit=unit,
+        energy=np.asarray(of_pole), goal_energy=0.0,
+    )  # fmt: skip
+    write_figure(folder / "swing-ups.png", traces)
+    sizes, t = plant.sizes, np.asarray(runs.t[0])
+    if "arm_length" in sizes:
+        drawing = rotary_pendulum_drawing(sizes["arm_length"], sizes["pole_length"])
+    else:
+        drawing = cart_pole_drawing(sizes["length"])
+    last = int(np.searchsorted(t, FILMED))
+    write_closed_loop_gif(
+        folder / "swing-up.gif", drawing, t[:last], runs.x[0, :last, :2], runs.u[0, :last, 0],
+        limits=limits, unit=unit,
+    )  # fmt: skip
+
+
+def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> Run:
+    """The first of the runs that were tried, [count, N]."""
+    run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
+    found = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
+    return jax.tree.map(np.asarray, found)

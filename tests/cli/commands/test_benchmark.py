@@ -1,0 +1,170 @@
+"""The benchmarks' own parts: the full-Hessian reference, integrators in one program for every dt, reports and paths."""
+
+import json
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.figures.benchmarks import EXACT, FRONT, cost_panels, cost_points
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.natural import lagrangian
+from dln_jax.metrics.latency import medians_in_turns, one_step
+from dln_jax.metrics.phase_space import Motions
+from dln_jax.metrics.report import Row, markdown
+from dln_jax.models.lagrangian import make_delan
+from dln_jax.scenes.chain import chain
+from dln_jax.training import low_latency_calls
+from dln_jax.training.hamiltonian.tasks import Problem
+from dln_jax.types import Needs
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import save
+from scripts.reports.arm.models import described
+from scripts.reports.arm.table import letters, published_split
+from scripts.reports.case import Findings
+from scripts.reports.commands import benchmark
+from scripts.reports.speed import costs as benchmark_costs
+from scripts.reports.speed import integrators as benchmark_integrators
+from scripts.reports.speed import one_step as benchmark_one_step
+from scripts.reports.speed.subjects import SUBJECTS
+
+
+def test_the_full_hessian_way_gives_the_same_torques(d=2):
+    model = make_delan(chain(d).needs, width=3, depth=1, dtype=jnp.float64)
+    energies = model.energies(model.init(jax.random.key(0)))
+    system = dynamics(energies)
+    state = tuple(jnp.asarray(row) for row in np.random.default_rng(0).standard_normal((3, d)))
+    reference = benchmark_costs.by_full_hessian(lagrangian(energies))
+    np.testing.assert_allclose(jax.jit(reference)(*state), system.inverse_dynamics(*state), rtol=1e-11, atol=1e-12)
+
+
+def oscillator(q, p):
+    return jnp.sum(0.5 * p**2 + 0.5 * q**2)
+
+
+@pytest.mark.parametrize(("method", "order"), [("stormer-verlet", 2), ("rk4", 4)])
+def test_halving_the_step_of_a_sweep_gains_by_the_order(method, order):
+    t = np.linspace(0, 2, 51)
+    truth = Motions(t, np.cos(t)[None, :, None], -np.sin(t)[None, :, None])
+    problem = Problem("oscillator", Needs(("prismatic",)), None, None, None, (truth,), oscillator, oscillator)
+    step = benchmark_integrators.step_of(method, oscillator, separable=True)
+    swept = benchmark_integrators.sweep(problem, oscillator, step, dt=0.08, halvings=3)
+    assert [round(swept[0][0] / dt) for dt, *_ in swept] == [1, 2, 4]
+    errors = np.array([error for *_, error in swept])
+    np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), order, atol=0.2)
+    assert all(rate > 0 and drift < 1e-2 for _, rate, drift, _ in swept)
+    assert benchmark_integrators.motions._cache_size() <= 2, "every step size has a program of its own"
+    assert benchmark_integrators.step_of("stormer-verlet", oscillator, separable=False) is None
+
+
+def test_a_subject_writes_its_report_table_and_figure(tmp_path, monkeypatch, capsys):
+    rows = [Row("a/b", "p50_us", 3.0, "us", None, 2.0), Row("a/b", "ratio", 2.0, "1"), Row("c", "ratio", 4.0, "1")]
+    monkeypatch.setitem(
+        SUBJECTS,
+        "scaling",
+        (lambda quick: Findings(rows, {"x": ([1.0, 2.0], [3.0, 4.0], "s")}), SUBJECTS["scaling"][1]),
+    )
+    command(benchmark, "scaling", "--quick", "--out", str(tmp_path / "out"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert [row["case"] for row in report["rows"]] == ["scaling/a/b", "scaling/a/b", "scaling/c"]
+    assert report["rows"][0]["pass"] is False and report["conditions"]["quick"] is True
+    assert (tmp_path / "out" / "scaling.png").read_bytes().startswith(b"\x89PNG")
+    table = (tmp_path / "out" / "scaling.md").read_text()
+    assert table == markdown([row._replace(case=f"scaling/{row.case}") for row in rows])
+    assert table.splitlines()[0] == "| case | p50 us, us | ratio |" and table.splitlines()[-1] == "| scaling/c |  | 4 |"
+    assert "already contains" in refused(capsys, benchmark, "scaling", "--out", str(tmp_path / "out"))
+
+
+def test_figures_of_points_and_panels_draw():
+    places = {"a, jit": (1.0, 1e-3), "a, c": (2.0, 1e-3), "b, jit": (3.0, 1e-20)}
+    figure = cost_points(places, x="", y="", title="", front=True, exact=EXACT)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [FRONT, "jit", "c"]
+    (axis,) = figure.axes
+    assert {text.get_text() for text in axis.texts} == {"a", "b"}
+    assert axis.get_yticklabels()[0].get_text() == "exact" and axis.get_xscale() == "linear"
+    drawn = cost_panels(
+        {"s": {"rk4": ([1.0, 2.0], [1e-3, 1e-4]), "rk4, learned": ([1.0, 2.0], [1e-2, 1e-2])}}, x="", y=""
+    )
+    one, other = drawn.axes[0].lines
+    assert one.get_color() == other.get_color() and one.get_linestyle() != other.get_linestyle()
+
+
+def test_programs_take_turns():
+    order: list[str] = []
+    programs = {name: (lambda _, name=name: order.append(name)) for name in ("one", "other")}
+    assert set(medians_in_turns(programs, (0,), repetitions=2, warm_up=1)) == {"one", "other"}
+    assert order == ["one", "other"] * 3
+    found = one_step(lambda x: x, [(0,), (1,)], calls=10, warm_up=0)
+    assert found.p50_us <= found.p99_us <= found.p999_us <= found.worst_us
+
+
+def run_of(kind, place):
+    """A run with random parameters."""
+    (folder := place / kind).mkdir()
+    description = described(kind, published_split(letters(None)).train, width=2, depth=1)
+    save(folder, description, build(description).init(jax.random.key(0)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    return run_of("structured-delan", tmp_path_factory.mktemp("runs"))
+
+
+def test_low_latency_is_timed_in_a_process_of_its_own(small_run):
+    said = []
+    states = (np.zeros((7, 2)), np.ones((7, 2)), np.ones((7, 2)))
+    found = low_latency_calls.low_latency_metrics(small_run, states, said.append)
+    assert not said
+    assert 0 < found["one_step_low_latency_p50_us"] <= found["one_step_low_latency_p99_us"]
+
+
+BROKEN = {
+    "no such program": ({"side_effect": FileNotFoundError("no python")}, "no python"),
+    "too slow": ({"side_effect": subprocess.TimeoutExpired("python", 1)}, "no answer in 120 s"),
+    "a mistake": ({"returncode": 2, "stderr": b"x\nerror: no model\n"}, "exit status 2: error: no model"),
+    "killed": ({"returncode": -9}, "exit status -9: it printed nothing"),
+    "no answer": ({"stdout": b"hello"}, "Expecting value"),
+    "no time": ({"stdout": b"{}"}, "p50_us"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_process_that_fails_leaves_the_row_out_with_a_reason(case, tmp_path, monkeypatch):
+    outcome, reason = BROKEN[case]
+
+    def failing(command, **_):
+        if "side_effect" in outcome:
+            raise outcome["side_effect"]
+        return subprocess.CompletedProcess(command, **{"returncode": 0, "stdout": b"", "stderr": b"", **outcome})
+
+    monkeypatch.setattr(low_latency_calls.subprocess, "run", failing)
+    said = []
+    assert low_latency_calls.low_latency_metrics(tmp_path, (np.zeros((3, 2)),), said.append) == {}
+    assert len(said) == 1 and reason in said[0] and "\n" not in said[0]
+
+
+def test_call_paths_are_timed(small_run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(benchmark_one_step, "enable_low_latency", lambda: None)  # a process of its own would be needed
+    for dispatch in ("default", "low-latency"):
+        command(benchmark_one_step, "--runs", str(small_run), "--dispatch", dispatch, "--calls", "10")
+    first, second = (json.loads(line)["structured-delan"] for line in capsys.readouterr().out.splitlines())
+    assert set(first) == {"default-jit"}
+    assert {"low-latency-jit", "low-latency-numpy", "c-from-python", "c-loop"} == set(second)
+    assert second["c-loop"]["inverse"]["calls_per_second"] > 0
+    plain = str(run_of("feed-forward", tmp_path))
+    command(benchmark_one_step, "--runs", plain, "--dispatch", "low-latency", "--calls", "10")
+    assert set(json.loads(capsys.readouterr().out)["feed-forward"]) == set(second)
+    merged = benchmark_one_step.over_processes([first, second, second])
+    assert merged["c-from-python"]["inverse"]["p50_spread_us"] == 0 and set(merged) == {*first, *second}
+    rows = [
+        row
+        for path, functions in merged.items()
+        for row in benchmark_one_step.rows_of(f"structured-delan/{path}", functions)
+    ]
+    bounds = {row.case: row.bound for row in rows if row.bound is not None}
+    assert bounds == {"structured-delan/c-loop": 1_500_000.0}
+    assert {row.quantity for row in rows} >= {"inverse_p50_us", "forward_p999_us", "inverse_calls_per_second"}

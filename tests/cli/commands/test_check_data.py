@@ -1,0 +1,120 @@
+"""`check_data` as the shell calls it, and `--cutoff` where commands train on logs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dln_jax.cli.commands import check_data, train_delan
+from tests.calls import command, refused
+
+RATE = 100.0
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A pendulum that is driven, from its encoder."""
+    random = np.random.default_rng(0)
+    t, runs = np.arange(400) / RATE, 4
+    q, qd, qdd = np.zeros((3, runs, len(t)))
+    for run in range(runs):
+        for w in (2.0, 5.0, 9.0):
+            a, phase = random.uniform(0.3, 0.6), random.uniform(0, 6)
+            q[run] += a * np.sin(w * t + phase)
+            qd[run] += a * w * np.cos(w * t + phase)
+            qdd[run] -= a * w**2 * np.sin(w * t + phase)
+    tau = 0.4 * qdd + 3.0 * np.sin(q)
+    path = tmp_path / "log.npz"
+    np.savez(
+        path,
+        t=np.tile(t, runs),
+        q=q.reshape(-1, 1) + 5e-4 * random.normal(size=(q.size, 1)),
+        tau=tau.reshape(-1, 1) + 0.02 * random.normal(size=(q.size, 1)),
+        trajectory=np.repeat(np.arange(runs), len(t)),
+        label=np.array(["a", "b", "c", "d"]),
+    )
+    return path
+
+
+def test_a_log_is_examined(log, tmp_path, capsys):
+    command(check_data, "--data", log, "--out", tmp_path / "check")
+    said = capsys.readouterr().out
+    assert "1600 samples of 4 trajectories, 1 joints" in said and "warning: accelerations by differences" in said
+    folder = tmp_path / "check"
+    assert (folder / "log.png").stat().st_size > 10_000
+    assert (folder / "page.txt").read_text().strip() in said
+    findings = json.loads((folder / "findings.json").read_text())["findings"]
+    assert [each["check"] for each in findings] == ["raw-differences"]
+    assert 3 < json.loads((folder / "metrics.json").read_text())["cutoff_hz"] < 30
+    assert "not there" not in refused(capsys, check_data, "--data", tmp_path / "none.npz")
+
+
+def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, capsys):
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
+    with pytest.raises(SystemExit) as exit_:
+        command(check_data, "--data", tmp_path / "degrees.npz", "--out", tmp_path / "check")
+    assert exit_.value.code == 1
+    assert "error: q of joint 1 goes to" in (tmp_path / "check" / "page.txt").read_text()
+    assert {each.name for each in (tmp_path / "check").iterdir()} >= {"findings.json", "metrics.json", "log.png"}
+
+
+def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, tmp_path, capsys):
+    errors = {}
+    for name, options in (("raw", []), ("filtered", ["--cutoff", "auto"])):
+        out = ["--out", tmp_path / name, "--no-figures", "--no-low-latency"]
+        command(train_delan, "--data", log, "--model", "trigonometric", "--degree", "1", "--test", "d", *options, *out)
+        said = capsys.readouterr().out
+        assert ("raw finite differences, which amplify noise: --cutoff auto" in said) == (name == "raw")
+        assert ("q filtered without delay at" in said) == (name == "filtered")
+        assert ("warning: accelerations by differences of this q" in said) == (name == "raw")
+        errors[name] = json.loads((tmp_path / name / "metrics.json").read_text())["torque_mse"]
+    assert errors["filtered"] < 0.1 * errors["raw"]
+    config = json.loads((tmp_path / "filtered" / "config.json").read_text())
+    assert config["cutoff"] == "auto" and 3 < config["chosen"]["cutoff_hz"] < 30
+
+
+def test_errors_in_a_log_stop_a_training_unless_they_are_accepted(log, tmp_path, capsys):
+    arrays = dict(np.load(log))
+    np.savez(tmp_path / "degrees.npz", **{**arrays, "q": np.degrees(arrays["q"])})
+    given = ["--data", tmp_path / "degrees.npz", "--model", "trigonometric", "--degree", "1", "--out", tmp_path / "run"]
+    said = refused(capsys, train_delan, *given)
+    assert "convert to radians" in said and "--accept-log" in said
+    assert f"check_data --data {tmp_path / 'degrees.npz'} says more" in said
+    assert not (tmp_path / "run").exists()
+    command(train_delan, *given, "--accept-log", "--no-figures", "--no-low-latency")
+    said = capsys.readouterr().out
+    assert "warning: q of joint 1 goes to" in said and "error:" not in said
+
+
+def test_joints_of_a_gripper_are_held(log, tmp_path, capsys):
+    pytest.importorskip("mujoco")
+    links = "".join(
+        f'<link name="{name}"><inertial><origin xyz="0 0 -0.3"/><mass value="1"/>'
+        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for name in ("arm", "finger")
+    )
+    joints = "".join(
+        f'<joint name="{name}_joint" type="continuous"><parent link="{parent}"/><child link="{name}"/>'
+        '<axis xyz="0 1 0"/></joint>'
+        for parent, name in (("ground", "arm"), ("arm", "finger"))
+    )
+    robot = tmp_path / "robot.urdf"
+    robot.write_text(f'<robot name="robot"><link name="ground"/>{links}{joints}</robot>')
+    given = ["--data", log, "--robot", robot, "--no-figures"]
+    assert "--hold NAME,NAME" in refused(capsys, check_data, *given, "--out", tmp_path / "all")
+    command(check_data, *given, "--hold", "*finger*", "--out", tmp_path / "held")
+    assert "robot: the motions determine" in capsys.readouterr().out
+    assert "--hold is for joints of --robot" in refused(capsys, check_data, "--data", log, "--hold", "finger")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cutoff", "fast"], "expected Hz, a positive number, or auto"),
+        (["--cutoff", "90"], "--cutoff 90: cutoff is 90 Hz; expected less than 50 Hz"),
+        (["--decimate", "3"], "add --cutoff auto"),
+    ],
+)
+def test_options_that_make_no_filter_are_refused(log, capsys, options, message):
+    assert message in refused(capsys, train_delan, "--data", log, *options)

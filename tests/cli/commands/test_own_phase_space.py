@@ -1,0 +1,202 @@
+"""Own files with momenta: published protocols made by numpy and scipy, trained by the command that a user types."""
+
+import json
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from dln_jax import load
+from dln_jax.cli.commands import train_hnn, train_hnn_task
+from dln_jax.mechanics.equations import flow
+from dln_jax.training import phase_space, phase_space_options
+from dln_jax.training.hamiltonian import recipes, training
+from dln_jax.training.hamiltonian.model_selection import description_of
+from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
+from dln_jax.training.hamiltonian.training import train
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build
+from tests.calls import command, refused
+from tests.published_motions import PUBLISHED, integrated, published_arrays
+
+TASK = ("--task", "measured", "--no-low-latency", "--no-figures", "--data")
+SLIDING = Needs(joints=("prismatic",))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        np.savez("spring.npz", **published_arrays("spring", 11, trajectories=24))
+        np.savez("orbits.npz", **published_arrays("two-body", 11, trajectories=24))
+        yield folder
+
+
+def test_noise_of_states_and_rates_weighs_motions(files):
+    """What the named task was told, own data show: sd 0.1 of q and p, and rates that are exact."""
+    problem = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    assert problem.trust is not None and not problem.trust.free_of_noise
+    np.testing.assert_allclose(problem.trust.weights.state, 0.1, rtol=0.15)
+    named = recipes.RECIPES["spring"].weights
+    assert named is not None and named.rate == 0.01
+    assert problem.trust.weights.rate is not None
+    assert np.all(np.abs(np.log2(np.divide(problem.trust.weights.rate, named.rate))) < 1)
+
+
+def test_stated_noise_is_used_or_refused(files, capsys):
+    one, two = (
+        problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING, noise=noise)).trust
+        for noise in ((0.3,), (0.3, 0.2))
+    )
+    assert one is not None and two is not None and two.weights.state == (0.3, 0.2)
+    assert one.weights.state == (0.3, pytest.approx(0.1, rel=0.15))
+    options = (*TASK, "spring.npz", "--noise", "0.1,0.1,0.1", "--out", "none")
+    assert "noise has 3 numbers; expected one, or one for each of 1 coordinates, or 2 of q and then p" in refused(
+        capsys, train_hnn_task, *options
+    )
+
+
+def test_a_file_without_rates_of_momenta_is_no_mass_of_one(files):
+    """p = ½ qd on this spring: the rate of p is estimated from p, and is not qdd."""
+    arrays = published_arrays("spring", 11, trajectories=24)
+    np.savez("momenta.npz", **{key: value for key, value in arrays.items() if key != "pd"})
+    problem = problem_of(MEASURED, data=files / "momenta.npz", stated=Stated(SLIDING))
+    assert "pd" in problem.fitted.estimated and problem.trust is not None
+    assert problem.trust.weights.rate is not None and np.isinf(problem.trust.weights.rate[1])
+
+
+def energy_error(name, rates, K=4):
+    """Mean square error of the true energy along predicted motions from starts without noise."""
+    system, random = PUBLISHED[name], np.random.default_rng(5)
+    starts = [np.stack(each) for each in zip(*(system.start(random) for _ in range(K)), strict=True)]
+    t = np.linspace(0, 10, 51)
+    q, p = integrated(system, *starts, t)
+    learned = system._replace(rates=lambda q, p: tuple(np.asarray(each) for each in rates(q, p)))
+    return float(np.mean((system.energy(*integrated(learned, *starts, t)) - system.energy(q, p)) ** 2))
+
+
+@pytest.mark.slow
+def test_own_springs_are_learned_as_the_named_task(files):
+    """Same model, start and budget: 20 own trajectories, 4 more for the test, and 20 of the generated task."""
+    errors = {}
+    named = problem_of("spring", trajectories=40)
+    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    for name, problem in {"named": named, "own": own}.items():
+        description = description_of(problem, "separable-hnn")
+        trained = train(problem, description, seed=0, steps=12)
+        energies = build(description).energies(trained.result.parameters)
+        errors[name] = energy_error("spring", jax.jit(flow(energies).rates))
+    assert errors["named"] < 1e-3 and errors["own"] < 2 * errors["named"]
+
+
+@pytest.mark.slow
+def test_own_orbits_axis_by_axis_need_no_motions(files, capsys):
+    """Nothing is stated: order, bodies and model are found, rates are exact, and the true energy is conserved."""
+    command(train_hnn_task, *TASK, "orbits.npz", "--out", "orbits", "--steps", "25")
+    out = capsys.readouterr().out
+    assert "auto: pairwise-hnn" in out and "motions need no fit" in out and "motions: loss" not in out
+    run = load(files / "orbits")
+    assert (run.description["order"], run.description["dimension"], run.description["alike"]) == ("axes", 2, True)
+    assert energy_error("two-body", run.flow.rates, K=1) < 1e-9
+    assert json.loads((files / "orbits" / "metrics.json").read_text())["validation_error"] < 1e-9
+
+
+def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
+    arrays = published_arrays("two-body", 11, trajectories=6)
+    random = np.random.default_rng(0)
+    np.savez("shuffled.npz", **arrays | {"pd": random.normal(size=arrays["pd"].shape)})
+    still = ("--needs", '{"joints": ["prismatic", "prismatic", "prismatic", "prismatic"]}', "--out", "none")
+    options = (*TASK, "shuffled.npz", "--model", "pairwise-hnn", *still)
+    assert "state --order bodies (x1, y1, x2, y2) or --order axes" in refused(capsys, train_hnn_task, *options)
+    problem = problem_of(MEASURED, data=files / "orbits.npz")
+    assert description_of(problem, "pairwise-hnn", order="bodies")["order"] == "bodies"
+    assert "--order is for measured" in refused(capsys, train_hnn_task, "--order", "axes", "--out", "none")
+
+
+def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
+    """Whatever ends the fit of motions, the folder holds a model."""
+
+    def broken(*_):
+        raise InputError("the fit of motions ended")
+
+    monkeypatch.setattr(training, "second_problem", broken)
+    options = (*TASK, "spring.npz", "--model", "separable-hnn", "--steps", "3", "--out", "half")
+    assert "the fit of motions ended" in refused(capsys, train_hnn_task, *options)
+    assert np.isfinite(load(files / "half").flow.rates([0.1], [0.2])).all()
+
+
+def test_motions_are_left_out_where_they_could_not_be_compiled_in_time(files):
+    """A fit whose next program would compile past the limit ends before it, with the fit of rates."""
+    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    description = description_of(own, "separable-hnn")
+    trained = train(own, description, seed=0, steps=3, seconds=0.01)
+    assert list(trained.fits) == ["rates"] and "motions were not fitted" in trained.stopped
+
+
+@pytest.mark.slow
+def test_the_fit_of_motions_ends_where_it_is_flat(files):
+    """At the floor of the noise iterations bring nothing: the fit stops by itself, and says that it has finished."""
+    own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
+    trained = train(own, description_of(own, "separable-hnn", width=3), seed=0, steps=200)
+    motions = trained.fits["motions"]
+    assert motions.stop.reason == "finished" and motions.stop.step < 100
+    losses = [at.loss for at in motions.history]
+    assert losses[-2] - losses[-1] <= 2e-5 * losses[-1]
+
+
+def test_a_file_without_torques_names_the_command_for_it(files, capsys):
+    line = refused(capsys, train_hnn, "--data", "spring.npz", "--out", "none")
+    assert "spring.npz has no tau" in line and "train_hnn_task --task measured --data spring.npz" in line
+
+
+def test_a_model_whose_motions_explode_is_refused(files, capsys):
+    """The file's forces point away from rest: its rates are fitted exactly, and every predicted motion grows."""
+    arrays = published_arrays("spring", 11, trajectories=8)
+    system, t = PUBLISHED["spring"], PUBLISHED["spring"].t
+    starts = [arrays[key][arrays["t"] == 0] for key in ("q", "p")]
+    q, p = (each.reshape(-1, 1) for each in integrated(system, *starts, t))
+    qd, pd = system.rates(q, p)
+    np.savez("away.npz", t=arrays["t"], trajectory=arrays["trajectory"], q=q, p=p, qd=qd, pd=-pd)
+    still = ("--needs", '{"joints": ["prismatic"]}', "--model", "polynomial-hamiltonian", "--degree", "2")
+    with pytest.raises(SystemExit) as stop:
+        command(train_hnn_task, *TASK, "away.npz", *still, "--out", "away")
+    said = capsys.readouterr()
+    assert stop.value.code == 1 and said.err.startswith("error: the fit is refused: ")
+    assert "verdict: refused: 1 of 1 predicted test motions grow beyond 10 times the range" in said.out
+    assert json.loads((files / "away" / "metrics.json").read_text())["verdict"] == 2
+
+
+class Clock:
+    """Time that passes only where a test says so."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+    def passing(self, seconds, function):
+        """The function, which takes so long."""
+
+        def slow(*arguments, **options):
+            self.now += seconds
+            return function(*arguments, **options)
+
+        return slow
+
+
+def test_seconds_count_from_the_start_of_the_command_to_the_stored_model(files, monkeypatch):
+    """Reading takes 20 s, choosing 10 s and each dispatch 4 s: the model is stored before 60 s and a dispatch."""
+    clock, stored = Clock(), []
+    monkeypatch.setattr(time, "perf_counter", clock)
+    monkeypatch.setattr(phase_space_options, "problem_of", clock.passing(20.0, problem_of))
+    monkeypatch.setattr(phase_space_options, "choose_model", clock.passing(10.0, phase_space_options.choose_model))
+    monkeypatch.setattr(phase_space, "losses", clock.passing(4.0, lambda at: ""))  # reported after each dispatch
+    monkeypatch.setattr(phase_space, "save", lambda *_: stored.append(clock.now - 1000.0))
+    monkeypatch.setattr(phase_space, "evaluate", lambda *_, **__: (_ for _ in ()).throw(InputError("enough")))
+    with pytest.raises(SystemExit):
+        command(train_hnn_task, *TASK, "spring.npz", "--seconds", "60", "--out", "limited")
+    assert 60.0 <= stored[-1] <= 64.0

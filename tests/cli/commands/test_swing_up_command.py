@@ -1,0 +1,39 @@
+"""One command explores, learns and swings up, and refuses mistakes before anything is written."""
+
+import json
+
+import pytest
+from calls import command, refused
+
+from dln_jax.cli.commands import swing_up
+
+
+def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("dln_jax.training.swing_ups.run.MOST_SHOWN", 2)
+    few = ("--seconds-of-data", 4, "--starts", 2)
+    command(swing_up, "--plant", "furuta", "--model", "known", *few, "--out", tmp_path / "run")
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["success_share"] == 1 and found["not_finite"] == 0 and found["torque_nmse"] < 1e-20
+    assert {each.name for each in (tmp_path / "run").iterdir()} >= {
+        "config.json",
+        "data.npz",
+        "swing-ups.png",
+        "swing-up.gif",
+    }
+    assert "100.0% of 2 starts up" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--plant", "acrobot"), "choose from"),
+        (("--model", "feed-forward"), "choose from"),
+        (("--seconds-of-data", 1), "expected at least 4 s"),
+        (("--starts", 0), "starts is 0"),
+        (("--seed", -1), "seed is -1"),
+    ],
+    ids=lambda given: given if isinstance(given, str) else given[0],
+)
+def test_mistakes_are_one_line_and_leave_nothing(capsys, tmp_path, arguments, message):
+    assert message in refused(capsys, swing_up, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()

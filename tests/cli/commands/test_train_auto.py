@@ -1,0 +1,168 @@
+"""--model auto end to end: which model is kept of which arm, what is printed and stored, and what is refused."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.cli.commands import train_delan
+from dln_jax.data.mjcf import mjcf
+from dln_jax.data.robots import Robot
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.mechanics.friction import joint_dissipation
+from dln_jax.mechanics.residual import Residual, with_residual
+from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
+from dln_jax.training.dynamics import direct_fits
+from dln_jax.training.dynamics.model_selection import climb_ladder
+from dln_jax.training.dynamics.options import check_options
+from dln_jax.training.dynamics.recorded import read
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build
+from dln_jax.zoo.run import load
+
+LINK = inertial_parameters(2.0, [0.1, 0.05, 0.2], np.diag([0.03, 0.04, 0.02]))
+ROWS = [[0.4, 0, 0.1, 0], [1.2, 0.2, 0.1, 0]]
+ARM = serial(*dh_frames(ROWS), [LINK] * 2, armature=np.array([0.1, 0.2]))
+RUBBED = tree_system(ARM, joint_dissipation([0.4, 0.2]))
+AUTO = ("--model", "auto", "--data", "rigid.npz")
+TREE = ("--model", "learned-tree", "--data", "rigid.npz")
+QUIET = ("--no-figures", "--no-low-latency", "--no-uncertainty")
+PLAIN = '{"joints": ["revolute", "revolute"], "joint_friction": ["viscous"]}'
+
+
+def torques(system, states):
+    """Of states [N, 2] each."""
+    return np.asarray(jax.jit(jax.vmap(dynamics(system).inverse_dynamics))(*states))
+
+
+def motions():
+    """Eight noisy motions of the arm with viscous friction."""
+    random, T = np.random.default_rng(0), 60
+    t, trajectory = np.tile(0.05 * np.arange(T), 8), np.repeat(np.arange(8), T)
+    a, w, p = random.uniform([0.2, 1, 0], [0.9, 3, 6], (8, 2, 3, 3)).transpose(3, 0, 1, 2)[:, trajectory]
+    phase = w * t[:, None, None] + p
+    states = [x.sum(axis=2) for x in (a * np.sin(phase), a * w * np.cos(phase), -a * w * w * np.sin(phase))]
+    tau = torques(RUBBED, states) + 0.02 * random.normal(size=states[0].shape)
+    return {"t": t, **dict(zip(("q", "qd", "qdd"), states, strict=True)), "tau": tau, "trajectory": trajectory}
+
+
+def sprung_states():
+    """Independent states of the same arm, exact, with a spring between its joints that is not of rigid bodies."""
+    states = np.random.default_rng(1).normal(size=(3, 300, 2))
+    spring = Residual(potential=lambda q: 1.5 * jnp.cos(q[0] - 2 * q[1]))
+    tau = torques(with_residual(RUBBED, spring), states)
+    arrays = dict(zip(("q", "qd", "qdd"), states, strict=True))
+    return {"t": np.zeros(300), **arrays, "tau": tau, "trajectory": np.arange(300)}
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """Logs of the arm with and without the spring, its file with other masses, and a sketch of it."""
+    folder = tmp_path_factory.mktemp("ladder")
+    np.savez(folder / "rigid.npz", **motions())
+    np.savez(folder / "spring.npz", **sprung_states())
+    free = np.tile([-np.inf, np.inf], (2, 1))
+    rough = ARM._replace(inertias=0.8 * ARM.inertias)
+    (folder / "arm.xml").write_text(mjcf(Robot(rough, np.zeros(2), np.zeros(2), free, free)))
+    (folder / "sketch.json").write_text(json.dumps({"dh_rows": ROWS, "angle_degrees": 10}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield folder
+
+
+def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
+    pytest.importorskip("mujoco")
+    given = train_delan.Arguments(model="auto", data=Path("rigid.npz"), robot=Path("arm.xml"), velocity_scale=0.01)
+    task, training = climb_ladder(given, read(given), workplace, mesh=None)
+    said, stored = capsys.readouterr().out, json.loads((workplace / "ladder.json").read_text())
+    assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
+    assert "│ rigid-tree " in said and [rung["tried"] for rung in stored["rungs"]].count(True) == 1
+    found = dynamics(build(task.description).energies(training.parameters))
+    state = (np.array([0.3, -0.5]), np.array([0.7, 0.4]), np.array([1.0, -2.0]))
+    np.testing.assert_allclose(found.inverse_dynamics(*state), dynamics(RUBBED).inverse_dynamics(*state), atol=0.05)
+
+
+def test_a_potential_of_no_rigid_body_is_found_by_the_basis_that_has_it(workplace, capsys):
+    needs = ("--needs", PLAIN)
+    command(train_delan, "--model", "auto", "--data", "spring.npz", *needs, "--out", "spring", *QUIET)
+    stored = json.loads((workplace / "spring" / "ladder.json").read_text())
+    assert stored["kept"] == "trigonometric" and stored["ended"] == "trigonometric is exact"
+    assert len(stored["rungs"][0]["validation_nmse_joints"]) == 2
+    assert "trigonometric: validation nMSE" in capsys.readouterr().out
+    config = json.loads((workplace / "spring" / "config.json").read_text())
+    assert len(config["chosen"]["validation_units"]) == 2 and config["model"] == "auto"
+    assert load(workplace / "spring").description["name"] == "trigonometric"
+
+
+def test_a_sketch_and_parents_reach_the_search(workplace, capsys, monkeypatch):
+    seen = {}
+
+    def searched(*data, parents, settings, velocity_scale, **others):
+        seen.update(parents=tuple(parents), sketch=settings.sketch, angle=settings.sketch_angle, scale=velocity_scale)
+        raise InputError("seen")
+
+    monkeypatch.setattr(direct_fits, "fit_tree", searched)
+    options = (*TREE, "--needs", PLAIN, "--velocity-scale", "0.02", "--sketch", "sketch.json", "--parents", "0,1")
+    assert "seen" in refused(capsys, train_delan, *options, "--out", "sketched")
+    assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02
+    np.testing.assert_allclose(seen["sketch"].rotations, ARM.rotations, atol=1e-12)
+    assert seen["angle"] == pytest.approx(np.radians(10))
+
+
+def test_one_trajectory_is_cut_into_blocks_of_time(workplace):
+    one = {key: values[:60] for key, values in motions().items()}
+    np.savez("one.npz", **one)
+    recorded = read(train_delan.Arguments(model="auto", data=Path("one.npz")))
+    assert [len(np.unique(part.trajectory)) for part in recorded.sets] == [8, 1, 1]
+    assert recorded.needs.joint_friction
+    assert (
+        recorded.said[-1] == "one recording: cut into blocks of time, 8 for training, 1 for validation, 1 for the test"
+    )
+
+
+MISTAKES = {
+    "width": ((*AUTO, "--width", "4"), "the ladder chooses by validation"),
+    "degree": ((*AUTO, "--degree", "2"), "the ladder chooses by validation"),
+    "hold": ((*AUTO, "--hold", "x"), "--hold is for joints of --robot"),
+    "robot of a network": (
+        ("--model", "structured-delan", "--data", "rigid.npz", "--robot", "arm.xml"),
+        "--robot is for --model auto",
+    ),
+    "robot that is not there": ((*AUTO, "--robot", "none.urdf"), "none.urdf"),
+    "parents": ((*TREE, "--parents", "0,3"), "--parents is '0,3'"),
+    "parents of a network": (
+        ("--data", "rigid.npz", "--width", "4", "--parents", "0,1"),
+        "--parents is for --model auto",
+    ),
+    "sketch that is not there": ((*TREE, "--sketch", "none.json"), "none.json: no such file"),
+    "sketch of something else": ((*TREE, "--sketch", "wrong.json"), "wrong.json: expected"),
+    "scale": ((*AUTO, "--velocity-scale", "-1"), "velocity_scale is -1"),
+    "scale without friction": (
+        (*TREE, "--velocity-scale", "0.1", "--needs", '{"joints": ["revolute", "revolute"]}'),
+        "--velocity-scale is for dry friction",
+    ),
+    "friction that no learned tree has": (
+        (*TREE, "--needs", PLAIN.replace("viscous", "stribeck")),
+        "a learned tree has no stribeck friction",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line(workplace, capsys, mistake):
+    arguments, message = MISTAKES[mistake]
+    (workplace / "wrong.json").write_text('{"colour": "red"}')
+    if "arm.xml" in arguments or "none.urdf" in arguments:
+        pytest.importorskip("mujoco")
+    assert message in refused(capsys, train_delan, *arguments, "--out", workplace / "refused")
+    assert not (workplace / "refused").exists()
+
+
+@pytest.mark.parametrize("model", ["auto", "trigonometric", "trigonometric-kernel", "learned-tree"])
+def test_a_fit_that_processes_do_not_share_is_refused(model):
+    with pytest.raises(InputError, match="--processes is for networks"):
+        check_options(train_delan.Arguments(model=model, processes=2), model)

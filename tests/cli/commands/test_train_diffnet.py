@@ -1,0 +1,236 @@
+"""The command line of differential networks end to end on a tiny budget: what it writes, and what it refuses."""
+
+import json
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.cli.commands import train_diffnet
+from dln_jax.data import functions
+from dln_jax.learning.engine import checkpoint
+from dln_jax.learning.engine import fit as engine_fit
+from dln_jax.training import functions as function_runs
+from dln_jax.training.functions import task as function_task
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import load, save
+from scripts.reports.commands import diffnet_report, diffnet_table
+from scripts.reports.differential_networks import one_pass, table
+from scripts.reports.published import DIFFERENTIAL_NETWORKS
+
+SMALL = ("--samples", "200", "--width", "4")
+TINY = (*SMALL, "--steps", "4")
+ADAM = (*SMALL, "--optimizer", "adam", "--epochs", "2", "--batch", "64")
+FILES = {".lock", "config.json", "metrics.json", "model.json", "model.safetensors"}
+METRICS = {
+    *("value_mse", "gradient_mse", "hessian_mse", "parameters", "validation_loss"),
+    *("train_seconds", "compile_seconds", "one_step_p50_us", "one_step_p99_us"),
+}
+
+
+def metrics_of(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert all(isinstance(value, int | float) for value in metrics.values())
+    return metrics
+
+
+def names_in(folder):
+    """Without the checkpoints."""
+    return {path.name for path in folder.iterdir() if not path.name.startswith("checkpoint")}
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def own_file(path, **changes):
+    """Sixty samples of a smooth function of three inputs and two outputs, of very different sizes."""
+    x = np.random.default_rng(0).uniform(-1, 1, (60, 3)) * np.array([1.0, 100.0, 0.01])
+
+    def function(x):
+        u = x / jnp.array([1.0, 100.0, 0.01])
+        return jnp.array([jnp.sin(u[0]) + u[1] * u[2], 1e3 * jnp.exp(u[1])])
+
+    data = {"x": x}
+    for key, each in (("y", function), ("dy", jax.jacfwd(function)), ("d2y", jax.hessian(function))):
+        data[key] = np.asarray(jax.jit(jax.vmap(each))(x))
+    data.update(changes)
+    np.savez(path, **{key: value for key, value in data.items() if value is not None})
+    return data
+
+
+def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplace, capsys):
+    command(train_diffnet, *TINY)
+    folder = workplace / "runs" / "train_diffnet-1"
+    assert names_in(folder) == FILES | {"curves.png", "training.png"}
+    metrics = metrics_of(folder)
+    assert set(metrics) >= METRICS and metrics["parameters"] == 4 + 4 + 4 + 1
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["function"], config["optimizer"]) == ("sin", "gauss-newton")
+    assert (config["chosen"]["width"], config["chosen"]["precision"]) == (4, "f64")
+    loaded = load(folder)
+    grid = functions.sine_grid()
+    answers = jax.vmap(loaded.derivatives)(grid.x)
+    np.testing.assert_allclose(np.mean((answers.hessian - grid.d2y) ** 2), metrics["hessian_mse"], rtol=1e-6)
+    out = capsys.readouterr().out
+    assert "value, gradient; gauss-newton, f64" in out and "almost everywhere" not in out
+    assert "already contains a run" in refused(capsys, train_diffnet, *TINY, "--out", folder)
+
+
+def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
+    coarse = partial(functions.cosine_sine_grid, points=9)
+    monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
+    command(train_diffnet, *ADAM, "--function", "cos_sin", "--ensemble", "3", "--out", "run")
+    folder = workplace / "run"
+    assert names_in(folder) == FILES | {f"{name}.png" for name in ("ensemble", "heat_maps", "surfaces", "training")}
+    metrics = metrics_of(folder)
+    assert metrics["parameters"] == 3 * (8 + 4 + 16 + 4 + 4 + 1)
+    assert metrics["spread_inside"] > 0 and metrics["spread_outside"] > 0
+    loaded = load(folder)
+    assert loaded.parameters[0][0].shape == (3, 2, 4) and loaded.derivatives(np.zeros(2)).value.dtype == jnp.float32
+    assert "3 networks 2 x 4 x 4 x 1" in capsys.readouterr().out
+
+
+def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(workplace):
+    data = own_file("mine.npz")
+    run = ("--function", "mine.npz", "--activation", "tanh", "--width", "6", "--depth", "1", "--steps", "30")
+    command(train_diffnet, *run, "--out", "run")
+    folder = workplace / "run"
+    assert names_in(folder) == FILES | {"parity.png", "training.png"}
+    metrics = metrics_of(folder)
+    assert metrics["value_mse"] < 1e-2 * data["y"].var(axis=0).sum()
+    answers = jax.vmap(load(folder).derivatives)(data["x"])
+    assert answers.hessian.shape == (60, 2, 3, 3)
+    units = data["x"].std(axis=0) / data["y"].std(axis=0)[:, None]
+    assert np.sqrt(np.mean(((answers.jacobian - data["dy"]) * units) ** 2)) < 0.1
+
+
+def test_relu_is_told_that_its_hessian_is_useless(workplace, capsys):
+    quick = ("--loss", "type2", "--no-figures")
+    command(train_diffnet, *ADAM, *quick, "--activation", "relu", "--derivative", "2", "--out", "run")
+    out = capsys.readouterr().out
+    assert "Hessian is zero almost everywhere" in out and "teaches it nothing" in out
+    assert names_in(workplace / "run") == FILES
+    # What predicting zero gets: the mean of sin² over the grid.
+    assert metrics_of(workplace / "run")["hessian_mse"] == pytest.approx(np.mean(functions.sine_grid().d2y ** 2))
+
+
+@pytest.mark.parametrize("optimizer", ["gauss-newton", "adam"])
+def test_an_interrupted_run_resumes_bit_for_bit(workplace, monkeypatch, capsys, optimizer):
+    """Stopped after a few reports, and continued; Gauss-Newton chooses its width again."""
+    own_file("mine.npz")
+    newton, adam = ("--steps", "12", "--coarse-steps", "6"), ("--width", "3", "--epochs", "6", "--batch", "16")
+    growing = newton if optimizer == "gauss-newton" else adam
+    wanted = ("--function", "mine.npz", "--loss", "type2", "--depth", "1", "--optimizer", optimizer)
+    monkeypatch.setattr(function_runs, "WIDTHS", (2,))
+    command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "unbroken")
+    stored = checkpoint.store
+    left = iter(range(1))
+
+    def store_and_die(*arguments):
+        stored(*arguments)
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(engine_fit, "store", store_and_die)
+    with pytest.raises(SystemExit) as exit_:
+        command(train_diffnet, *wanted, *growing, "--no-figures", "--out", "broken")
+    assert exit_.value.code == 130 and not (workplace / "broken" / "model.json").exists()
+    monkeypatch.setattr(engine_fit, "store", stored)
+    line = refused(capsys, train_diffnet, "--resume", "--out", "broken", "--seed", "3")
+    assert "started with seed = 0; leave --seed out" in line
+    command(train_diffnet, "--resume", "--no-figures", "--out", "broken")
+    ours, theirs = ((workplace / run / "model.safetensors").read_bytes() for run in ("broken", "unbroken"))
+    assert ours == theirs
+
+
+MISTAKES = {
+    "missing file": (None, [], "no such file"),
+    "missing key": ({"y": None}, [], "key 'y' is missing"),
+    "rank of x": ({"x": np.zeros(60)}, [], "x has shape (60,); expected [N, n]"),
+    "mismatched dy": ({"dy": np.zeros((60, 3, 2))}, [], "dy has shape (60, 3, 2); expected (60, 2, 3)"),
+    "not a number": ({"y": np.full((60, 2), np.nan)}, [], "y has 120 NaN"),
+    "pickle": ({"y": np.array([None] * 60)}, [], "without pickled objects"),
+    "no gradient": ({"dy": None}, [], "no dy; add it or choose type2"),
+    "no Hessian": ({"d2y": None}, ["--derivative", "2"], "no d2y"),
+    "activation": ({}, ["--activation", "sigmoidal"], "activation is 'sigmoidal'; choose one of relu"),
+    "loss": ({}, ["--loss", "type3"], "loss is 'type3'; expected one of type1, type2"),
+    "width": ({}, ["--width", "0"], "width is 0"),
+    "depth": ({}, ["--depth", "-1"], "depth is -1"),
+    "ensemble": ({}, ["--ensemble", "0"], "members is 0"),
+    "precision": ({}, ["--precision", "f32"], "gauss-newton needs f64"),
+    "batch": ({}, ["--batch", "-1"], "--batch is for adam"),
+    "steps of adam": ({}, ["--optimizer", "adam", "--steps", "5"], "--steps is for gauss-newton"),
+    "rate": ({}, ["--optimizer", "adam", "--learning-rate", "nan"], "--learning-rate is nan"),
+    "coarse steps": ({}, ["--coarse-steps", "-1"], "coarse_steps is -1"),
+    "samples of a file": ({}, ["--samples", "5"], "--samples is for sin and cos_sin"),
+    "seed": ({}, ["--seed", "-1"], "seed is -1"),
+    "mark in y": (
+        {"y": np.where(np.arange(120).reshape(60, 2) == 3, 1e200, 0.5)},
+        [],
+        "y has numbers of up to",
+    ),
+    "mark in dy": ({"dy": np.full((60, 2, 3), 1e200)}, [], "dy has numbers of up to"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_and_leaves_nothing_behind(workplace, capsys, mistake):
+    changes, arguments, message = MISTAKES[mistake]
+    if changes is not None:
+        own_file("wrong.npz", **changes)
+    file = () if "--table" in arguments else ("--function", "wrong.npz")
+    assert message in refused(capsys, train_diffnet, *file, "--out", "refused", *arguments)
+    assert not (workplace / "refused").exists()
+
+
+def test_an_unknown_function_is_refused_with_the_names(workplace, capsys):
+    assert "expected sin, cos_sin or an npz file" in refused(capsys, train_diffnet, "--function", "tan")
+    assert "noise is -1" in refused(capsys, train_diffnet, "--noise", "-1")
+
+
+def test_a_folder_with_another_model_is_refused(workplace):
+    description = describe("phase-network", needs=Needs(joints=("revolute",)), precision="f32")
+    save(workplace, description, build(description).init(jax.random.key(0)))
+    with pytest.raises(InputError, match=r"a phase-network has no derivatives; ask for \.flow"):
+        _ = load(workplace).derivatives
+
+
+def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypatch, capsys):
+    """With training stubbed: each row of the published table gets the best of ours and its bound."""
+    numbers = {"value_mse": 1e-9, "gradient_mse": 1e-8, "hessian_mse": 1e-5}
+    costs = {"train_seconds": 1.0, "compile_seconds": 2.0, "job_seconds": 3.0, "width": 4}
+    monkeypatch.setattr(table, "trained", lambda *given: {**numbers, **costs})
+    command(diffnet_table, "--samples", "50", "--out", "table")
+    report = json.loads((workplace / "table" / "report.json").read_text())
+    rows = {(row["case"], row["quantity"]): row for row in report["rows"]}
+    assert rows["sin/type1/cos/gauss-newton", "value_mse"]["reference"] == 2.0e-7
+    assert rows["cos_sin/type2/relu/adam", "hessian_mse"]["reference"] == 1.0
+    assert ("sin/type1/relu/gauss-newton", "value_mse") not in rows
+    assert len([row for row in report["rows"] if row["quantity"] == "value_mse"]) == 16 + 12 + 2
+    bounds = {key: row["bound"] for key, row in rows.items() if key[0].endswith("/best")}
+    assert bounds["sin/best", "value_mse"] == pytest.approx(1.7e-8 / 30)
+    assert bounds["cos_sin/best", "hessian_mse"] == pytest.approx(1.7e-4 / 10)
+    assert [rows["sin/best", key]["pass"] for key in numbers] == [False, True, False]
+    # What is measured is not measured again.
+    monkeypatch.setattr(table, "trained", None)
+    command(diffnet_table, "--resume", "--out", "table")
+    out = capsys.readouterr().out
+    assert out.count("published") >= 12 and "almost everywhere" in out and "…" not in out
+    type2 = [each for case, each in DIFFERENTIAL_NETWORKS.values.items() if case.startswith("sin/type2/")]
+    assert len(type2) == 4 and all(f"{number:.1e}" in out for each in type2 for number in each.values())
+
+
+def test_the_report_states_the_ratio_for_every_number_of_inputs(workplace, monkeypatch):
+    monkeypatch.setattr(one_pass, "INPUTS", (1, 2))
+    command(diffnet_report, "--width", "4", "--depth", "1", "--batch", "8", "--repetitions", "2", "--out", "report")
+    rows = json.loads((workplace / "report" / "report.json").read_text())["rows"]
+    ratios = {row["case"]: row for row in rows if row["quantity"] == "speedup_over_jax_hessian"}
+    assert {case: row["bound"] for case, row in ratios.items()} == {"diffnet-pass/n-1": None, "diffnet-pass/n-2": 4.0}
+    assert ratios["diffnet-pass/n-2"]["pass"] == (ratios["diffnet-pass/n-2"]["value"] >= 4.0)

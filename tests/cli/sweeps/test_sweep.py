@@ -1,0 +1,308 @@
+"""A sweep from the shell: what is done, fails and is killed, what is chosen; --resume does only what is left."""
+
+import contextlib
+import csv
+import json
+import os
+import shlex
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calls import command, refused
+
+from dln_jax.cli.commands import sweep
+from dln_jax.cli.sweeps import sweep as course
+from dln_jax.cli.sweeps.executors import here
+from dln_jax.cli.sweeps.job import Job, Status, status_of
+from dln_jax.data import schema
+from dln_jax.figures.sweeps import Point, error_against_seconds
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.registry import scene_named
+
+WIDTHS = {"2": 3e-3, "4": 1e-4, "8": 2e-4}
+"""Validation errors of pretended trainings; seeds add to them."""
+
+
+class Over:
+    """A future that is done."""
+
+    state = "OUT_OF_MEMORY"
+
+    def done(self):
+        return True
+
+
+def trained(job, resumed):
+    """Pretends to be a run of a job: its test error is smallest where its validation error is largest."""
+    width, seed = job.values["width"], int(job.values["seed"])
+    before = status_of(job.folder)
+    if before.attempt and not job.resumes:
+        before = before._replace(run=f"run-{before.attempt + 1}")
+    run = job.folder / before.run
+    run.mkdir(exist_ok=True)
+    (run / "config.json").write_text("{}")
+    status = Status("running", attempt=before.attempt + 1, run=before.run)
+    if width == "8" and seed == 1 and not resumed:
+        return status._replace(state="failed", line="the loss stopped being finite")
+    if width == "2" and seed == 1 and not resumed:
+        return status
+    validation = WIDTHS[width] * (1 + seed)
+    metrics = {"validation_error": validation, "torque_mse": 1e-7 / validation, "train_seconds": 1.0 + seed}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    return status._replace(state="done")
+
+
+@pytest.fixture
+def executor(monkeypatch):
+    """Jobs one after the other; the first time one fails, and one is killed as it begins."""
+    begun = []
+
+    def submit(jobs):
+        for job in jobs:
+            begun.append(job.values)
+            status = trained(job, resumed=begun.count(job.values) > 1)
+            (job.folder / "status.json").write_text(json.dumps(status._asdict()))
+        return [Over() for _ in jobs]
+
+    monkeypatch.setattr(course, "SECONDS_BETWEEN_LOOKS", 0.0)
+    monkeypatch.setattr(course, "executor_of", lambda asked, folder: contextlib.nullcontext(submit))
+    return begun
+
+
+@pytest.mark.parametrize("option", ["metric", "error"])
+def test_unknown_metrics_are_refused_and_jobs_are_kept(tmp_path, executor, capfd, option):
+    out = tmp_path / "sweep"
+    with pytest.raises(SystemExit) as stop:
+        command(sweep, "--grid", "width=4 seed=0:2", "--out", out, f"--{option}", "torque_msee")
+    said = capfd.readouterr().err
+    assert stop.value.code == 2 and not (out / "table.csv").exists()
+    assert f"--{option}: no job has the metric 'torque_msee'; choose from torque_mse, train_seconds, valid" in said
+    begun = len(executor)
+    command(sweep, "--out", out, "--resume", f"--{option}", "torque_mse")
+    assert len(executor) == begun == 2 and (out / "table.csv").is_file()
+
+
+def test_a_sweep_is_done_and_only_what_is_left_is_done_again(tmp_path, executor, capfd):
+    out = tmp_path / "sweep"
+    with pytest.raises(SystemExit) as stop:
+        command(sweep, "--grid", "width=2,4,8 seed=0:3", "--fixed", "steps=3", "--out", out)
+    said = capfd.readouterr().out
+    assert stop.value.code == 1 and len(executor) == 9
+    found = json.loads((out / "sweep.json").read_text())
+    states = [job["state"] for job in found["jobs"]]
+    assert states == ["done", "killed", *["done"] * 5, "failed", "done"]
+    assert "0001 killed: ended without a word (OUT_OF_MEMORY)" in said
+    assert "0007 failed: the loss stopped being finite" in said
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    # Validation chooses, and the test errors are such that it is the worst of them.
+    (best,) = [job["values"] for job in found["jobs"] if job["best"]]
+    assert best == {"width": "4", "seed": "0"}
+    with (out / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 9 and float(rows[3]["validation_error"]) == 1e-4 and rows[7]["validation_error"] == ""
+    assert max(rows, key=lambda row: float(row["torque_mse"] or 0))["best"] == "1"
+    # Medians over seeds, by hand.
+    of = {group["values"]["width"]: group for group in found["groups"]}
+    assert of["4"]["medians"]["validation_error"] == pytest.approx(2e-4) and of["4"]["worst"]["train_seconds"] == 3.0
+    assert of["2"]["done"] == 2 and of["2"]["medians"]["validation_error"] == pytest.approx(np.median([3e-3, 9e-3]))
+
+    command(sweep, "--out", out, "--resume", "--best", "largest")
+    assert executor[9:] == [{"width": "2", "seed": "1"}, {"width": "8", "seed": "1"}]
+    found = json.loads((out / "sweep.json").read_text())
+    assert {job["state"] for job in found["jobs"]} == {"done"}
+    (best,) = [job for job in found["jobs"] if job["best"]]
+    assert best["values"] == {"width": "2", "seed": "2"}
+    # What was begun was continued, in its folder.
+    assert status_of(out / "jobs" / "0007")[:4] == ("done", "", 2, "run")
+    command(sweep, "--out", out, "--resume")
+    assert len(executor) == 11
+
+
+def test_jobs_for_later_are_done_by_anything(tmp_path, executor, capsys):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=2,4 seed=0", "--where", "later", "--out", out)
+    assert "2 jobs, a line each" in capsys.readouterr().out and not (out / "sweep.json").exists()
+    lines = [shlex.split(line) for line in (out / "jobs.sh").read_text().splitlines()]
+    for width, line in zip(("2", "4"), lines, strict=True):
+        assert line[1:4] == ["-m", "dln_jax", "train_delan"] and f"--width={width}" in line
+        run = Path(line[-1].removeprefix("--out="))
+        run.mkdir(parents=True)
+        (run / "metrics.json").write_text(json.dumps({"validation_error": WIDTHS[width]}))
+    command(sweep, "--out", out, "--resume", "--where", "here")
+    assert not executor and "best by validation_error: width=4" in capsys.readouterr().out
+
+
+def test_a_job_is_not_done_twice_and_continues_where_its_command_can(tmp_path):
+    """With a command that is no training: what it prints and how it ends is what a job stores."""
+    job = Job(tmp_path / "0", "check_data", ("--data=none.npz",), {}, resumes=False, directory=tmp_path)
+    (job.folder / "run").mkdir(parents=True)  # of somebody else
+    for attempt in (1, 2):
+        job()
+        status = status_of(job.folder)
+        assert (status.state, status.attempt, status.run) == ("failed", attempt, "run-1")
+        assert "none.npz" in status.line and "none.npz" in (job.folder / "output.txt").read_text()
+    (job.folder / "status.json").unlink()
+    (job.folder / "run" / "metrics.json").write_text("{}")
+    job()
+    assert not (job.folder / "status.json").exists()
+
+
+STATUS = {
+    "a run elsewhere": {"run": "../../X"},
+    "a run at the root": {"run": "/tmp/X"},
+    "a run that is a number": {"run": 5},
+    "attempts in words": {"attempt": "x"},
+    "attempts below zero": {"attempt": -1},
+    "an unknown state": {"state": "happy"},
+    "seconds in words": {"seconds": "few"},
+}
+
+
+@pytest.mark.parametrize("damage", STATUS)
+def test_a_status_that_is_not_a_job_s_own_is_refused(tmp_path, executor, capsys, damage):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=4 seed=0", "--out", out)
+    path = out / "jobs" / "0000" / "status.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **STATUS[damage]}))
+    assert "status.json" in refused(capsys, sweep, "--out", out, "--resume")
+    assert not (tmp_path / "X").exists() and len(executor) == 1
+
+
+def test_a_job_that_is_done_without_a_run_is_done_again(tmp_path, executor):
+    out = tmp_path / "sweep"
+    command(sweep, "--grid", "width=4 seed=0", "--out", out)
+    for run in (out / "jobs" / "0000" / "run").iterdir():
+        run.unlink()
+    command(sweep, "--out", out, "--resume")
+    assert len(executor) == 2
+
+
+def test_the_best_is_of_each_problem(tmp_path, executor):
+    for name in "ab":
+        (tmp_path / name).touch()
+    command(
+        sweep,
+        "--grid",
+        f"data={tmp_path}/a,{tmp_path}/b width=2,4 seed=0:4:2",
+        "--over",
+        "seed,width",
+        "--out",
+        tmp_path / "s",
+    )
+    found = json.loads((tmp_path / "s" / "sweep.json").read_text())
+    assert [job["values"]["width"] for job in found["jobs"] if job["best"]] == ["4", "4"]
+    assert [group["jobs"] for group in found["groups"]] == [4, 4]
+
+
+def test_an_interrupt_cancels_the_jobs(tmp_path, executor, monkeypatch, capsys):
+    cancelled = []
+
+    class Future:
+        def done(self):
+            raise KeyboardInterrupt
+
+        def cancel(self):
+            cancelled.append(self)
+
+    submit = contextlib.nullcontext(lambda jobs: [Future() for _ in jobs])
+    monkeypatch.setattr(course, "executor_of", lambda asked, folder: submit)
+    with pytest.raises(SystemExit) as stop:
+        command(sweep, "--grid", "width=2,4,8 seed=0", "--out", tmp_path / "s")
+    assert stop.value.code == 130 and f"continue with: sweep --out {tmp_path}/s --resume" in capsys.readouterr().err
+    assert len(cancelled) == 3
+
+
+def test_an_interrupt_ends_the_processes_of_this_machine(tmp_path):
+    """And leaves jobs that are not begun."""
+    jobs = [Job(tmp_path / name, "train_delan", (), {}, resumes=True, directory=tmp_path) for name in "ab"]
+    with pytest.raises(KeyboardInterrupt), here(1, 0) as submit:
+        futures = submit(jobs)
+        until = time.monotonic() + 60
+        while status_of(jobs[0].folder).state != "running" and time.monotonic() < until:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert futures[0].done() and futures[1].cancelled()
+    assert status_of(jobs[0].folder)[:2] == ("killed", "interrupted") and not jobs[1].folder.exists()
+
+
+MISTAKES = [
+    (("--grid", "width=a"), "--width must be a whole number"),
+    ((), "--grid names no option"),
+    (("--command", "train_delen", "--grid", "width=8"), "did you mean train_delan?"),
+    (("--command", "sweep", "--grid", "width=8"), "there is no 'sweep'"),
+    (("--command", "make_data", "--grid", "seed=0:2"), "make_data"),
+    (("--grid", "width=8", "--over", "seed"), "'seed' is not in --grid"),
+    (("--grid", "width=8", "--jobs", "0"), "jobs is 0"),
+    (("--grid", "width=8", "--jobs", "4", "--gpus", "2"), "each job has one"),
+    (("--grid", "width=8", "--where", "slurm"), "no sbatch on the PATH"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES)
+def test_mistakes_are_one_line_and_leave_nothing(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(capsys, sweep, *arguments)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("where", "package", "extra"), [("slurm", "submitit", "sweep"), ("ray", "ray", "ray")])
+def test_an_executor_that_is_missing_is_named(where, package, extra, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    line = refused(capsys, sweep, "--grid", "width=8", "--where", where, "--out", tmp_path / "s")
+    assert f"pip install 'dln-jax[{extra}]'" in line and not (tmp_path / "s").exists()
+
+
+def test_another_grid_is_refused(tmp_path, executor, capsys):
+    command(sweep, "--grid", "width=2 seed=0", "--out", tmp_path / "s")
+    line = refused(capsys, sweep, "--grid", "width=4 seed=0", "--out", tmp_path / "s", "--resume")
+    assert "was started with grid = width=2 seed=0" in line
+
+
+def test_the_figure_shows_every_run_and_rings_the_best():
+    points = [Point(1.0, 1e-3, "4"), Point(2.0, 1e-5, "8", best=True), Point(1.5, 1e-4, median=True)]
+    drawn = error_against_seconds(points, x="training, s", y="torque", colour="width", note="3 jobs, of which 1 failed")
+    (axis,) = drawn.axes
+    assert [line.get_xydata()[0].tolist() for line in axis.lines].count([2.0, 1e-5]) == 2
+    assert len(axis.lines) == 4 and axis.get_yscale() == "log"
+    (legend,) = drawn.legends
+    assert legend.get_title().get_text() == "3 jobs, of which 1 failed"
+
+
+def kill_as_it_begins(job):
+    """SIGKILL to a job's command as soon as it runs."""
+    until = time.monotonic() + 60
+    found = ""
+    while time.monotonic() < until and not found:
+        found = subprocess.run(["pgrep", "-f", f"out={job}"], capture_output=True, text=True).stdout
+        time.sleep(0.01)
+    os.kill(int(found.split()[0]), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
+def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
+    """One is done, one fails, and one is killed from outside."""
+    pytest.importorskip(package)
+    recorded = generators.uniform(scene_named("pendulum"), samples=50)
+    for name in ("good", "killed"):
+        schema.save(tmp_path / f"{name}.npz", recorded)
+    np.savez(tmp_path / "bad.npz", nothing=1.0)
+    files = ",".join(str(tmp_path / f"{name}.npz") for name in ("good", "bad", "killed"))
+    killer = threading.Thread(target=kill_as_it_begins, args=(tmp_path / "sweep" / "jobs" / "0002",))
+    killer.start()
+    with pytest.raises(SystemExit) as stop:
+        command(
+            sweep, "--command", "check_data", "--grid", f"data={files}", "--fixed", "figures=no", "--where", where,
+            "--jobs", "2", "--out", tmp_path / "sweep",
+        )  # fmt: skip
+    killer.join()
+    assert stop.value.code == 1
+    done, failed, killed = (status_of(tmp_path / "sweep" / "jobs" / f"{number:04}") for number in range(3))
+    assert done.state == "done" and failed.state == "failed" and killed.state == "killed"
+    assert "bad.npz" in failed.line
+    assert "warnings" in (tmp_path / "sweep" / "table.csv").read_text()
+    assert f"0002 {killed.state}: {killed.line}" in capsys.readouterr().out

@@ -1,0 +1,85 @@
+"""Grids: which jobs a text is, and that what is wrong with it is one line before anything starts."""
+
+import math
+
+import pytest
+
+from dln_jax.cli.commands import check_data, train_delan, train_locomotion
+from dln_jax.cli.sweeps.grid import combinations, fixed_of, grid_of
+from dln_jax.cli.sweeps.plan import plan
+from dln_jax.types import InputError
+
+GRIDS = [
+    ("seed=0:3", {"seed": ("0", "1", "2")}),
+    ("seed=4:-1:-2", {"seed": ("4", "2", "0")}),
+    ("width=8,16 --learning-rate=1e-3", {"width": ("8", "16"), "learning_rate": ("1e-3",)}),
+    ("width=2:4,16", {"width": ("2", "3", "16")}),
+    ("data='a b.npz',c:d.npz", {"data": ("a b.npz", "c:d.npz")}),
+    ("needs='{\"gravity\": false}'", {"needs": ('{"gravity": false}',)}),
+]
+
+
+@pytest.mark.parametrize(("text", "grid"), GRIDS)
+def test_a_text_is_a_grid(text, grid):
+    assert grid_of(text) == grid
+    every = combinations(grid)
+    assert len(every) == math.prod(map(len, grid.values())) == len({tuple(each.items()) for each in every})
+
+
+def test_fixed_values_keep_their_commas():
+    assert fixed_of("test=e,q,v steps=5") == {"test": "e,q,v", "steps": "5"}
+
+
+MISTAKES = [
+    ("", "names no option"),
+    ("width", "no NAME=VALUE"),
+    ("width=", "no NAME=VALUE"),
+    ("width=8,,16", "empty value"),
+    ("width='8", "close the quotes"),
+    ("seed=3:3", "empty range"),
+    ("seed=0:3:0", "step 0"),
+    ("seed=0:9:-1", "empty range"),
+    ("seed=1,0:3", "seed has 1 twice"),
+    ("seed=1 width=8 seed=2", "names seed twice"),
+    ("seed=0:10001", "at most 10,000"),
+    ("seed=0:101 width=0:100", "10,100 combinations"),
+    ("widht=8", "no option widht; did you mean width?"),
+    ("width=8.5", "--width must be a whole number"),
+    ("learning_rate=0.1:0.5", "--learning-rate must be a number"),
+    ("activation=tanh,relu", "invalid choice 'relu'"),
+    ("figures=maybe", "expected yes or no"),
+    ("data=nowhere.npz", "data=nowhere.npz: no such file"),
+    ("out=a,b", "gets from the sweep"),
+    ("depth=1", "in --grid and in --fixed"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), MISTAKES)
+def test_what_is_wrong_is_said_before_anything_starts(text, message, tmp_path):
+    with pytest.raises(InputError, match=message.replace("?", r"\?")) as error:
+        plan("train_delan", train_delan.Arguments, grid_of(text), {"depth": "2"}, tmp_path)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_jobs_are_command_lines(tmp_path):
+    (tmp_path / "a.npz").touch()
+    grid, fixed = (
+        grid_of(f"width=8,16 data={tmp_path}/a.npz"),
+        fixed_of("low-latency=no compilation-cache=yes test=e,q"),
+    )
+    first, second = plan("train_delan", train_delan.Arguments, grid, fixed, tmp_path)
+    common = ("--no-low-latency", "--compilation-cache", "--test=e,q", "--processes=1")
+    assert first.arguments == (*common, "--width=8", f"--data={tmp_path}/a.npz")
+    assert second.values == {"width": "16", "data": f"{tmp_path}/a.npz"} and second.folder == tmp_path / "jobs" / "0001"
+    assert first.resumes
+
+
+def test_a_job_continues_where_its_command_can(tmp_path):
+    jobs = plan("train_locomotion", train_locomotion.Arguments, grid_of("method=gradient,ppo"), {}, tmp_path)
+    assert [job.resumes for job in jobs] == [True, False]
+    # An option without a default is given with each that is checked.
+    (tmp_path / "log.npz").touch()
+    fixed = {"data": str(tmp_path / "log.npz")}
+    (job, _) = plan("check_data", check_data.Arguments, grid_of("figures=no,yes"), fixed, tmp_path)
+    assert not job.resumes and job.arguments[-1] == "--no-figures"

@@ -1,0 +1,285 @@
+"""What all command lines share: one line for a mistake, help that says what an option takes, bars that fit."""
+
+import importlib
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import pytest
+from rich.console import Console
+
+from dln_jax.__main__ import REPORTS, command, main, report_names
+from dln_jax.cli.arguments import Unstated, choice, names_in
+from dln_jax.cli.commands import COMMANDS
+from dln_jax.cli.progress import progress
+from dln_jax.cli.running import interrupted, run
+from dln_jax.metrics.verdict import FitRefused, Verdict
+from dln_jax.zoo.run_folder import CONFIG, run_folder
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = {**dict.fromkeys(COMMANDS, "dln_jax.cli.commands"), **dict.fromkeys(report_names(), REPORTS)}
+"""Of every command, by name."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Of a command that does nothing."""
+
+    kind: Literal["this", "that"] = "this"
+    """Which."""
+    names: Annotated[str, choice(("one", "two"), several=True)] = "one,two"
+    """Some (default: all)."""
+    steps: Unstated[int] = None
+    """How many (default: 7)."""
+    precision: Unstated[Literal["f32", "f64"]] = None
+    """Floating-point type (default: f64)."""
+
+
+def say(given: Arguments) -> None:
+    print(given)
+
+
+def called(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["command", *arguments])
+    run(say, Arguments, prog="command")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--kind", "other"], "invalid choice 'other' for argument '--kind'. Expected one of ('this', 'that')"),
+        (["--steps", "many"], "--steps must be a whole number; got 'many'"),
+        (["--steps"], "Missing value for argument '--steps'"),
+        (["--stepz", "3"], "Unrecognized options: --stepz, 3"),
+        (["--precision", "None"], "invalid choice 'None' for argument '--precision'. Expected one of ('f32', 'f64')"),
+        (["stray"], "Unrecognized options: stray"),
+    ],
+)
+def test_what_cannot_be_parsed_is_one_line(monkeypatch, capsys, arguments, complaint):
+    with pytest.raises(SystemExit) as stop:
+        called(monkeypatch, *arguments)
+    line = capsys.readouterr().err
+    assert stop.value.code == 2 and line.count("\n") == 1
+    assert line.startswith(f"error: {complaint}") and "--help)" in line
+
+
+def test_help_says_what_an_option_takes_and_each_default_once(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        called(monkeypatch, "--help")
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert stop.value.code == 0
+    for shown in ("--kind {this,that} Which. (default: this)", "--names {one,two}[,...] Some (default: all).",
+                  "--steps INT How many (default: 7).", "--precision {f32,f64} Floating-point"):  # fmt: skip
+        assert shown in text
+    assert "None" not in text
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as stop:
+        command(name, name, package=PACKAGES[name])
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert stop.value.code == 0
+    assert not re.search(r"\{None\}|default: [Nn]one\)|--precision (STR|\{float)", text)
+    assert "--gif" not in text and "--no-compilation-cache" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "resumes"),
+    [
+        ("compare_locomotion", {}, False),
+        ("train_locomotion", {"method": "ppo"}, False),
+        ("train_locomotion", {"method": "evolution"}, True),
+        ("train_hnn_pixels", {}, True),
+    ],
+)
+def test_only_a_command_that_continues_says_so(name, arguments, resumes, tmp_path):
+    (tmp_path / CONFIG).touch()
+    given = importlib.import_module(f"{PACKAGES[name]}.{name}").Arguments(**arguments)
+    assert ("--resume" in interrupted(name, given, tmp_path)) == resumes
+
+
+def test_names_are_taken_apart():
+    assert names_in("--only", "b, a", ("a", "b")) == ["b", "a"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_bar_shows_count_text_and_time_left_whole(width):
+    out = io.StringIO()
+    text = "motions: loss 1.23e-05  validation 1.23e-05"
+    with progress(20_000, console=Console(file=out, force_terminal=True, width=width, color_system=None)) as show:
+        show(5_000, text)
+        show(19_990, text)
+    last = [line for line in re.split(r"[\r\n]", re.sub(r"\x1b\[[0-9?]*[A-Za-z]", "", out.getvalue())) if line][-1]
+    assert len(last) <= width and "19990/20000" in last and text in last and re.search(r"left \d\d:\d\d", last)
+
+
+def test_a_closed_pipe_ends_a_command_without_a_word():
+    """What it prints stays in a buffer that nobody takes, and is flushed as the command ends."""
+    program = (
+        "import sys; sys.argv = ['command']; sys.path.append('tests/command_line'); "
+        "from test_command_line import *; run(say, Arguments, prog='command')"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        said = child.stderr.read()
+    assert said == b"" and child.returncode == 141
+
+
+CONSOLE = "import sys\nfrom dln_jax.__main__ import main\nsys.exit(main())\n"
+"""What pip makes of the package's entry."""
+
+
+def ways(folder):
+    """The three ways of calling `make_data`."""
+    (folder / "dln-jax").write_text(CONSOLE)
+    return {
+        "console": [str(folder / "dln-jax"), "make_data"],
+        "package": ["-m", "dln_jax", "make_data"],
+        "script": ["-m", "scripts.make_data"],
+    }
+
+
+WAYS = ("console", "package", "script")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_an_interrupt_during_imports_is_one_word(tmp_path, way):
+    """The first import of the command waits, so that the interrupt meets it, also of a parent that ignores its own."""
+    heard = "import signal, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    (tmp_path / "jax.py").write_text(f"{heard}print('importing', flush=True)\ntime.sleep(60)\n")
+    with subprocess.Popen(
+        [sys.executable, *ways(tmp_path)[way]],
+        cwd=ROOT,
+        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        assert child.stdout.readline() == "importing\n"
+        time.sleep(0.05)
+        child.send_signal(signal.SIGINT)
+        said = child.stderr.read()
+    assert said == "interrupted\n" and child.returncode in (-signal.SIGINT, 130)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_way_of_calling_names_itself(tmp_path, way):
+    done = subprocess.run(
+        [sys.executable, *ways(tmp_path)[way], "--stepz"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    names = {"console": "dln-jax make_data", "package": "python -m dln_jax make_data"}
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stdout == ""
+    assert f"(see {names.get(way, 'python -m scripts.make_data')} --help)" in done.stderr
+
+
+def test_without_a_name_there_is_a_list_and_an_unknown_one_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["/bin/dln-jax"])
+    main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("usage: dln-jax COMMAND")
+    listed = [line.split(maxsplit=1) for line in lines[5:-2]]
+    assert [name for name, _ in listed] == COMMANDS and all(text.endswith(".") for _, text in listed)
+    for nonsense in ("teapot", "", "../x", "a\nb", "x" * 5000, "--steps", "__init__"):
+        monkeypatch.setattr(sys, "argv", ["dln-jax", nonsense])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        line = capsys.readouterr().err
+        assert stop.value.code == 2 and line.count("\n") == 1 and len(line) < 1000
+        assert line.startswith("error: ") and "is no command; choose from" in line
+
+
+def test_a_name_that_is_nearly_right_is_suggested_and_reports_are_commands_of_a_checkout(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["dln-jax", "train-delen"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "did you mean train_delan?" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["dln-jax", "report"])
+    main()
+    assert "robot_report" in capsys.readouterr().out
+
+
+def test_a_list_that_nobody_reads_ends_without_a_word():
+    with subprocess.Popen(
+        [sys.executable, "-m", "dln_jax"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        said = child.stderr.read()
+    assert said == b"" and child.returncode == 141
+
+
+@dataclass(frozen=True)
+class Resumable:
+    """Of a command that can continue."""
+
+    resume: bool = False
+    """Continue."""
+    continues: ClassVar = True
+
+
+@dataclass(frozen=True)
+class Sometimes(Resumable):
+    """Of a command that can continue, but not with these arguments."""
+
+    continues: ClassVar = False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stored", "said"),
+    [
+        (Resumable, True, "interrupted; continue with: command --out {folder} --resume"),
+        (Resumable, False, "interrupted; {folder} is incomplete"),
+        (Arguments, True, "interrupted; {folder} is incomplete"),
+        (Sometimes, True, "interrupted; {folder} is incomplete"),
+    ],
+)
+def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):
+    folder = tmp_path / "run"
+
+    def main(given):
+        with run_folder(folder, "command"):
+            if stored:
+                (folder / CONFIG).write_text("{}")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["command"])
+    with pytest.raises(SystemExit) as ended:
+        run(main, arguments, prog="command")
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == said.format(folder=folder) + "\n"
+
+
+def test_refused_fit_ends_with_its_own_status(monkeypatch, capsys):
+    def main(given):
+        raise FitRefused(Verdict("refused", "nMSE 22.7", "check the sign of tau"))
+
+    monkeypatch.setattr(sys, "argv", ["command"])
+    with pytest.raises(SystemExit) as ended:
+        run(main, Arguments, prog="command")
+    assert ended.value.code == 1
+    assert capsys.readouterr().err == "error: the fit is refused: nMSE 22.7; check the sign of tau\n"
+
+
+def test_every_command_has_a_script():
+    scripts = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem != "__init__")
+    assert scripts == sorted(PACKAGES)
+    for name in scripts:
+        assert f'command("{name}", "python -m scripts.{name}"' in (ROOT / "scripts" / f"{name}.py").read_text()

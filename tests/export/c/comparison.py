@@ -1,0 +1,57 @@
+"""Exported C beside the JAX functions that it is of: both called on the same states."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+
+STRICT = ("-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wshadow", "-Wdouble-promotion")
+"""Warnings, which fail."""
+BOUND = {"f64": 1e-12, "f32": 1e-5}
+TYPES = {"f64": np.float64, "f32": np.float32}
+Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
+
+
+def at_precision(tree: Any, precision: str) -> Any:
+    """Real numbers of a tree as arrays of the precision; too large ones are infinite."""
+
+    def cast(leaf):
+        array = np.asarray(leaf)
+        return array.astype(TYPES[precision]) if array.dtype.kind == "f" else array
+
+    with np.errstate(over="ignore"):
+        return jax.tree.map(cast, tree)
+
+
+def in_c(
+    functions: Functions, states: Mapping[str, list[Any]], folder: Path, *, precision="f64", flags=("-O1",), **options
+):
+    """Leaves of the results of each function, [states, ...] each: exported at once, and compiled without a warning."""
+    at = {name: (function, at_precision(examples, precision)) for name, (function, examples) in functions.items()}
+    export_c(at, folder, precision=precision, **options)
+    if precision == "f32":
+        assert "double" not in (folder / "model.c").read_text()
+    loaded = load_c(folder, flags=(*flags, *STRICT))
+    results = {}
+    for name in functions:
+        call = getattr(loaded, name)
+        rows = [call(*jax.tree.leaves(at_precision(state, precision))) for state in states[name]]
+        rows = [row if isinstance(row, tuple) else (row,) for row in rows]
+        results[name] = [np.stack([np.asarray(each) for each in column]) for column in zip(*rows, strict=True)]
+    return results
+
+
+def in_jax(functions: Functions, states: Mapping[str, list[Any]], *, precision="f64"):
+    """The same of the functions, compiled at once and mapped over the states."""
+    stacked = {
+        name: at_precision(jax.tree.map(lambda *leaves: np.stack(leaves), *states[name]), precision)
+        for name in functions
+    }
+    with jax.enable_x64(precision == "f64"):  # as they are exported
+        every = jax.jit(lambda given: {name: jax.vmap(functions[name][0])(*given[name]) for name in functions})(stacked)
+    return {name: [np.asarray(leaf) for leaf in jax.tree.leaves(each)] for name, each in every.items()}

@@ -1,0 +1,125 @@
+"""Exported C as Python functions: what they take, that they share nothing between calls, and hold nothing on to."""
+
+import shutil
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from comparison import STRICT
+
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c
+from dln_jax.types import InputError
+
+pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="there is no C compiler on the PATH")
+MATRIX = np.arange(6.0).reshape(2, 3)
+
+
+class Several(NamedTuple):
+    y: jnp.ndarray
+    total: jnp.ndarray
+
+
+def matrix(a, k):
+    return k * a.T
+
+
+def several(a, k):
+    return Several(a + k, jnp.sum(a))
+
+
+def count(flag, n, wide):
+    return jnp.where(flag, n, -n) + wide.astype(jnp.int32)
+
+
+def number(k):
+    return 2 * k
+
+
+@pytest.fixture(scope="module", params=["f64", "f32"])
+def loaded(request, tmp_path_factory):
+    folder, real = tmp_path_factory.mktemp("binding"), np.float64 if request.param == "f64" else np.float32
+    examples = (np.zeros((2, 3), real), real(0))
+    functions: dict[str, Any] = {each.__name__: (each, examples) for each in (matrix, several)}
+    functions["number"] = (number, examples[1:])
+    if request.param == "f64":
+        functions["count"] = (count, (np.bool_(True), np.int32(0), np.int64(0)))
+    export_c(functions, folder, precision=request.param)
+    return load_c(folder, flags=("-O0", *STRICT)), real
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int64, ">f8"])
+@pytest.mark.parametrize("k", [2.0, 2, np.float32(2), np.float64(2), np.array(2.0), jnp.array(2.0)], ids=repr)
+def test_any_real_numbers_of_the_shape_are_taken(loaded, order, dtype, k):
+    functions, real = loaded
+    array = np.array(MATRIX, dtype, order=order)
+    for a in (array, array.tolist(), np.repeat(array, 2, axis=1)[:, ::2]):
+        result = functions.matrix(a, k)
+        assert result.dtype == real and result.shape == (3, 2)
+        np.testing.assert_array_equal(result, 2 * MATRIX.T)
+    np.testing.assert_array_equal(functions.matrix(k=k, a=MATRIX), functions.matrix(MATRIX, k=k))
+
+
+def test_results_are_new_arrays_and_numbers(loaded):
+    functions, real = loaded
+    given = MATRIX.astype(real)
+    first, second = functions.several(given, 1.0), functions.several(given, 2.0)
+    np.testing.assert_array_equal(first.y, MATRIX + 1)
+    np.testing.assert_array_equal(second.y, MATRIX + 2)
+    assert first.total == second.total == 15 and first.y.flags.writeable
+    assert functions.number(3.0) == 6 and isinstance(functions.number(3.0), float)
+    assert "several(a [2, 3], k) -> y [2, 3], total" in functions.several.__doc__
+
+
+def test_whole_numbers_and_truth_values(loaded):
+    functions, real = loaded
+    if real is np.float32:
+        pytest.skip("64-bit integers are those of double precision")
+    assert functions.count(True, 3, 4) == 7 and functions.count(np.bool_(False), np.int32(3), 4) == 1
+    assert isinstance(functions.count(True, 3, 4), int)
+
+
+def test_nothing_is_held_on_to(loaded):
+    functions, real = loaded
+    a, k = MATRIX.astype(real), np.array(1.0, real)
+    before, result = (sys.getrefcount(a), sys.getrefcount(k)), functions.several(a, k)
+    for _ in range(100):
+        result = functions.several(a, k)
+        with pytest.raises(InputError):
+            functions.several(a, a)
+    assert (sys.getrefcount(a), sys.getrefcount(k)) == before
+    references = sys.getrefcount(result.y)
+    assert references == 2
+    a.resize((6, 1))  # refused while a buffer of it is held
+
+
+def test_threads_may_call_at_once(loaded):
+    functions, real = loaded
+    inputs = [np.full((2, 3), each, real) for each in range(200)]
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda a: functions.matrix(a, 1.0), inputs))
+    for a, result in zip(inputs, results, strict=True):
+        np.testing.assert_array_equal(result, a.T)
+
+
+@pytest.mark.parametrize(
+    "args, kwargs, message",
+    [
+        ((MATRIX,), {}, "matrix takes a, k; got 1 of them$"),
+        ((MATRIX, 1.0, 2.0), {}, "matrix takes a, k; got 3 of them and others"),
+        ((MATRIX, 1.0), {"k": 1.0}, "matrix takes a, k; got 3 of them"),
+        ((MATRIX,), {"j": 1.0}, "matrix takes a, k; got 2 of them and others"),
+        ((MATRIX.T, 1.0), {}, r"a has shape \(3, 2\); expected \(2, 3\)"),
+        ((MATRIX, [1.0]), {}, r"k has shape \(1,\)"),
+        ((MATRIX, "1"), {}, "k has type <U1; expected real numbers"),
+        ((MATRIX + 1j, 1.0), {}, "a has type complex128"),
+        ((None, 1.0), {}, "a has type object"),
+    ],
+)
+def test_others_are_refused(loaded, args, kwargs, message):
+    with pytest.raises(InputError, match=message):
+        loaded[0].matrix(*args, **kwargs)

@@ -1,0 +1,215 @@
+"""Exported C through CasADi's `external`: values and derivatives equal JAX's, and a swing-up is solved with them."""
+
+import ctypes
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.export.c import casadi as external_c
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import compile_c
+from dln_jax.export.c.source import export_c
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.scenes import pendulum, two_link_arm
+from dln_jax.types import InputError
+
+casadi = pytest.importorskip("casadi")
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
+)
+# What a loop leaves of each turn is kept even if nothing reads it.
+KEPT = "-Wno-unused-but-set-variable"
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", KEPT)
+ARM = [np.ones(2)] * 3
+BOUND = 1e-12
+
+
+def products(A, b, scale):
+    return {"y": A @ b * scale, "Z": jnp.outer(b, jnp.sin(A[:, 0])) * scale}
+
+
+def root(x):
+    """Newton's method until it has converged, of which JAX has no reverse mode."""
+    a = 2 + x @ x
+    return jax.lax.while_loop(lambda r: jnp.any(jnp.abs(r * r - a) > 1e-9 * a), lambda r: (r + a / r) / 2, a)
+
+
+FUNCTIONS = {
+    "forward_dynamics": (dynamics(two_link_arm().energies).forward_dynamics, ARM),
+    "step": functions_of_system(pendulum().energies, 1, dtype=np.float64)["step_rk4"],
+    "products": (products, [np.ones((3, 2)), np.ones(2), np.float64(1)]),
+    "root": (root, [np.ones(3)]),
+}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("external")
+    export_c(FUNCTIONS, folder, name="model", casadi=True)
+    sources, built = [str(folder / f"model{part}.c") for part in ("", "_casadi")], folder / "libmodel.so"
+    compile_c([*STRICT, "-O1", "-fPIC", "-shared", *sources, "-lm", "-o", str(built)])
+    return built
+
+
+def of_a_vector(name):
+    """The function of one vector, all arguments column-major and end to end, and the shapes of these."""
+    function, examples = FUNCTIONS[name]
+    shapes = [np.shape(each) for each in examples]
+    cuts = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+
+    def flat(x):
+        given = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
+        return jnp.concatenate([jnp.ravel(each.T) for each in jax.tree.leaves(function(*given))])
+
+    return flat, [(*shape, 1, 1)[:2] for shape in shapes]
+
+
+def columns(matrices):
+    """CasADi matrices as one vector."""
+    return casadi.veccat(*(matrices if isinstance(matrices, list | tuple) else [matrices]))
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_and_derivatives_equal_jax(name, library):
+    flat, shapes = of_a_vector(name)
+    function = casadi.external(f"casadi_model_{name}", str(library))
+    symbols = [casadi.MX.sym(f"x{k}", *shape) for k, shape in enumerate(shapes)]
+    result = columns(function(*symbols))
+    random = np.random.default_rng(0)
+    x, weights, seed = (random.normal(size=n) for n in (columns(symbols).numel(), result.numel(), result.numel()))
+    given = columns(symbols)
+    hessian, gradient = casadi.hessian(casadi.dot(result, weights), given)
+    backward = casadi.jtimes(result, given, seed, True)
+    along = casadi.jtimes(result, given, x)
+    every = casadi.Function(
+        "every", symbols, [result, casadi.jacobian(result, given), gradient, hessian, backward, along]
+    )
+    parts = np.split(x, np.cumsum([n * m for n, m in shapes])[:-1])
+    got = every(*(part.reshape(shape, order="F") for part, shape in zip(parts, shapes, strict=True)))
+    slopes = jax.jit(jax.jacfwd(flat))(x)
+    curvature = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: flat(x) @ weights)))(x)
+    expected = flat(x), slopes, weights @ slopes, curvature, seed @ slopes, slopes @ x
+    assert np.abs(curvature).max() > 0
+    for ours, wanted in zip(got, expected, strict=True):
+        scale = max(1.0, np.abs(wanted).max())
+        np.testing.assert_allclose(np.array(ours).reshape(wanted.shape), wanted, rtol=0, atol=BOUND * scale)
+
+
+@needs_compiler
+def test_signatures_are_those_that_casadi_gives_its_own_functions(library):
+    ours = casadi.external("casadi_model_products", str(library))
+    A, b, scale = casadi.MX.sym("A", 3, 2), casadi.MX.sym("b", 2), casadi.MX.sym("scale")
+    results = [scale * b @ casadi.sin(A[:, 0]).T, A @ b * scale]
+    theirs = casadi.Function("casadi_model_products", [A, b, scale], results, ["A", "b", "scale"], ["Z", "y"])
+
+    def signature(function):
+        inputs = [(function.size_in(k), function.nnz_in(k)) for k in range(function.n_in())]
+        outputs = [function.size_out(k) for k in range(function.n_out())]
+        return function.name(), function.name_in(), inputs, function.name_out(), outputs
+
+    ways = {
+        "jac": casadi.Function.jacobian,
+        "fwd1": lambda function: function.forward(1),
+        "adj1": lambda function: function.reverse(1),
+        "jac_adj1": lambda function: function.reverse(1).jacobian(),
+    }
+    for prefix, derivative in ways.items():
+        made = derivative(ours)
+        assert made.class_name() == "External" and made.name() == f"{prefix}_casadi_model_products"
+        assert signature(made) == signature(derivative(theirs))
+
+
+@needs_compiler
+def test_null_pointers_are_zeros_and_what_nobody_wants(library):
+    call = ctypes.CDLL(str(library)).jac_casadi_model_products
+    Block = ctypes.POINTER(ctypes.c_double)
+    A, written = np.arange(6.0), [np.full(36, np.nan) for _ in range(6)]
+    arg = (Block * 5)(A.ctypes.data_as(Block))  # the others are null, and so is scale
+    wanted = 5  # dy/dscale = A b, of which b is zero
+    res = (Block * 6)(*(each.ctypes.data_as(Block) if k == wanted else None for k, each in enumerate(written)))
+    assert call(arg, res, None, None, 0) == 0
+    assert np.array_equal(written[wanted][:3], np.zeros(3)) and np.isnan(written[wanted][3:]).all()
+    assert np.isnan(written[:wanted]).all()
+
+
+@needs_compiler
+@pytest.mark.parametrize("hessian", ["exact", "limited-memory"])
+def test_a_swing_up_is_solved_by_an_sqp(hessian, library):
+    step, steps, dt, goal = casadi.external("casadi_model_step", str(library)), 20, 0.05, np.array([np.pi, 0.0])
+    x, u = casadi.MX.sym("x", 2, steps + 1), casadi.MX.sym("u", 1, steps)
+    defects = [x[:, k + 1] - step(x[:, k], u[:, k], dt) for k in range(steps)]
+    problem = {
+        "x": casadi.veccat(x, u),
+        "f": dt * casadi.sumsqr(u),
+        "g": casadi.vertcat(x[:, 0], x[:, -1] - goal, *defects),
+    }
+    silent = {"print_iter": False, "print_header": False, "print_info": False}
+    options = {"qpsol": "qrqp", "qpsol_options": silent, "hessian_approximation": hessian, "tol_pr": 1e-10}
+    options |= {f"print_{part}": False for part in ("header", "iteration", "time", "status")}
+    solver = casadi.nlpsol("solver", "sqpmethod", problem, options)
+    start = np.concatenate([np.linspace(0 * goal, goal, steps + 1).ravel(), np.zeros(steps)])
+    solution = solver(x0=start, lbg=0, ubg=0)
+    stats = solver.stats()
+    assert stats["success"] and stats["iter_count"] <= (5 if hessian == "exact" else 30)
+    assert float(solution["f"]) == pytest.approx(148.466897, rel=1e-6)
+    states, torques = np.split(np.array(solution["x"]).ravel(), [2 * (steps + 1)])
+    states, in_jax = states.reshape(-1, 2), FUNCTIONS["step"][0]
+    after = jax.vmap(lambda x, u: in_jax(x, u, jnp.array(dt))["x_next"])(states[:-1], torques[:, None])
+    assert np.abs(after - states[1:]).max() < 1e-9
+
+
+@needs_compiler
+def test_c_that_casadi_generates_calls_the_library(library, tmp_path, monkeypatch):
+    """As that of acados does, which links it."""
+    step = casadi.external("casadi_model_step", str(library))
+    x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u")
+    after = step(step(x, u, 0.1), u, 0.1)
+    twice = casadi.Function("twice", [x, u], [after, casadi.jacobian(after, x), casadi.hessian(after[0], x)[0]])
+    monkeypatch.chdir(tmp_path)
+    twice.generate("twice.c")
+    compile_c(["-O1", "-w", "-fPIC", "-shared", "twice.c", str(library), "-lm", "-o", "twice.so"])
+    for ours, wanted in zip(casadi.external("twice", "./twice.so")([0.3, 1], 2), twice([0.3, 1], 2), strict=True):
+        np.testing.assert_array_equal(np.array(ours), np.array(wanted))
+
+
+REFUSED = {
+    "three axes": (lambda x: x.sum(), [np.ones((2, 2, 2))], {}, "x is real of shape .2, 2, 2.; CasADi takes"),
+    "a result of three axes": (lambda x: jnp.ones((1, 1, 1)) * x, [np.float64(1)], {}, "result is real of shape"),
+    "integers": (lambda k: 2 * k, [np.int32(1)], {}, "k is int"),
+    "empty": (lambda x: jnp.ones(2), [np.ones(0)], {}, "none of them empty"),
+    "no arguments": (lambda: jnp.ones(2), [], {}, "no arguments to differentiate"),
+    "single precision": (lambda x: x, [np.ones(2)], {"precision": "f32"}, "CasADi computes in double"),
+    "a name for itself": (lambda hess: hess, [np.ones(2)], {}, "CasADi has no such name as hess"),
+    "two underscores": (lambda x: x, [np.ones(2)], {"name": "my__arm"}, "my__arm_f"),
+    "a name twice": (lambda a, out_a: {"y": a}, [np.ones(2)] * 2, {}, "name as out_a"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_casadi_cannot_take_is_refused(case, tmp_path):
+    function, examples, keywords, message = REFUSED[case]
+    with pytest.raises(InputError, match=message) as raised:
+        export_c({"f": (function, examples)}, tmp_path / "c", casadi=True, **keywords)
+    assert "\n" not in str(raised.value) and not (tmp_path / "c").exists()
+
+
+def test_derivatives_that_take_more_than_the_stack_are_refused():
+    with pytest.raises(
+        InputError, match=r"^casadi_m_f: it would take 4 KiB of stack; .* up to 2 KiB; export it without casadi$"
+    ):
+        external_c.external_functions("m", {"f": (jnp.tanh, [np.ones(500)])}, libm=True, stack=2048)
+
+
+def test_what_casadi_cannot_take_is_left_out_where_it_may_be(tmp_path):
+    functions = {"f": (jnp.tanh, [np.ones(2)]), "g": (lambda x: x.sum(), [np.ones((2, 2, 2))]), "h": (jnp.cos, [1.0])}
+    for chosen, missing in ((True, "gi"), (("f", "g"), "ghi")):
+        folder = tmp_path / str(chosen)
+        export_c(functions, folder, casadi=chosen, leave_out_large=True)
+        text = (folder / "model_casadi.c").read_text()
+        assert [each for each in "fghi" if f"DESCRIBED(casadi_model_{each}," not in text] == list(missing)
+        assert " * Left out: casadi_model_g: x is real of shape [2, 2, 2]; CasADi takes real" in text
+        assert "model_g(" in (folder / "model.h").read_text()

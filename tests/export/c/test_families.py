@@ -1,0 +1,343 @@
+"""What is exported of each kind of model and of scenes: values of its dynamics, and derivatives of those values."""
+
+import functools
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.export.c.families import functions_of_run, functions_of_system
+from dln_jax.mechanics import integrators
+from dln_jax.mechanics.dynamics import Dynamics
+from dln_jax.mechanics.equations import Canonical, dynamics, flow
+from dln_jax.mechanics.plain import PhaseRates
+from dln_jax.mechanics.trees import inertial_parameters, serial, tree_to_json
+from dln_jax.scenes import cart_pole, chain, double_pendulum, n_body
+from dln_jax.types import InputError, Needs
+from dln_jax.zoo.catalogue import CATALOGUE
+from dln_jax.zoo.descriptions import build, describe
+from dln_jax.zoo.run import Run
+
+MIXED = Needs(joints=("prismatic", "revolute"), friction=True, actuation=((1.0,), (0.5,)))
+FREE = Needs(joints=("revolute", "revolute"), gravity=False)
+BODIES = Needs(joints=("prismatic",) * 4)
+SMALL = {"width": 4, "depth": 1}
+SWING = Needs(joints=("revolute",), friction=True)
+RODS = [inertial_parameters(1.0, [0.1, 0.2, 0.3], np.diag([0.2, 0.3, 0.4]))] * 2
+CART = serial([np.eye(3)] * 2, [[0, 0, 0], [0, 0.1, 0]], RODS, joints=MIXED.joints, axes=[[1, 0, 0], [0, 1, 0]])
+CONVEX = {**SMALL, "activation": "softplus", "iterations": 8}
+MODELS = {
+    "structured-delan": {"needs": MIXED, **SMALL},
+    "black-box-delan": {"needs": MIXED, **SMALL, "activation": "softplus"},
+    "trigonometric": {"needs": FREE, "degree": 1},
+    "trigonometric-kernel": {"needs": MIXED, "samples": 3},
+    "rigid-tree": {"needs": MIXED, "tree": tree_to_json(CART)},
+    "rigid-tree-residual": {
+        **{"needs": MIXED, "tree": tree_to_json(CART), "terms": ("potential", "dissipation", "inertia"), **SMALL},
+    },
+    "trigonometric-residual": {"needs": FREE, "degree": 1, **SMALL},
+    "trigonometric-kernel-residual": {"needs": MIXED, "samples": 3, **SMALL},
+    "planar-chain": {"needs": FREE._replace(gravity=True, friction=True), "armature": True},
+    "learned-tree": {"needs": MIXED._replace(actuation=None)},
+    "feed-forward": {"needs": MIXED, "width": 4, "depth": 2},
+    "structured-hnn": {"needs": MIXED, **SMALL, "friction_width": 2},
+    "black-box-hnn": {"needs": MIXED, **CONVEX},
+    "separable-hnn": {"needs": SWING, **CONVEX},
+    "pairwise-hnn": {"needs": BODIES, **SMALL},
+    "polynomial-hamiltonian": {"needs": SWING._replace(friction=False), "degree": 2},
+    "phase-network": {"needs": FREE, **SMALL},
+    "helmholtz-hnn": {"needs": FREE, **SMALL},
+    "differential-network": {"sizes": [2, 4, 3], "activation": "tanh", "members": 2},
+    "latent-phase": {"field": "black-box-hnn", "pixels": 6, "components": 2, "width": 3, "field_width": 3},
+}
+SCENES = {
+    "cart-pole": functools.partial(cart_pole, friction=0.3),
+    "double-pendulum": double_pendulum,
+    "two-body": functools.partial(n_body, 2),
+    "chain-1": functools.partial(chain, 1),
+}
+DT = 0.02
+
+
+def run_of(name, precision="f64"):
+    """A model whose parameters no initialisation would give: biases are not zero."""
+    description = describe(name, precision=precision, **MODELS[name])
+    model, random = build(description), np.random.default_rng(3)
+    if CATALOGUE[name].properties.linear and not CATALOGUE[name].properties.canonical:  # starts from a definite M
+        started = model.init(jax.random.key(0))
+        return Run(model, jax.tree.map(lambda leaf: leaf + 0.02 * random.normal(size=leaf.shape), started), description)
+
+    def drawn(path, leaf):
+        values = 0.4 * random.normal(size=leaf.shape)
+        # Convex in its inputs, so that mass matrices are definite and each velocity has a momentum.
+        convex = MODELS[name].get("activation") == "softplus" and "linear_0" not in str(path) and len(leaf.shape) == 2
+        return jnp.asarray(np.abs(values) + 0.1 if convex else values, leaf.dtype)
+
+    # Drawn here and not by `init`, which is slow to compile.
+    like = jax.eval_shape(model.init, jax.random.key(0))
+    return Run(model, jax.tree_util.tree_map_with_path(drawn, like), description)
+
+
+def states_of(system, d, controls):
+    """By the name of an argument, three of them."""
+    random = np.random.default_rng(1)
+    states = {name: random.uniform(-1, 1, (3, d)) for name in ("q", "qd", "qdd", "tau", "p")}
+    states["u"] = random.normal(size=(3, controls))
+    if isinstance(system, Canonical):  # velocities that have momenta
+        rates = jax.jit(jax.vmap(lambda q, p: flow(system).rates(q, p)[0]))
+        states["qd"] = rates(states["q"], 0.5 * states["p"])
+    return {**states, "x": np.concatenate([states["q"], states["qd"]], axis=1), "dt": np.full(3, DT)}
+
+
+def definitions(system, needs):
+    """By the name of a function, what it is by the mechanics of the system."""
+    B = np.eye(needs.degrees_of_freedom) if needs.actuation is None else np.asarray(needs.actuation)
+    expected = {}
+    if not isinstance(system, PhaseRates):
+        motion = dynamics(system)
+
+        def force(q, qd, qdd):
+            return motion.decompose(q, qd, qdd)
+
+        def stepped(make):
+            def step(x, u, dt):
+                field = integrators.second_order(lambda t, q, qd: motion.forward_dynamics(q, qd, B @ u))
+                return {"x_next": jnp.concatenate(make(field)(0.0, tuple(jnp.split(x, 2)), dt))}
+
+            return step
+
+        expected |= {
+            "inverse_dynamics": lambda q, qd, qdd: {"tau": motion.inverse_dynamics(q, qd, qdd)},
+            "forward_dynamics": lambda q, qd, tau: {"qdd": motion.forward_dynamics(q, qd, tau)},
+            "gravity": lambda q: {"g": force(q, 0 * q, 0 * q).gravity},
+            "coriolis": lambda q, qd: {"c": force(q, qd, 0 * q).coriolis},
+            "step_rk4": stepped(integrators.rk4),
+            "step_implicit_midpoint": stepped(functools.partial(integrators.implicit_midpoint, tolerance=1e-13)),
+        }
+        if isinstance(motion, Dynamics):
+            expected |= {
+                "energy": lambda q, qd: {"energy": motion.energy(q, qd)},
+                "mass_matrix": lambda q, qd: {"M": motion.mass_matrix(q, qd)},
+                "friction": lambda q, qd: {"tau_friction": motion.friction(q, qd)},
+            }
+    if isinstance(system, Canonical | PhaseRates):
+        moving = flow(system)
+
+        def phase(make):
+            def step(q, p, dt):
+                q, p = make(lambda t, state: moving.rates(*state))(0.0, (q, p), dt)
+                return {"q_next": q, "p_next": p}
+
+            return step
+
+        expected |= {
+            "rates": lambda q, p: dict(zip(("qd", "pd"), moving.rates(q, p), strict=True)),
+            "phase_step_rk4": phase(integrators.rk4),
+            "phase_step_implicit_midpoint": phase(functools.partial(integrators.implicit_midpoint, tolerance=1e-13)),
+        }
+        if isinstance(system, Canonical):
+            expected["hamiltonian"] = lambda q, p: {"H": moving.energy(q, p)}
+    return expected
+
+
+def with_derivatives(name, expected, arguments):
+    """A definition and its derivatives, by the names that they are exported under."""
+    places = tuple(k for k, each in enumerate(arguments) if each != "dt")
+    differentiated = jax.jacfwd(lambda *state: (expected(*state),) * 2, argnums=places, has_aux=True)
+
+    def derivatives(*state):
+        slopes, values = differentiated(*state)
+        named = {
+            f"{result}_{key}": each for result, by in slopes.items() for key, each in zip(arguments, by, strict=False)
+        }
+        if name.startswith("step"):
+            named = {"A": named["x_next_x"], "B": named["x_next_u"]}
+        return {**values, **named} if "step" in name else named
+
+    return {name: expected, f"{name}_jacobian": derivatives, f"{name}_gradient": derivatives}
+
+
+def system_of(case):
+    """Functions, the system that they are of, and its needs."""
+    if case in MODELS:
+        run = run_of(case)
+        return functions_of_run(run, precision="f64"), run.energies, MODELS[case]["needs"]
+    scene = SCENES[case.removesuffix("-lagrangian")]()
+    system = scene.energies if case.endswith("-lagrangian") else scene.closed_form
+    return (
+        functions_of_system(system, len(scene.needs.joints), dtype=float, actuation=scene.needs.actuation),
+        system,
+        scene.needs,
+    )
+
+
+CASES = [*(name for name in MODELS if "needs" in MODELS[name]), *SCENES, "double-pendulum-lagrangian"]
+DEFAULT = ("structured-delan", "black-box-delan", "black-box-hnn", "feed-forward", "phase-network", "cart-pole")
+"""One of each sort of record; the others by `--every-export`."""
+STEPPED = ("cart-pole", "phase-network")
+"""Steps call the same functions of every system, and take long to compile."""
+HAMILTONIANS = ("black-box-hnn", "separable-hnn", "polynomial-hamiltonian")
+"""Of one record, whose Newton iterations take long to trace: what is differentiated as for others is left out."""
+LACKING = {
+    "structured-delan": set(),
+    "trigonometric": {"gravity", "friction"},
+    "feed-forward": {"energy", "mass_matrix", "friction"},
+    "structured-hnn": set(),
+    "phase-network": {"hamiltonian"},
+    "pairwise-hnn": {"friction"},
+    "double-pendulum": {"friction"},
+}
+"""Functions that some systems of the kind have."""
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_functions_and_their_derivatives_are_those_of_the_mechanics(case, pytestconfig):
+    if case not in DEFAULT and not pytestconfig.getoption("--every-export"):
+        pytest.skip("is tried with --every-export")
+    functions, system, needs = system_of(case)
+    # As exported, traced once.
+    system = system._replace(**{name: jax.jit(each) for name, each in system._asdict().items() if callable(each)})
+    controls = len(needs.joints) if needs.actuation is None else len(needs.actuation[0])
+    states = states_of(system, len(needs.joints), controls)
+    expected = {}
+    for name, function in definitions(system, needs).items():
+        arguments = list(inspect.signature(function).parameters)
+        expected |= {key: (each, arguments) for key, each in with_derivatives(name, function, arguments).items()}
+    tried = [name for name in functions if case in STEPPED or "step" not in name]
+    if case in HAMILTONIANS:
+        own = ("inverse", "forward", "rates", "hamiltonian")
+        tried = [name for name in tried if name.startswith(own) or name in ("coriolis", "energy", "mass_matrix")]
+    given = {name: list(inspect.signature(function).parameters) for name, (function, _) in functions.items()}
+    for name, (_, examples) in functions.items():
+        assert [(each.shape, each.dtype) for each in examples] == [
+            (states[key][0].shape, "float64") for key in given[name]
+        ]
+
+    @jax.jit
+    def everything(states):
+        got = {name: jax.vmap(functions[name][0])(*(states[key] for key in given[name])) for name in tried}
+        wanted = {name: jax.vmap(expected[name][0])(*(states[key] for key in expected[name][1])) for name in tried}
+        return got, wanted
+
+    got, wanted = everything(states)
+    for name in tried:
+        assert np.isfinite(jax.tree.leaves(wanted[name])[0]).all()
+        for result, array in got[name].items():
+            scale = max(1, np.abs(wanted[name][result]).max())
+            np.testing.assert_allclose(array, wanted[name][result], rtol=0, atol=1e-10 * scale, err_msg=name)
+
+
+@pytest.mark.parametrize("case", LACKING)
+def test_what_a_system_lacks_is_not_exported(case):
+    functions, system, _ = system_of(case)
+    kind = ["rates", "hamiltonian"] * isinstance(system, Canonical | PhaseRates)
+    kind += ["gravity", "energy", "mass_matrix", "friction"] * (not isinstance(system, PhaseRates))
+    assert {name for name in kind if name not in functions} == LACKING[case]
+
+
+def test_a_step_has_the_derivatives_of_finite_differences():
+    """Of an under-actuated scene, and by dt too."""
+    scene = SCENES["cart-pole"]()
+    functions = functions_of_system(scene.closed_form, 2, dtype=float, actuation=scene.needs.actuation)
+    step, state = functions["step_implicit_midpoint"][0], jnp.array([0.1, 2.0, -0.4, 1.5, 0.7, DT])
+
+    @jax.jit
+    @jax.vmap
+    def stepped(state):
+        return step(state[:4], state[4:5], state[5])["x_next"]
+
+    shifts = 1e-5 * np.eye(6)
+    slopes = jax.jit(jax.jacrev(lambda state: stepped(state[None])[0]))(state)
+    rates = (stepped(state + shifts) - stepped(state - shifts)) / 2e-5
+    np.testing.assert_allclose(slopes, rates.T, rtol=0, atol=1e-7)
+
+
+def test_a_differential_network_has_the_means_over_its_members():
+    run, x = run_of("differential-network"), jnp.array([0.3, -0.8])
+    functions = functions_of_run(run, precision="f64")
+    expected = dict(zip(("y", "jacobian", "hessian"), run.derivatives(x), strict=True))
+    results = {"value": ["y"], "value_and_jacobian": ["y", "jacobian"], "value_jacobian_hessian": [*expected]}
+    assert list(functions) == list(results)
+    for name, names in results.items():
+        got = functions[name][0](x)
+        assert list(got) == names
+        for key, array in got.items():
+            np.testing.assert_allclose(array, expected[key], rtol=1e-12)
+
+
+def test_pictures_have_their_networks_and_the_steps_of_their_latent_phase():
+    run = run_of("latent-phase")
+    functions = {name: jax.jit(function) for name, (function, _) in functions_of_run(run, precision="f64").items()}
+    frames, dt = jnp.linspace(0, 1, 12), jnp.array(DT)
+    q, p = functions["encode"](frames).values()
+    np.testing.assert_allclose((q, p), run.pictures.encode(frames))
+    np.testing.assert_allclose(functions["decode"](q, p)["frames"], run.pictures.decode(q, p))
+    np.testing.assert_allclose([*functions["rates"](q, p).values()], run.pictures.field.rates(q, p))
+    got = functions["phase_step_rk4"](q, p, dt)
+    for key, wanted in zip(
+        got, integrators.rk4(lambda t, x: run.pictures.field.rates(*x))(0.0, (q, p), dt), strict=True
+    ):
+        np.testing.assert_allclose(got[key], wanted, rtol=1e-12)
+
+
+def float64_in(jaxpr):
+    """Whether anything is computed in it, in functions that are called too."""
+    inner = (leaf for each in jaxpr.eqns for leaf in jax.tree.leaves(each.params, is_leaf=lambda x: hasattr(x, "eqns")))
+    every = [getattr(each, "jaxpr", each) for each in inner]
+    return any(each.aval.dtype == "float64" for line in jaxpr.eqns for each in line.outvars) or any(
+        float64_in(each) for each in every if hasattr(each, "eqns")
+    )
+
+
+@pytest.mark.parametrize("case", ["structured-delan", "differential-network", "cart-pole"])
+def test_nothing_is_computed_in_double_precision_for_single(case):
+    if case in SCENES:
+        scene = SCENES[case]()
+        functions = functions_of_system(scene.closed_form, 2, dtype=np.float32, actuation=scene.needs.actuation)
+    else:
+        functions = functions_of_run(run_of(case), precision="f32")
+    for name, (function, examples) in functions.items():
+        if name.endswith("jacobian") and not name.startswith(("inverse", "step_implicit")):
+            continue
+        assert not float64_in(jax.make_jaxpr(function)(*examples).jaxpr), name
+    if case == "structured-delan":
+        name = "inverse_dynamics_jacobian"
+        wide = functions_of_run(run_of(case), precision="f64", names=[name])[name][0]
+        state = [np.full(2, each) for each in (0.2, -0.4, 0.9)]
+        got = jax.jit(functions[name][0])(*(np.float32(each) for each in state))
+        for key, array in jax.jit(wide)(*state).items():
+            assert got[key].dtype == "float32"
+            np.testing.assert_allclose(got[key], array, rtol=0, atol=1e-5)
+
+
+def test_a_step_that_is_not_found_is_nan():
+    """Ten seconds of a fast pendulum; and a NaN in the state makes every result one."""
+    functions = functions_of_system(double_pendulum().closed_form, 2, dtype=float)
+    step = jax.jit(functions["step_implicit_midpoint"][0])
+    fast = jnp.array([1.0, 2.0, 20.0, -30.0])
+    assert jnp.isnan(step(fast, jnp.zeros(2), 10.0)["x_next"]).all()
+    assert jnp.isfinite(step(fast, jnp.zeros(2), 0.001)["x_next"]).all()
+    assert jnp.isnan(step(fast.at[0].set(jnp.nan), jnp.zeros(2), 0.001)["x_next"]).all()
+
+
+def test_mistakes_are_named():
+    run = run_of("structured-delan")
+    assert list(functions_of_run(run, precision="f32", names=["gravity"])) == ["gravity"]
+    own = Run(run.model, run.parameters, {**run.description, "name": "own"})
+    large = Run(run.model, jax.tree.map(lambda leaf: leaf * 1e300, run.parameters), run.description)
+    cases = {
+        "a structured-delan has no sped, value; choose from inverse_dynamics, ": lambda: functions_of_run(
+            run, precision="f64", names=["sped", "gravity", "value"]
+        ),
+        "which float32 cannot hold": lambda: functions_of_run(large, precision="f32"),
+        "precision is 'f16'": lambda: functions_of_run(run, precision="f16"),
+        "of one's own is exported in f64": lambda: functions_of_run(own, precision="f32"),
+        "iterations is 0": lambda: functions_of_system(run.energies, 2, dtype=float, iterations=0),
+    }
+    for message, call in cases.items():
+        with pytest.raises(InputError, match=message) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    assert {*MODELS} == {*CATALOGUE}

@@ -1,0 +1,98 @@
+"""Which functions of a source are one function, and what an export leaves behind in the process."""
+
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.export.c import jaxprs
+from dln_jax.export.c.families import functions_of_system
+from dln_jax.export.c.load import load_c
+from dln_jax.export.c.source import export_c, source_files
+from dln_jax.scenes.chain import chain
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="there is no C compiler on the PATH"
+)
+
+
+@pytest.fixture(autouse=True)
+def small_functions_are_called(monkeypatch):
+    """Not inlined, as only large ones are otherwise."""
+    monkeypatch.setattr(jaxprs, "_LARGE_CALL", 6)
+
+
+def model(weights):
+    """A jitted function, whose constants are in a jitted function inside of it."""
+
+    @jax.jit
+    def layer(x):
+        return jnp.tanh(weights @ x)
+
+    @jax.jit
+    def deep(x):
+        return layer(layer(x) + 0.1 * x) - x
+
+    return deep
+
+
+W = np.random.default_rng(0).normal(size=(3, 3)) / 3
+STATE = np.array([0.3, -0.2, 0.5])
+
+
+def of_two(f, g):
+    return lambda x: (f(x), g(x), f(2 * x), g(2 * x))
+
+
+def parts(files):
+    return files["model.c"].decode().count("static void part_")
+
+
+@needs_compiler
+def test_two_models_in_one_export_keep_their_own_weights(tmp_path):
+    old, retrained = model(W), model(1.1 * W)
+    functions = {"old": (lambda x: old(old(x)), (STATE,)), "retrained": (lambda x: retrained(retrained(x)), (STATE,))}
+    export_c(functions, tmp_path)
+    loaded = load_c(tmp_path)
+    for name, (function, _) in functions.items():
+        np.testing.assert_allclose(getattr(loaded, name)(STATE), function(STATE), rtol=1e-12)
+
+
+@needs_compiler
+def test_members_of_an_ensemble_keep_their_own_weights(tmp_path):
+    function = of_two(model(W), model(1.1 * W))
+    export_c({"both": (function, (STATE,))}, tmp_path)
+    for ours, theirs in zip(load_c(tmp_path).both(STATE), function(STATE), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+def test_functions_of_equal_programs_are_one_however_they_came_about():
+    alike, differing = of_two(model(W), model(W.copy())), of_two(model(W), model(np.nextafter(W, 1)))
+    assert parts(source_files({"f": (alike, (STATE,))}, name="model")) == 1
+    assert parts(source_files({"f": (differing, (STATE,))}, name="model")) == 2
+
+
+def test_what_is_left_out_leaves_nothing_behind():
+    """Neither tables nor functions that only it would have called."""
+    large = np.random.default_rng(0).normal(size=(200, 200))
+    small = {"f": (lambda x: 2 * x, (STATE,))}
+    both = {"large": (lambda x: jnp.linalg.solve(large * x, large), (np.ones(()),)), **small}
+    kept = source_files(both, name="model", leave_out_large=True)["model.c"]
+    assert kept == source_files(small, name="model")["model.c"]
+
+
+def test_precisions_may_follow_each_other_in_a_process(tmp_path):
+    system, q = chain(3).closed_form, np.array([0.3, -0.4, 0.5])
+    before = jax.jit(system.gravity)(q)
+    texts = []
+    for turn, (precision, dtype) in enumerate(2 * [("f64", np.float64), ("f32", np.float32)]):
+        functions = functions_of_system(system, 3, dtype=dtype)
+        chosen = {"gravity_jacobian": functions["gravity_jacobian"]}
+        texts.append(source_files(chosen, name="model", precision=precision))
+        np.testing.assert_array_equal(jax.jit(system.gravity)(q), before, err_msg=str(turn))
+    assert texts[:2] == texts[2:]
+    with jax.enable_x64(False):
+        again = source_files(chosen, name="model", precision="f64")["model.c"]
+    assert again == texts[0]["model.c"]  # constants are not rounded

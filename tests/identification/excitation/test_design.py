@@ -1,0 +1,230 @@
+"""Motions designed to show parameters do so better than random ones of the same limits, and keep the limits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dln_jax.identification.excitation.candidates import FINER, functions_at, grid, random_designs, states
+from dln_jax.identification.excitation.design import (
+    CRITERIA,
+    as_trajectories,
+    best_design,
+    design_set,
+    error_ratio,
+    make_optimiser,
+    together,
+)
+from dln_jax.identification.excitation.fourier import FourierMotion, require_sampling, rest_basis, sampled, state
+from dln_jax.identification.excitation.limits import MotionLimits, heights_above, used, worst
+from dln_jax.identification.excitation.task import independent_columns, linear_force, make_task
+from dln_jax.learning.linear import fit_linear, linearised
+from dln_jax.mechanics import trees
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.models.rigid_tree import make_rigid_tree
+from dln_jax.types import InputError
+
+RIGHT = np.pi / 2
+LINK = trees.inertial_parameters(1.5, [0.25, 0.02, 0.01], np.diag([0.01, 0.02, 0.03]))
+# Both axes level, so that the arm swings in a vertical plane.
+ARM = trees.serial(*trees.dh_frames([[-RIGHT, 0, 0.3, 0], [0, 0.5, 0, 0]]), [LINK, LINK], armature=[0.1, 0.05])
+LIMITS = MotionLimits(
+    position=np.array([[-2.0, 1.0], [-2.5, 2.5]]),
+    velocity=np.array([2.0, 3.0]),
+    acceleration=np.array([8.0, 12.0]),
+    force=np.array([[-22.0, 22.0], [-np.inf, np.inf]]),
+)
+MODEL = make_rigid_tree(ARM, friction=True, velocity_scale=0.1)
+PARAMETERS = MODEL.init(jax.random.key(0))._replace(viscous=np.array([0.5, 0.3]), coulomb=np.array([0.8, 0.4]))
+
+
+@pytest.fixture(scope="module")
+def task():
+    heights = heights_above(ARM, -0.1)
+    return make_task(MODEL, PARAMETERS, LIMITS, period=6.0, harmonics=3, clearance=heights, noise=[0.2, 0.1])
+
+
+@pytest.fixture(scope="module")
+def drawn(task):
+    return random_designs(task, 8, seed=1)
+
+
+@pytest.fixture(scope="module")
+def designed(task, drawn):
+    """By criterion, the best of two starts."""
+    return {
+        name: best_design(task, make_optimiser(task, judge, rounds=6, iterations=40), judge, drawn[:2])
+        for name, judge in CRITERIA.items()
+    }
+
+
+def test_random_motions_break_no_limit_and_use_some(drawn):
+    for design in drawn:
+        assert 0 < design.slack < 0.1
+
+
+def test_the_condition_falls(drawn, designed):
+    assert designed["condition"].condition < 0.75 * np.median([each.condition for each in drawn])
+
+
+def test_the_information_rises(drawn, designed):
+    middle = sorted(drawn, key=lambda each: each.log_determinant)[len(drawn) // 2]
+    assert error_ratio([designed["information"]], [middle]) < 0.75
+    assert designed["information"].log_determinant > max(each.log_determinant for each in drawn)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_limits_hold_at_ten_times_the_samples_that_were_checked(task, designed, criterion):
+    motion = designed[criterion].motion
+    q, qd, qdd = states(functions_at(task, grid(task, 10 * FINER)), motion.offset, motion.coefficients)
+    tau = jax.jit(jax.vmap(dynamics(MODEL.energies(PARAMETERS)).inverse_dynamics))(q, qd, qdd)
+    assert np.all(q >= LIMITS.position[:, 0]) and np.all(q <= LIMITS.position[:, 1])
+    assert np.all(abs(qd) <= LIMITS.velocity) and np.all(abs(qdd) <= LIMITS.acceleration)
+    assert np.all(abs(tau[:, 0]) <= LIMITS.force[0, 1])
+    elbow = jax.jit(jax.vmap(lambda q: trees.world_frames(ARM, q)[1][1, 2]))(q)
+    assert np.all(elbow >= -0.1)
+
+
+def test_a_limit_that_would_be_broken_matters(task, designed):
+    """The force and the plane are what these motions are held back by."""
+    free = LIMITS._replace(force=np.full((2, 2), [-np.inf, np.inf]))
+    wider = make_task(MODEL, PARAMETERS, free, period=6.0, harmonics=3, noise=[0.2, 0.1])
+    judge = CRITERIA["information"]
+    found = make_optimiser(wider, judge, rounds=6, iterations=40)(designed["information"])
+    assert found is not None and found.log_determinant > designed["information"].log_determinant
+
+
+def test_motions_rest_at_both_ends_and_rates_are_derivatives(task, designed):
+    motion = designed["information"].motion
+    ends = sampled(motion, np.array([0.0, task.period]))
+    assert np.allclose(ends[0][0], ends[0][1], atol=1e-12)
+    assert np.abs(np.array(ends[1:])).max() < 1e-12
+    both = jax.jit(lambda t: jax.jvp(lambda t: state(motion, t), (t,), (1.0,)))
+    for t in (0.7, 3.1):
+        (_q, qd, qdd), slope = both(t)
+        assert np.allclose(slope[0], qd, atol=1e-12) and np.allclose(slope[1], qdd, atol=1e-12)
+
+
+def test_rest_basis_spans_all_that_rests():
+    basis = rest_basis(4)
+    assert np.allclose(basis.T @ basis, np.eye(6), atol=1e-12)
+    random = FourierMotion(np.zeros(1), np.random.default_rng(0).normal(size=(1, 6)) @ basis.T, 3.0)
+    assert np.abs(np.array(state(random, 0.0)[1:])).max() < 1e-12
+
+
+def test_base_parameters_of_a_plane_arm(task):
+    """Two links in a plane: I_zz, h_x, h_y each (the first with the second's mass), the second's motor; friction."""
+    assert task.columns.size == 7 + 6
+
+
+def test_columns_that_others_explain_are_left_out():
+    A = np.random.default_rng(0).normal(size=(40, 3))
+    A = np.column_stack([A[:, 0], np.zeros(40), A[:, 1], A[:, 0] - 2 * A[:, 1], 1e3 * A[:, 2]])
+    kept = independent_columns(A)
+    assert kept.size == 3 and 4 in kept and 1 not in kept
+    # What right angles of a file leave is not taken to be a parameter.
+    assert (
+        independent_columns(np.column_stack([A, A[:, 0] + 1e-4 * np.random.default_rng(1).normal(size=40)])).size == 3
+    )
+
+
+def test_the_regressor_and_its_slope_are_those_of_autodiff():
+    regressor, theta = linear_force(MODEL, PARAMETERS)
+    regressor, by_autodiff = jax.jit(regressor), jax.jit(lambda *at: linearised(MODEL, PARAMETERS, *at))
+    q, qd, qdd = (jnp.array(each) for each in ([0.3, -1.1], [0.05, -0.8], [2.0, 1.0]))
+    Phi, tau = by_autodiff(q, qd, qdd)
+    assert np.allclose(regressor(q, qd, qdd), Phi, atol=1e-12) and np.allclose(Phi @ theta, tau, atol=1e-12)
+    rows = np.random.default_rng(0).normal(size=Phi.shape)
+    slopes = [
+        jax.jit(jax.grad(lambda *at, f=f: jnp.sum(rows * f(*at)), argnums=(0, 1, 2)))(q, qd, qdd)
+        for f in (regressor, lambda *at: by_autodiff(*at)[0])
+    ]
+    assert np.allclose(*map(np.array, slopes), atol=1e-10)
+
+
+def test_a_design_measures_what_it_says(task, designed):
+    design = designed["information"]
+    A = design.information
+    assert np.isclose(np.linalg.slogdet(A)[1], design.log_determinant)
+    assert np.allclose(together([design, design]), (design.condition, design.log_determinant))
+    assert np.isclose(CRITERIA["information"](jnp.asarray(A)), -design.log_determinant / (2 * len(A)))
+    # Smooth means lie beyond the largest and the smallest, by at most the number of them.
+    above = float(CRITERIA["condition"](jnp.asarray(A))) - np.log(design.condition)
+    assert 0 <= above <= np.log(len(A)) / 4
+
+
+def test_least_squares_on_the_motions_finds_the_parameters(task, drawn):
+    """Written as data, with the forces of the nominal model: they are what the model predicts, and of full rank."""
+    train, validation = design_set(task, drawn[:3], trajectories=2)
+    data = as_trajectories(
+        [*train, validation], ["a", "b", "v"], MODEL, PARAMETERS, rate=50.0, needs=ARM.needs._replace(friction=True)
+    )
+    assert data.t.shape == (3 * 301,) and np.abs(data.qd[data.t == 0.0]).max() < 1e-12
+    found = fit_linear(MODEL, data, rank_tolerance=1e-8, negligible=1e-12)
+    assert found.rank == task.columns.size
+    assert found.torque_mse < 1e-18
+    # Both motions are worth more than twice the better one alone is: they were not designed apart.
+    assert error_ratio(train, drawn[:2]) < 0.8
+
+
+def test_used_limits_shrink_towards_the_middle():
+    found = used(LIMITS, 0.5)
+    assert np.allclose(found.position, [[-1.25, 0.25], [-1.25, 1.25]])
+    assert np.allclose(found.velocity, [1.0, 1.5]) and np.isinf(found.force[1]).all() and found.force[0, 1] == 11.0
+
+
+def test_heights_leave_out_what_cannot_sink():
+    heights = heights_above(ARM, 0.1)
+    assert heights is not None
+    # The first link turns about the origin; the second is half a metre away.
+    reach = [float(heights(jnp.array([q, 0.0]))[0]) for q in (-RIGHT, RIGHT)]
+    assert np.allclose(sorted(reach), [-0.5 - 0.1, 0.5 - 0.1], atol=1e-12)
+    assert np.allclose(heights(jnp.array([0.0, 0.0])), [-0.1], atol=1e-12)
+    assert heights_above(trees.serial(*trees.dh_frames([[0, 0, 0.3, 0]]), [LINK]), 0.0) is None
+
+
+def test_the_largest_excess_is_named(task):
+    q, qd, zero = jnp.array([-0.5, 0.0]), jnp.array([0.0, 4.0]), jnp.zeros(2)
+    beyond, kind = worst(jax.jit(task.observe)(q, qd, zero)[2])
+    assert kind == "velocity" and np.isclose(beyond, 4.0 / 3.0 - 1)
+
+
+BAD = {
+    "no limit of velocity": lambda: _task(limits=LIMITS._replace(velocity=np.array([2.0, np.inf]))),
+    "limit of force on one side": lambda: _task(limits=LIMITS._replace(force=np.array([[-np.inf, 1.0], [-1, 1]]))),
+    "limits of position": lambda: _task(limits=LIMITS._replace(position=LIMITS.position[:, ::-1])),
+    "limits of acceleration have shape": lambda: _task(limits=LIMITS._replace(acceleration=np.ones(3))),
+    "harmonics is 1;": lambda: _task(harmonics=1),
+    "harmonics is 51;": lambda: _task(harmonics=51),
+    "period is 0": lambda: _task(period=0.0),
+    "noise is": lambda: _task(noise=[0.1, 0.0]),
+    "share is 1.5": lambda: used(LIMITS, 1.5),
+    "half the sampling rate": lambda: require_sampling(period=2.0, harmonics=10, rate=10.0),
+    "seconds is 0": lambda: require_sampling(period=0.0, harmonics=5, rate=10.0),
+}
+
+
+def _task(limits=LIMITS, **settings):
+    return make_task(MODEL, PARAMETERS, limits, **settings)
+
+
+@pytest.mark.parametrize("said", BAD)
+def test_bad_input_is_one_line(said):
+    with pytest.raises(InputError, match=said) as error:
+        BAD[said]()
+    assert "\n" not in str(error.value)
+
+
+def test_limits_that_no_motion_keeps_are_said(task):
+    weak = LIMITS._replace(force=np.array([[-0.1, 0.1], [-0.1, 0.1]]))
+    impossible = make_task(MODEL, PARAMETERS, weak, period=6.0, harmonics=3)
+    with pytest.raises(InputError, match="force by"):
+        random_designs(impossible, 1)
+
+
+@pytest.mark.parametrize(
+    "arguments, said", [({"criterion": "best"}, "choose from"), ({"trajectories": 8}, "8 starts are fewer")]
+)
+def test_sets_that_cannot_be_designed(task, drawn, arguments, said):
+    with pytest.raises(InputError, match=said):
+        design_set(task, drawn, **arguments)

@@ -1,0 +1,218 @@
+"""Letters: smooth in time, true to the font, inside the arm's workspace, the same everywhere."""
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import matplotlib
+import numpy as np
+import pytest
+
+from dln_jax.scenes.datasets.letters import LETTERS, letter_path, outline
+from dln_jax.types import InputError
+
+HEIGHT = 0.55
+CENTRE = np.array([1.05, 0.45])
+
+
+def motion(position, time):
+    """Position, velocity and acceleration at one time."""
+
+    def velocity(at):
+        return jax.jvp(position, (at,), (jnp.ones_like(at),))[1]
+
+    return position(time), *jax.jvp(velocity, (time,), (jnp.ones_like(time),))
+
+
+# `position` is an argument: letters with equally many strokes share one compilation.
+compiled_motions = jax.jit(jax.vmap(motion, in_axes=(None, 0)))
+SAMPLES = 1201
+
+
+def motions(path, times):
+    """Position, velocity and acceleration [times, 2]; padded to one length: one compilation."""
+    padded = np.pad(np.asarray(times), (0, SAMPLES - len(times)), mode="edge")
+    return tuple(np.asarray(values)[: len(times)] for values in compiled_motions(path.position, padded))
+
+
+@pytest.fixture(scope="module", params=list(LETTERS))
+def letter(request):
+    """A letter with its motion at SAMPLES times."""
+    path = letter_path(request.param)
+    times = np.linspace(0.0, path.duration, SAMPLES)
+    return request.param, path, times, *motions(path, times)
+
+
+def junctions(path):
+    """Times at which strokes begin, and the end: contours are strokes 0, 2, 4, ..."""
+    starts = np.asarray(path.position.args[0].starts) * path.duration
+    return np.append(starts, path.duration)
+
+
+def placed_outline(character):
+    """The font's polygons in m, where `letter_path` puts them."""
+    polygons = outline(character)
+    widths = np.concatenate(polygons)[:, 0]
+    x_height = outline("x")[0][:, 1].max()
+    middle = 0.5 * np.array([widths.min() + widths.max(), x_height])
+    return [(polygon - middle) * HEIGHT / x_height + CENTRE for polygon in polygons]
+
+
+def distance(points, polygons):
+    """Distance of each point [n, 2] to the nearest edge of the polygons."""
+    edges = [np.concatenate([polygon[:-1], polygon[1:]], axis=1) for polygon in polygons]
+    start, end = np.split(np.concatenate(edges), 2, axis=1)
+    along = end - start
+    length_squared = np.maximum((along**2).sum(-1), 1e-30)
+    offset = points[:, None] - start
+    part = np.clip((offset * along).sum(-1) / length_squared, 0.0, 1.0)
+    return np.linalg.norm(offset - part[..., None] * along, axis=-1).min(axis=1)
+
+
+def test_derivatives_agree_with_finite_differences(letter):
+    _, path, times, _, velocity, acceleration = letter
+
+    def errors(step):
+        inner = times[20:-20:7]
+        before, here, after = (motions(path, inner + k * step)[0] for k in (-1, 0, 1))
+        slope = (after - before) / (2.0 * step) - velocity[20:-20:7]
+        bend = (after - 2.0 * here + before) / step**2 - acceleration[20:-20:7]
+        return np.abs(slope).max(), np.abs(bend).max()
+
+    coarse, fine = errors(4e-3), errors(1e-3)
+    # Second order in both; where strokes and ramps join the jerk has kinks, hence 8 and not 16.
+    assert fine[0] < coarse[0] / 8.0 and fine[0] < 2e-4
+    assert fine[1] < coarse[1] / 8.0 and fine[1] < 5e-3
+
+
+def test_one_sided_values_agree_at_the_junctions(letter):
+    _, path, *_ = letter
+    inner = junctions(path)[1:-1]
+    if inner.size == 0:
+        assert len(outline(letter[0])) == 1
+        return
+    for gap, bound in ((1e-4, 1e-2), (1e-6, 1e-6)):
+        before = motions(path, inner - gap)
+        after = motions(path, inner + gap)
+        for left, right in zip(before, after, strict=True):
+            np.testing.assert_allclose(left, right, rtol=0.0, atol=bound)
+
+
+def test_acceleration_does_not_jump(letter):
+    """Halving the step halves the largest difference of neighbouring accelerations."""
+    acceleration = letter[-1]
+    jumps = [np.abs(np.diff(acceleration[::stride], axis=0)).max() for stride in (4, 2, 1)]
+    assert jumps[1] < 0.6 * jumps[0] and jumps[2] < 0.6 * jumps[1]
+
+
+def test_rests_at_every_junction_and_outside(letter):
+    _, path, *_ = letter
+    ends = np.concatenate([junctions(path), [-0.5, path.duration + 0.5]])
+    position, velocity, acceleration = motions(path, ends)
+    np.testing.assert_allclose(velocity, 0.0, atol=1e-12)
+    np.testing.assert_allclose(acceleration, 0.0, atol=1e-9)
+    np.testing.assert_allclose(position[-2], position[0], atol=1e-12)
+    np.testing.assert_allclose(position[-1], position[-3], atol=1e-12)
+
+
+def test_contours_are_closed(letter):
+    character, path, *_ = letter
+    corners = motions(path, junctions(path))[0]
+    assert len(corners) == 2 * len(outline(character))
+    np.testing.assert_allclose(corners[0::2], corners[1::2], rtol=0.0, atol=1e-12)
+
+
+def test_follows_the_outline(letter):
+    character, path, times, position, *_ = letter
+    polygons = placed_outline(character)
+    stroke = np.searchsorted(junctions(path), times, side="right") - 1
+    drawn = [position[stroke == index] for index in range(0, 2 * len(polygons) - 1, 2)]
+    assert distance(np.concatenate(drawn), polygons).max() < 0.03 * HEIGHT
+    # Corners of the font lie farther out than the pen goes.
+    assert distance(np.concatenate(polygons), drawn).max() < 0.07 * HEIGHT
+
+
+def test_stays_in_the_workspace(letter):
+    _, path, times, position, velocity, acceleration = letter
+    assert np.all(position > [0.4, -0.15]) and np.all(position < [1.7, 1.2])
+    reach = np.linalg.norm(position, axis=1)
+    assert reach.min() > 0.25 and reach.max() < 1.85
+    assert 3.0 <= path.duration <= 8.0
+    speed = np.linalg.norm(velocity, axis=1)
+    assert 0.5 < speed.max() < 2.0
+    assert np.trapezoid(speed, times) / path.duration == pytest.approx(0.53, rel=1e-4)
+    assert 2.0 < np.linalg.norm(acceleration, axis=1).max() < 7.0
+
+
+def test_scaling_of_time_and_place():
+    slow, fast = letter_path("e"), letter_path("e", mean_speed=1.06, centre=(2.05, -0.55))
+    assert fast.duration == pytest.approx(slow.duration / 2.0)
+    relative = np.linspace(0.0, 1.0, 101)
+    there, here = (motions(path, relative * path.duration)[0] for path in (fast, slow))
+    np.testing.assert_allclose(there, here + np.array([1.0, -1.0]), atol=1e-9)
+
+
+def test_is_the_same_on_every_machine():
+    """Values written down once: neither platform nor version of matplotlib may move them."""
+    path = letter_path("a")
+    assert path.duration == pytest.approx(6.067241610475574, rel=1e-9)
+    found = motions(path, np.array([0.3, 0.8]) * path.duration)[0]
+    expected = [[0.9514085089000823, 0.4810760119471467], [1.1778256461233998, 0.23034506333699223]]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("character", ["g", "$", "\\"])
+def test_settings_change_nothing(character):
+    before = outline(character)
+    settings = {
+        "font.family": ["cursive", "monospace"],
+        "font.size": 3.0,
+        "text.usetex": True,
+        "text.hinting": "force_autohint",
+        "path.simplify_threshold": 1.0,
+    }
+    with matplotlib.rc_context(settings):
+        after = outline(character)
+    assert len(before) == len(after)
+    for first, second in zip(before, after, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("character", ["%", "."])
+def test_other_characters_work(character):
+    path = letter_path(character)
+    found = motions(path, np.linspace(0.0, path.duration, SAMPLES))
+    assert np.all(np.isfinite(found))
+    corners = motions(path, junctions(path))[0]
+    np.testing.assert_allclose(corners[0::2], corners[1::2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("character", "got"),
+    [
+        (" ", "' ', an empty glyph"),
+        ("ab", "'ab', 2 characters"),
+        ("", "'', 0 characters"),
+        ("\n", "font lacks"),
+        ("一", "font lacks"),
+        (3, "3, a int"),
+        (None, "None, a NoneType"),
+    ],
+)
+def test_refuses_what_has_no_outline(character, got):
+    # Users run without the type checker, which would refuse a number before the library does.
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        with pytest.raises(InputError, match=got) as caught:
+            letter_path(character)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    assert "expected one printable character" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"height": 0.0}, {"mean_speed": -1.0}, {"smoothing": float("nan")}, {"centre": (0.0, float("inf"))}],
+)
+def test_refuses_wrong_numbers(wrong):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))} is .*expected"):
+        letter_path("a", **wrong)

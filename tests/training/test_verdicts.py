@@ -1,0 +1,63 @@
+"""What verdicts add to errors on held-out motions: agreement of descents, heavy bodies, friction, spikes."""
+
+import numpy as np
+import pytest
+
+from dln_jax.metrics.verdict import HeldOut
+from dln_jax.training.dynamics.verdict import searched
+from dln_jax.training.identification.verdict import friction_verdict, spikes, weight_verdict
+
+
+def held_out(error, noise=1e-4):
+    return HeldOut(np.full(2, error), np.ones(2), np.ones(2), None if noise is None else np.full(2, noise))
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "error", "noise", "said"),
+    [
+        (5, 1e-4, 1e-4, None),
+        (1, 1e-4, 1e-4, None),  # at the noise there is nothing lower
+        (1, 3e-4, 1e-4, "only 1 of 31 descents reached the lowest loss"),
+        (1, 3e-4, None, "only 1 of 31 descents"),
+        (5, 3e-4, 1e-4, None),
+        (5, 5e-4, 1e-4, "held-out errors are 5 times the noise, though 5 descents agree"),
+        (5, 5e-4, None, None),
+    ],
+)
+def test_learned_tree_says_how_its_frames_were_found(agreeing, error, noise, said):
+    verdict, numbers = searched(np.arange(31.0), agreeing, 5, held_out(error, noise))
+    assert numbers["descents"] == 31 and numbers["descents_agreeing"] == agreeing
+    assert verdict is None if said is None else verdict is not None and verdict.level == "doubtful"
+    assert said is None or (verdict is not None and said in verdict.reason)
+
+
+@pytest.mark.parametrize(
+    ("factor", "level"),
+    [(1.5, "good"), (0.3, "good"), (10, "doubtful"), (0.1, "doubtful"), (1e3, "refused"), (1e-3, "refused")],
+)
+def test_bodies_are_compared_with_the_file(factor, level):
+    torques = np.random.default_rng(0).normal(size=(100, 3)) * [100, 1, 0]
+    assert weight_verdict(factor * torques, torques).level == level
+
+
+def test_friction_that_drives_is_refused_and_a_fast_scale_doubted():
+    qd = np.random.default_rng(0).uniform(-1, 1, (500, 2))
+    tau = 3 * np.where(np.arange(500) % 2, 1, -1)[:, None] + qd
+
+    def verdict(friction, *scales):
+        return friction_verdict(("hip", "knee"), qd, tau, friction, np.array(scales))
+
+    assert verdict(np.tanh(qd / 0.1), 0.1, 0.1).level == "good"
+    assert verdict(np.tanh(qd / [0.1, 1.5]), 0.1, 1.5).level == "doubtful"
+    assert verdict(1e-3 * np.tanh(qd / [0.1, 1.5]), 0.1, 1.5).level == "good"
+    driving = verdict(qd * [1.0, -1.8], 0.1, 0.1)
+    assert driving.level == "refused" and "friction of knee drives it" in driving.reason
+
+
+def test_spikes_are_single_samples_and_dry_friction_has_none():
+    t = np.arange(0, 20, 0.01)
+    torque = np.stack([5 * np.sin(2 * t) + 2 * np.sign(np.cos(3 * t)), np.sign(np.sin(t))], axis=1)
+    torque += 0.05 * np.random.default_rng(0).normal(size=torque.shape)
+    assert not spikes(torque).any()
+    torque[[300, 700], [0, 1]] += 60
+    assert np.argwhere(spikes(torque)).tolist() == [[300, 0], [700, 1]]
