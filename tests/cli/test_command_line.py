@@ -126,7 +126,7 @@ def test_a_bar_shows_count_text_and_time_left_whole(width):
 def test_a_closed_pipe_ends_a_command_without_a_word():
     """What it prints stays in a buffer that nobody takes, and is flushed as the command ends."""
     program = (
-        "import sys; sys.argv = ['command']; sys.path.append('tests/command_line'); "
+        "import sys; sys.argv = ['command']; sys.path.append('tests/cli'); "
         "from test_command_line import *; run(say, Arguments, prog='command')"
     )
     with subprocess.Popen(

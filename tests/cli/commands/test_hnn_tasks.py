@@ -16,7 +16,8 @@ from dln_jax.mechanics.dynamics import Flow
 from dln_jax.mechanics.equations import Energies, hamiltonian_of
 from dln_jax.metrics.phase_space import Motions
 from dln_jax.scenes.datasets import phase_samples
-from dln_jax.training.hamiltonian import choice, measurements, predictions, stages
+from dln_jax.training.hamiltonian import measurements, predictions, stages
+from dln_jax.training.hamiltonian import model_selection as choice
 from dln_jax.training.hamiltonian import pixels as pixel_task
 from dln_jax.training.hamiltonian import tasks as hnn_tasks
 from dln_jax.training.hamiltonian import training as hnn_models

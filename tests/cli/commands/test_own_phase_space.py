@@ -10,8 +10,9 @@ import pytest
 from dln_jax import load
 from dln_jax.cli.commands import train_hnn, train_hnn_task
 from dln_jax.mechanics.equations import flow
-from dln_jax.training import phase_space, phase_space_options
+from dln_jax.training.hamiltonian import options as phase_space_options
 from dln_jax.training.hamiltonian import recipes, training
+from dln_jax.training.hamiltonian import run as phase_space
 from dln_jax.training.hamiltonian.model_selection import description_of
 from dln_jax.training.hamiltonian.tasks import MEASURED, Stated, problem_of
 from dln_jax.training.hamiltonian.training import train

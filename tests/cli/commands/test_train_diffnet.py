@@ -13,7 +13,7 @@ from dln_jax.cli.commands import train_diffnet
 from dln_jax.data import functions
 from dln_jax.learning.engine import checkpoint
 from dln_jax.learning.engine import fit as engine_fit
-from dln_jax.training import functions as function_runs
+from dln_jax.training.functions import run as function_runs
 from dln_jax.training.functions import task as function_task
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.descriptions import build, describe
