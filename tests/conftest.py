@@ -11,6 +11,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
+import jaxlib
 import pytest
 from jaxtyping import install_import_hook
 
@@ -24,17 +25,33 @@ ROOMS = [name.removesuffix(".__init__") for name in ROOMS if not name.startswith
 ROOMS = [name for name in ROOMS if not UNCHECKED.startswith(f"{name}.")]
 install_import_hook(ROOMS, "typechecking.checked")
 
-CACHE = "DLN_JAX_TEST_PROGRAMS"
-"""Variable with the folder of compiled programs, which the test processes share: a run that is resumed has those of the
-first."""
-if CACHE not in os.environ:
-    os.environ[CACHE] = tempfile.mkdtemp(prefix="dln_jax-tests-")
-    atexit.register(shutil.rmtree, os.environ[CACHE], ignore_errors=True)
+PROGRAMS = "DLN_JAX_TEST_PROGRAMS"
+"""Environment variable: folder of compiled programs, shared by the test processes and by the commands that they start."""
+LARGEST_FOLDER = 512 * 2**20
+"""Bytes; one run of all tests leaves 40 MB. Programs of tests that have changed stay until this size is reached."""
+
+
+def programs_folder():
+    """Returns the folder in which compiled programs are kept between runs of the tests, one for each jaxlib."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "dln_jax" / "test-programs" / jaxlib.__version__
+    try:
+        if folder.exists() and sum(program.stat().st_size for program in folder.iterdir()) > LARGEST_FOLDER:
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # a home that cannot be written to
+        folder = Path(tempfile.mkdtemp(prefix="dln_jax-tests-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return str(folder)
+
+
+if PROGRAMS not in os.environ:
+    os.environ[PROGRAMS] = programs_folder()
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", os.environ[CACHE])
-LEAST_SECONDS = "0.02"
-"""Of compilation, from which on a program is kept."""
-jax.config.update("jax_persistent_cache_min_compile_time_secs", float(LEAST_SECONDS))
+jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
+SHORTEST_COMPILATION = "0.02"
+"""Seconds; reading a program takes about 0.01 s, so that one that compiles faster is not worth a file."""
+jax.config.update("jax_persistent_cache_min_compile_time_secs", float(SHORTEST_COMPILATION))
 
 # Tracing makes many small objects that live on: collecting among them in vain costs a tenth of the time.
 gc.set_threshold(200_000, 20, 100)
@@ -50,11 +67,14 @@ if jax.__version_info__ < (0, 11):  # later ones do not know it, and abort at wh
 
 def pytest_addoption(parser):
     parser.addoption("--optimised", action="store_true", help="compile programs as users do, which takes twice as long")
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow, too")
     parser.addoption("--every-export", action="store_true", help="compare all of every export with JAX, for minutes")
 
 
 def pytest_configure(config):
-    """Tests run each program a few times: compiling costs them more than running. Read when a device is first used."""
+    """Sets XLA's options before a device is first used: tests run a program a few times, so that compiling it costs more."""
+    if config.getoption("--slow"):
+        config.option.markexpr = ""
     if not config.getoption("--optimised"):
         os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICKLY])
 

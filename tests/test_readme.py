@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tyro
 from calls import command
-from conftest import CACHE, LEAST_SECONDS
+from conftest import PROGRAMS, SHORTEST_COMPILATION
 from interpreters import Program, interpreters
 
 from dln_jax.cli.commands import COMMANDS
@@ -124,7 +124,10 @@ def test_a_command_in_the_text_parses(text):
 
 @pytest.fixture(scope="module")
 def run_fresh():
-    told = {"JAX_COMPILATION_CACHE_DIR": os.environ[CACHE], "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": LEAST_SECONDS}
+    told = {
+        "JAX_COMPILATION_CACHE_DIR": os.environ[PROGRAMS],
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": SHORTEST_COMPILATION,
+    }
     with interpreters({**os.environ, **told}) as run_programs:
         yield run_programs
 
