@@ -224,7 +224,8 @@ def rollout_metrics(
     """
     require_positive(substeps=substeps)
     program = jax.jit(motion_program(lambda _: dynamics, substeps=substeps))
-    return metrics_of_motions(*program(None, records_of(data, dtype)), data, threshold=threshold)
+    motions, energies = program(None, records_of(data, dtype))
+    return metrics_of_motions(motions, energies, data, threshold=threshold)
 
 
 def metrics_of_motions(

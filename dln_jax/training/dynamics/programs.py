@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.sharding import Mesh
 
 from dln_jax.background import in_background
@@ -15,7 +14,7 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.learning.linear import design
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.errors import prediction_program, samples_of
-from dln_jax.metrics.rollouts import Motion, Records, metrics_of_motions, motion_program, records_of
+from dln_jax.metrics.rollouts import Records, metrics_of_motions, motion_program, records_of
 from dln_jax.models.model import Model
 from dln_jax.precision import data_type
 from dln_jax.training.dynamics.task import Task
@@ -32,9 +31,9 @@ class Programs(NamedTuple):
     model: Model
     double: Model
     """The same in float64, whose torques are linearised in the parameters."""
-    predict: Callable[[Any, Any], dict[str, Array]]
+    predict: Any
     """(parameters, samples) -> answers for the validation and the test."""
-    follow: Callable[[Any, Records], tuple[Motion, Array | None]]
+    follow: Any
     """(parameters, records of the test) -> motions and energies."""
     ceilings: Callable[[], dict[str, float]]
     """() -> metrics of the true plant's rollouts; none where the scene is unknown or the test has no motions."""
@@ -45,14 +44,13 @@ def programs_of(task: Task, mesh: Mesh | None) -> Programs:
     model = build(task.description)
     predict = prediction_program(model.energies, mesh=mesh)
     follow = motion_program(lambda parameters: dynamics(model.energies(parameters)))
-    options = {"compiler_options": quick_compilation()}
-    return Programs(
-        model,
-        model if task.precision == "f64" else build({**task.description, "precision": "f64"}),
-        jax.jit(predict, **options),
-        jax.jit(follow, **options),
-        lambda: plant_metrics(task),
-    )
+    double = model if task.precision == "f64" else build({**task.description, "precision": "f64"})
+    return Programs(model, double, compiled(predict), compiled(follow), lambda: plant_metrics(task))
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """`jax.jit` for programs of which each runs once or twice."""
+    return jax.jit(function, compiler_options=quick_compilation())
 
 
 def programs_ahead(task: Task, mesh: Mesh | None, *, uncertainty: bool) -> Programs:
@@ -77,11 +75,11 @@ def programs_ahead(task: Task, mesh: Mesh | None, *, uncertainty: bool) -> Progr
         follow = programs.follow if records is None else programs.follow.lower(parameters, records).compile()
         return predict, follow, plant_metrics(task)
 
-    compiled = in_background(compile_all)
+    ready = in_background(compile_all)
     return programs._replace(
-        predict=lambda *arguments: compiled()[0](*arguments),
-        follow=lambda *arguments: compiled()[1](*arguments),
-        ceilings=lambda: compiled()[2],
+        predict=lambda *arguments: ready()[0](*arguments),
+        follow=lambda *arguments: ready()[1](*arguments),
+        ceilings=lambda: ready()[2],
     )
 
 
@@ -109,9 +107,9 @@ def plant_metrics(task: Task) -> dict[str, float]:
     if task.scene is None or records_or_none(task) is None:
         return {}
     plant = dynamics(task.scene.energies)
-    program = jax.jit(motion_program(lambda _: plant), compiler_options=quick_compilation())
+    motions, energies = compiled(motion_program(lambda _: plant))(None, records_of(test, None))
     try:
-        return metrics_of_motions(*program(None, records_of(test, None)), test)
+        return metrics_of_motions(motions, energies, test)
     except InputError:  # a coordinate that rests; the model's own metrics say so
         return {}
 
