@@ -116,11 +116,16 @@ def tip_paths(
     columns = min(len(shown), 8)
     rows = -(-len(shown) // columns)
     figure, axes = style.figure(rows, columns, height=1.0 * rows + 0.55, sharex=True, sharey=True)
-    positions = np.asarray(jax.vmap(tip)(data.q))
+    places = jax.jit(jax.vmap(tip))
+    positions = np.asarray(places(data.q))
     for axis in axes.flat:
         axis.set_aspect("equal")
         axis.axis("off")
     times = valid_prediction_times(test, list(motions)) if motions else []
+    paths = []
+    if motions:
+        ends = np.cumsum([len(motion.q) for motion in motions])
+        paths = np.split(np.asarray(places(np.concatenate([motion.q for motion in motions]))), ends[:-1])
     for number, (axis, index) in enumerate(zip(axes.flat, shown, strict=False)):
         is_test = number < len(tested)
         chosen = data.trajectory == index
@@ -129,7 +134,7 @@ def tip_paths(
         if is_test and number < len(times):
             t = data.t[chosen]
             valid = t - t[0] <= times[number] + 1e-9
-            path = np.asarray(jax.vmap(tip)(np.asarray(motions[number].q)[valid]))
+            path = paths[number][valid]
             axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
             axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
             axis.set_title(f"{data.label[index]}: {times[number]:.1f} of {t[-1] - t[0]:.1f} s", fontsize=style.SMALL)

@@ -63,7 +63,7 @@ def driven(
 def looped_rk4(field: Field) -> Step:
     """`rk4` whose stages are a loop: the field is in the program once and not four times.
 
-    For fits through an integrator, whose compilation takes longer than their iterations.
+    For fits through an integrator and motions that run once, whose compilation takes longer than they do.
     """
     nodes, weights = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
 

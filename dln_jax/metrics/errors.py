@@ -1,7 +1,11 @@
 """Errors of a model on trajectories."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -18,33 +22,61 @@ DECOMPOSITION = ("inertial", "coriolis", "gravity")
 def predictions(
     system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None, mesh: Mesh | None = None
 ) -> dict[str, np.ndarray]:
-    """What energies say of every sample: `tau`, `qdd`, and the parts of the torque, each [N, d] in float64.
+    """Returns what energies predict of every sample: `tau`, `qdd`, and the parts of the torque, [N, d] in float64.
 
     With a Hamiltonian, the given one or that of a system in momenta, and recorded momenta also `tau_from_momenta` =
     pd + dH/dq + friction: as published results of Hamiltonian models were computed.
 
     Devices of a mesh share the samples.
     """
-    functions = dynamics(system)
-    if isinstance(system, Canonical):
-        H = hamiltonian_of(system)
-    recorded = () if data.p is None or data.pd is None or H is None else (data.p, data.pd)
+    program = jax.jit(prediction_program(lambda _: system, H=H, mesh=mesh))
+    return as_arrays(program(None, samples_of(data, dtype)))
 
-    def answer(q, qd, qdd, tau, momenta):
-        parts = functions.decompose(q, qd, qdd)
-        answers = {
-            "tau": functions.inverse_dynamics(q, qd, qdd),
-            "qdd": functions.forward_dynamics(q, qd, tau),
-            **{f"tau_{name}": getattr(parts, name) for name in DECOMPOSITION},
-        }
-        if H is not None and momenta:
-            friction = functions.friction(q, qd) if isinstance(functions, Dynamics) else 0.0
-            answers["tau_from_momenta"] = hamiltonian.inverse(H, q, *momenta) + friction
-        return answers
 
-    momenta = tuple(np.asarray(array, dtype) for array in recorded)
-    samples = *(np.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau)), momenta
-    answers = jax.jit(spread(lambda _, samples: jax.vmap(answer)(*samples), mesh))(None, samples)
+def prediction_program(
+    system_of: Callable[[Any], Driven], *, H: Hamiltonian | None = None, mesh: Mesh | None = None
+) -> Callable[[Any, tuple[Any, ...]], dict[str, Array]]:
+    """Returns (parameters, samples) -> `predictions` of the system with these parameters, for `jax.jit`.
+
+    Parameters are arguments of the program and not constants in it: one compilation serves every seed.
+
+    Args:
+        system_of: parameters -> energies.
+        H: as for `predictions`.
+        mesh: devices that share the samples.
+    """
+
+    def answers(parameters: Any, samples: tuple[Any, ...]) -> dict[str, Array]:
+        system = system_of(parameters)
+        functions = dynamics(system)
+        energy = hamiltonian_of(system) if isinstance(system, Canonical) else H
+
+        def answer(q, qd, qdd, tau, momenta):
+            parts = functions.decompose(q, qd, qdd)
+            answers = {
+                "tau": functions.inverse_dynamics(q, qd, qdd),
+                "qdd": functions.forward_dynamics(q, qd, tau),
+                **{f"tau_{name}": getattr(parts, name) for name in DECOMPOSITION},
+            }
+            if energy is not None and momenta:
+                friction = functions.friction(q, qd) if isinstance(functions, Dynamics) else 0.0
+                answers["tau_from_momenta"] = hamiltonian.inverse(energy, q, *momenta) + friction
+            return answers
+
+        return jax.vmap(answer)(*samples)
+
+    return spread(answers, mesh)
+
+
+def samples_of(data: Trajectories, dtype) -> tuple[Any, ...]:
+    """Returns the samples that a `prediction_program` takes: q, qd, qdd, tau, and the momenta if they were recorded."""
+    momenta = () if data.p is None or data.pd is None else (data.p, data.pd)
+    states = (np.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau))
+    return *states, tuple(np.asarray(array, dtype) for array in momenta)
+
+
+def as_arrays(answers: dict[str, Array]) -> dict[str, np.ndarray]:
+    """Returns the answers of a `prediction_program` in float64."""
     return {key: np.asarray(array, np.float64) for key, array in answers.items()}
 
 

@@ -10,7 +10,7 @@ a sample of a smooth function, so that even the true plant leaves such a referen
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,12 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.driven import Torque, driven, torque_slopes
+from dln_jax.mechanics.driven import Torque, driven, looped_rk4, torque_slopes
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Vector, require_positive
+
+TORQUES: tuple[Torque, ...] = ("held", "interpolated")
+"""What a torque does between two samples; all kinds are compared."""
 
 
 class Motion(NamedTuple):
@@ -31,6 +34,16 @@ class Motion(NamedTuple):
     qd: Float[Array | np.ndarray, "*K T d"]
     work: Float[Array | np.ndarray, "*K T"]
     """Energy supplied by tau less that lost to friction since the start, in J."""
+
+
+class Records(NamedTuple):
+    """What was recorded of K trajectories, padded to one length T by repeating their last samples."""
+
+    q0: Float[Array, "K d"]
+    qd0: Float[Array, "K d"]
+    tau: Float[Array, "K T d"]
+    t: Float[Array, "K T"]
+    """Since the start of each, in s."""
 
 
 def follow(
@@ -57,7 +70,7 @@ def recorded_motions(
     dynamics: Dynamics | PlainDynamics,
     data: Trajectories,
     *,
-    torques: Sequence[Torque] = ("held", "interpolated"),
+    torques: Sequence[Torque] = TORQUES,
     substeps: int = 20,
     dtype: DTypeLike | None = None,
 ) -> dict[Torque, list[Motion]]:
@@ -67,6 +80,44 @@ def recorded_motions(
     Raises InputError for a trajectory of a single sample, no substeps, or a torque of another name.
     """
     require_positive(substeps=substeps)
+    program = jax.jit(motion_program(lambda _: dynamics, torques=torques, substeps=substeps))
+    return by_trajectory(program(None, records_of(data, dtype))[0], data, torques)
+
+
+def motion_program(
+    dynamics_of: Callable[[Any], Dynamics | PlainDynamics],
+    *,
+    torques: Sequence[Torque] = TORQUES,
+    substeps: int = 20,
+) -> Callable[[Any, Records], tuple[Motion, Array | None]]:
+    """Returns (parameters, records) -> motions and their energies, for `jax.jit`; leading axes [torques, trajectories].
+
+    The energies, in J, are those of the predicting system at its own states; `None` for one that has no energy.
+    Parameters are arguments of the program and not constants in it: one compilation serves every seed.
+    """
+
+    def motions(parameters: Any, records: Records) -> tuple[Motion, Array | None]:
+        dynamics = dynamics_of(parameters)
+        q0, qd0, tau, t = records
+
+        def drive(q0, qd0, tau, t, slopes):
+            motion = _drive(dynamics, q0, qd0, tau[:-1], slopes, jnp.diff(t), substeps)
+            if not isinstance(dynamics, Dynamics):
+                return motion, None
+            return motion, jax.vmap(dynamics.energy)(motion.q, motion.qd)
+
+        slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in torques])
+        return jax.vmap(lambda slopes: jax.vmap(drive)(q0, qd0, tau, t, slopes))(slopes)
+
+    return motions
+
+
+def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
+    """Returns the records that a `motion_program` takes, in `dtype` (JAX's default if `None`).
+
+    Raises:
+        InputError: a trajectory of a single sample.
+    """
     groups = _samples(data)
     longest = max(map(len, groups))
     # Padded to one length by repeating the last sample: time stands still there, and so does the state.
@@ -74,19 +125,14 @@ def recorded_motions(
     first = padded[:, 0]
     # Times count from the start of each trajectory before they are rounded to `dtype`.
     t = data.t[padded] - data.t[first][:, None]
+    return Records(*(jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t)))
 
-    @jax.jit
-    def motions(q0, qd0, tau, t):
-        def drive(q0, qd0, tau, t, slopes):
-            return _drive(dynamics, q0, qd0, tau[:-1], slopes, jnp.diff(t), substeps)
 
-        slopes = jnp.stack([jax.vmap(functools.partial(torque_slopes, torque=torque))(tau, t) for torque in torques])
-        return jax.vmap(lambda slopes: jax.vmap(drive)(q0, qd0, tau, t, slopes))(slopes)
-
-    arrays = (jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t))
-    answers = [np.asarray(leaf, np.float64) for leaf in motions(*arrays)]
+def by_trajectory(motions: Motion, data: Trajectories, torques: Sequence[Torque]) -> dict[Torque, list[Motion]]:
+    """Returns the motions of a `motion_program` as `recorded_motions` does."""
+    groups, arrays = _samples(data), [np.asarray(leaf, np.float64) for leaf in motions]
     return {
-        torque: [Motion(*(leaf[kind, k, : len(group)] for leaf in answers)) for k, group in enumerate(groups)]
+        torque: [Motion(*(leaf[kind, k, : len(group)] for leaf in arrays)) for k, group in enumerate(groups)]
         for kind, torque in enumerate(torques)
     }
 
@@ -153,10 +199,11 @@ def energy_error(
     states = (np.concatenate([getattr(motion, key) for motion in motions]) for key in ("q", "qd"))
     energies = np.asarray(jax.jit(jax.vmap(energy))(*(jnp.asarray(array, dtype) for array in states)), np.float64)
     bounds = np.cumsum([0] + [len(motion.work) for motion in motions])
-    errors = [
-        np.abs(energies[start:end] - energies[start] - motion.work)
-        for motion, start, end in zip(motions, bounds[:-1], bounds[1:], strict=True)
-    ]
+    return _imbalance(np.split(energies, bounds[1:-1]), motions)
+
+
+def _imbalance(energies: Sequence[np.ndarray], motions: list[Motion]) -> float:
+    errors = [abs(energy - energy[0] - motion.work) for energy, motion in zip(energies, motions, strict=True)]
     return _mean_or_infinity(np.concatenate(errors))
 
 
@@ -175,17 +222,29 @@ def rollout_metrics(
     has an energy, `energy_error_j`. The true plant's figures are the ceiling that belongs beside a model's.
     Raises InputError for a trajectory of a single sample, a coordinate that never changes, or a number not positive.
     """
-    motions = recorded_motions(dynamics, data, substeps=substeps, dtype=dtype)
-    held, interpolated = motions["held"], motions["interpolated"]
-    durations = [data.t[group[-1]] - data.t[group[0]] for group in _samples(data)]
+    require_positive(substeps=substeps)
+    program = jax.jit(motion_program(lambda _: dynamics, substeps=substeps))
+    motions, energies = program(None, records_of(data, dtype))
+    return metrics_of_motions(motions, energies, data, threshold=threshold)
+
+
+def metrics_of_motions(
+    motions: Motion, energies: Array | None, data: Trajectories, *, threshold: float = 1e-2
+) -> dict[str, float]:
+    """Returns `rollout_metrics` from the motions and energies of a `motion_program` with both kinds of torque."""
+    held, interpolated = by_trajectory(motions, data, TORQUES).values()
+    groups = _samples(data)
+    durations = [data.t[group[-1]] - data.t[group[0]] for group in groups]
     metrics = {
         "vpt_seconds": float(np.mean(valid_prediction_times(data, held, threshold=threshold))),
         "vpt_interpolated_seconds": float(np.mean(valid_prediction_times(data, interpolated, threshold=threshold))),
         "rollout_seconds": float(np.mean(durations)),
         "normalised_state_error": normalised_state_error(data, interpolated),
     }
-    if isinstance(dynamics, Dynamics):
-        metrics["energy_error_j"] = energy_error(dynamics.energy, interpolated, dtype=dtype)
+    if energies is not None:
+        ours = np.asarray(energies, np.float64)[1]
+        own = [energy[: len(group)] for energy, group in zip(ours, groups, strict=True)]
+        metrics["energy_error_j"] = _imbalance(own, interpolated)
     return metrics
 
 
@@ -198,7 +257,8 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, 
         at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
         return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
 
-    return Motion(*driven(rate, (q0, qd0, jnp.zeros_like(q0[0])), tau, slopes, durations, substeps=substeps))
+    start = q0, qd0, jnp.zeros_like(q0[0])
+    return Motion(*driven(rate, start, tau, slopes, durations, substeps=substeps, method=looped_rk4))
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ of Bayesian neural nets via local linearization"). `learning.uncertainty` finds 
 one state.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -88,10 +88,19 @@ def predictive(
 
     def torque_std(q: Any, qd: Any, qdd: Any) -> Array:
         rows, _ = answer(partial(linearised, model, parameters), *vectors(d, q=q, qd=qd, qdd=qdd))
-        noises, inflations = (jnp.asarray(each, rows.dtype) for each in (noise, inflation))
-        return jnp.sqrt(noises**2 + inflations * parameter_variance(rows, factor))
+        return _deviation(rows, factor, noise, inflation)
 
     return torque_std
+
+
+def torque_deviation(rows: Float[Array, "d P"], uncertainty: Uncertainty) -> Vector:
+    """Standard deviation of the torque [d] at a state with Phi = `rows`, N m or N."""
+    return _deviation(rows, uncertainty.factor, uncertainty.noise, uncertainty.inflation)
+
+
+def _deviation(rows: Float[Array, "d P"], factor: Any, noise: Any, inflation: Any) -> Vector:
+    noises, inflations = (jnp.asarray(each, rows.dtype) for each in (noise, inflation))
+    return jnp.sqrt(noises**2 + inflations * parameter_variance(rows, factor))
 
 
 def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Scores]:
@@ -100,19 +109,29 @@ def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Ca
     def of_state(q: Any, qd: Any, qdd: Any) -> Scores:
         state = vectors(len(uncertainty.noise), q=q, qd=qd, qdd=qdd)
         rows, _ = linearised(model, parameters, *state)
-        domain = uncertainty.domain
-        limit, centre, reach, harmless = (
-            jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach, domain.harmless)
-        )
-        deviation = jnp.sqrt(parameter_variance(rows, uncertainty.factor))
-        distance = jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach)
-        return Scores(
-            parameters=jnp.max(deviation / limit),
-            undetermined=jnp.sqrt(jnp.max(undetermined_share(rows, domain))) / UNDETERMINED,
-            distance=jnp.where(jnp.any(deviation >= harmless), distance, 0),
-        )
+        return scores_of_rows(rows, state, uncertainty)
 
     return of_state
+
+
+def scores_of_rows(rows: Float[Array, "d P"], state: Sequence[Vector], uncertainty: Uncertainty) -> Scores:
+    """`scores` of a state (q, qd, qdd) with Phi = `rows`."""
+    domain = uncertainty.domain
+    limit, centre, reach, harmless = (
+        jnp.asarray(each, rows.dtype) for each in (domain.limit, domain.centre, domain.reach, domain.harmless)
+    )
+    deviation = jnp.sqrt(parameter_variance(rows, uncertainty.factor))
+    distance = jnp.max(jnp.abs(jnp.concatenate(state) - centre) / reach)
+    return Scores(
+        parameters=jnp.max(deviation / limit),
+        undetermined=jnp.sqrt(jnp.max(undetermined_share(rows, domain))) / UNDETERMINED,
+        distance=jnp.where(jnp.any(deviation >= harmless), distance, 0),
+    )
+
+
+def highest(of_state: Scores) -> Array:
+    """[], the largest score; NaN if one is."""
+    return jnp.max(jnp.stack(of_state))
 
 
 def outside(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Array]:
@@ -120,7 +139,7 @@ def outside(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> C
     of_state = scores(model, parameters, uncertainty)
 
     def is_outside(q: Any, qd: Any, qdd: Any) -> Array:
-        return ~(jnp.max(jnp.stack(of_state(q, qd, qdd))) <= 1)
+        return ~(highest(of_state(q, qd, qdd)) <= 1)
 
     return is_outside
 

@@ -6,27 +6,27 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from dln_jax import figures as drawing
+from dln_jax.background import in_background
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import merged
 from dln_jax.files import write_figure
 from dln_jax.learning.engine.problem import Training
 from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
-from dln_jax.mechanics.equations import dynamics
 from dln_jax.metrics.definiteness import Definiteness, definiteness
-from dln_jax.metrics.errors import errors, predictions
+from dln_jax.metrics.errors import as_arrays, errors, mean_square, samples_of
 from dln_jax.metrics.latency import Latency, one_step
-from dln_jax.metrics.rollouts import recorded_motions, rollout_metrics
+from dln_jax.metrics.rollouts import TORQUES, Motion, by_trajectory, metrics_of_motions, records_of
 from dln_jax.precision import data_type
+from dln_jax.training.dynamics.programs import Programs, judged_data
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.uncertainty import uncertainty_metrics
 from dln_jax.training.dynamics.verdict import Judged, judge_torques
+from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.results import cost_metrics, print_numbers, unit_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import load
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
@@ -72,28 +72,40 @@ MEANINGS = {
 
 
 def evaluate(
-    folder: Path, task: Task, training: Training, *, seeds: int, figures: bool, mesh: Mesh | None
+    folder: Path,
+    task: Task,
+    training: Training,
+    programs: Programs,
+    *,
+    seeds: int,
+    figures: bool,
+    low_latency: bool,
 ) -> tuple[dict[str, float | int], Judged]:
     """Loads the stored model as a user would, measures it on the test trajectories, judges it, and draws it."""
-    dtype, test, run = data_type(task.precision), task.sets.test, load(folder)
-    functions, model = run.dynamics, build(task.description)
-    predicted = predictions(run.energies, test, dtype, mesh=mesh)
+    run = load(folder)
+    functions, test = run.dynamics, task.sets.test
     latency = latency_of(functions, task)
-    if figures:
-        draw(folder, task, training, functions, predicted)
+    # Another process times the low-latency mode, while this one evaluates and draws.
+    timed = in_background(low_latency_metrics, folder, latency_states(task), print) if low_latency else dict
+    samples = samples_of(judged_data(task), data_type(task.precision))
+    answers = as_arrays(programs.predict(run.parameters, samples))
+    predicted = {name: array[: len(test.t)] for name, array in answers.items()}
+    judged = judge_torques(task, predicted["tau"], answers["tau"][len(test.t) :])
+    motions, of_rollouts = rollouts(run.parameters, task, programs)
     spread = {}
     if seeds > 1:
-        models = [model.energies(parameters_of(training, index)) for index in range(seeds)]
-        of_seeds = [errors(predictions(each, test, dtype, mesh=mesh), test)["torque_mse"] for each in models]
+        every = [programs.predict(parameters_of(training, index), samples) for index in range(seeds)]
+        of_seeds = [mean_square(np.asarray(each["tau"], float)[: len(test.t)] - test.tau) for each in every]
         spread = {f"torque_mse_{name}": float(function(of_seeds)) for name, function in SUMMARIES.items()}
-    judged = judge_torques(run.energies, task, predicted["tau"], mesh=mesh)
+    if figures:
+        draw(folder, task, training, motions, predicted)
     return {
         **errors(predicted, test),
         **judged.metrics,
         **spread,
         **definiteness_metrics(functions, task),
-        **uncertainty_metrics(folder, run, task, predicted["tau"], figures=figures),
-        **rollouts(functions, task),
+        **uncertainty_metrics(folder, run, task, programs, predicted["tau"], figures=figures),
+        **of_rollouts,
         **validation_metrics(training, seeds, task.best),
         **cost_metrics(
             training,
@@ -101,6 +113,7 @@ def evaluate(
             parameters=sum(leaf.size for leaf in jax.tree.leaves(training.parameters)) // seeds,
             best_step=int(np.ravel(training.best_step)[best_seed(training, seeds, task.best)[1]]),
         ),
+        **timed(),
     }, judged
 
 
@@ -151,30 +164,28 @@ def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dic
     return {} if found is None else {names.get(key, key): value for key, value in found._asdict().items()}
 
 
-def rollouts(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
-    """Valid prediction times on the test, and the true plant's as their ceiling where the scene is known.
+def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
+    """Motions of the test under interpolated torques, valid prediction times, and the true plant's as their ceiling.
 
     None for independent states, which are no motion.
     """
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
-        return {}
+        return [], {}
     try:
-        found = rollout_metrics(functions, test, dtype=data_type(task.precision))
+        motions, energies = programs.follow(parameters, records_of(test, data_type(task.precision)))
+        found = metrics_of_motions(motions, energies, test)
     except InputError as error:
         # The model is trained: what its test cannot tell is left out, not refused.
         print(f"no rollouts: {error}")
-        return {}
-    if task.scene is None:
-        return found
-    plant = rollout_metrics(dynamics(task.scene.energies), test)
-    return {**found, **{ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}}
+        return [], {}
+    plant = programs.ceilings()
+    ceilings = {ceiling: plant[key] for key, ceiling in CEILINGS.items() if key in plant}
+    return by_trajectory(motions, test, TORQUES)["interpolated"], {**found, **ceilings}
 
 
-def draw(
-    folder: Path, task: Task, training: Training, functions: Dynamics | PlainDynamics, predicted: dict[str, np.ndarray]
-) -> None:
-    """Writes what there is to draw."""
+def draw(folder: Path, task: Task, training: Training, motions: list[Motion], predicted: dict[str, np.ndarray]) -> None:
+    """Writes what there is to draw; `motions` are the model's of the test, or none."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
     if training.history and task.solver is not None:
@@ -183,11 +194,7 @@ def draw(
         best = int(np.max(training.best_step))
         write_figure(folder / "training.png", drawing.training_curve(training.history, best_step=best, **units))
     if task.scene is not None and task.scene.tip is not None:
-        moving = len(np.unique(test.trajectory)) < len(test.t)
-        dtype = data_type(task.precision)
-        found = recorded_motions(functions, test, torques=["interpolated"], dtype=dtype) if moving else {}
-        motions, every = found.get("interpolated", []), merged(task.sets)
-        paths = drawing.tip_paths(every, task.scene.tip, test=test, motions=motions, model=task.kind)
+        paths = drawing.tip_paths(merged(task.sets), task.scene.tip, test=test, motions=motions, model=task.kind)
         write_figure(folder / "tip_paths.png", paths)
 
 

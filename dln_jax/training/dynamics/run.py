@@ -20,12 +20,12 @@ from dln_jax.training.dynamics.growth import grow_to_target
 from dln_jax.training.dynamics.model_selection import climb_ladder
 from dln_jax.training.dynamics.network import cross_validated, train
 from dln_jax.training.dynamics.options import AUTO, Options, check_options, with_model
+from dln_jax.training.dynamics.programs import programs_ahead, programs_of
 from dln_jax.training.dynamics.recorded import Recorded, read
-from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, latency_states, print_metrics
+from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, print_metrics
 from dln_jax.training.dynamics.task import Task, task_of
 from dln_jax.training.dynamics.uncertainty import store_uncertainty
 from dln_jax.training.dynamics.verdict import refuse, say
-from dln_jax.training.low_latency_calls import low_latency_metrics
 from dln_jax.training.results import settings_of
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
@@ -52,9 +52,13 @@ def run(given: Options, command: str) -> None:
         announce(recorded, chosen_for)
         if chosen is None:
             task, training = climb_ladder(given, recorded, folder, mesh)
+            programs = programs_of(task, mesh)
         else:
             announce_model(chosen)
+            fixed = chosen.solver is not None and given.target is None  # its description is that of the model to come
+            ahead = programs_ahead(chosen, mesh, uncertainty=given.uncertainty) if fixed else None
             task, training = trained(chosen, given, folder, mesh)
+            programs = ahead or programs_of(task, mesh)
         if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
             raise InputError(
                 f"no validation error is finite; {folder} holds no model; look for large numbers in the data"
@@ -62,11 +66,10 @@ def run(given: Options, command: str) -> None:
         parameters, best = best_seed(training, given.seeds, task.best)
         save(folder, task.description, parameters)
         if given.uncertainty:
-            store_uncertainty(folder, task, parameters)
+            store_uncertainty(folder, task, programs.double, parameters)
         unit = torque_scale(task.sets.train).tolist() if task.objective is SCALED_TORQUE else None
-        metrics, judged = evaluate(folder, task, training, seeds=given.seeds, figures=given.figures, mesh=mesh)
-        if given.low_latency:
-            metrics |= low_latency_metrics(folder, latency_states(task), print)
+        options = {"seeds": given.seeds, "figures": given.figures, "low_latency": given.low_latency}
+        metrics, judged = evaluate(folder, task, training, programs, **options)
         write_json(folder / "metrics.json", metrics)
         optimiser = {} if task.solver is None else settings_of(task.solver.optimiser)
         more = {"cutoff_hz": recorded.cutoff, "validation_units": unit}

@@ -1,27 +1,33 @@
 """What a training of dynamics does not know: estimated, stored with the run, held against the test, and drawn."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from dln_jax.data.schema import Trajectories
 from dln_jax.figures.uncertainty import torque_bands
 from dln_jax.files import write_figure
+from dln_jax.learning.linear import linearised_chunks
 from dln_jax.learning.uncertainty import estimate
 from dln_jax.metrics.coverage import LEVEL, coverage
-from dln_jax.precision import data_type
+from dln_jax.models.model import Model
+from dln_jax.models.uncertainty import Uncertainty, highest, scores_of_rows, torque_deviation
+from dln_jax.training.dynamics.programs import CHUNK, Programs
 from dln_jax.training.dynamics.task import Task
 from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
-from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.run import Run
 from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 
-def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
-    """Estimates it by the training and validation trajectories; of models that are fitted to torques alone."""
+def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -> None:
+    """Estimates it by the training and validation trajectories; of models that are fitted to torques alone.
+
+    `model` is the task's in float64.
+    """
     if not task.objective.of_torques:
         print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
         return
@@ -29,7 +35,6 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
     if properties.kernel:
         print(f"a {task.kind} has as many parameters as data: the run does not say what it does not know")
         return
-    model = build({**task.description, "precision": "f64"})
     try:
         found = estimate(
             model,
@@ -49,15 +54,14 @@ def store_uncertainty(folder: Path, task: Task, parameters: Any) -> None:
 
 
 def uncertainty_metrics(
-    folder: Path, run: Run, task: Task, predicted: np.ndarray, *, figures: bool
+    folder: Path, run: Run, task: Task, programs: Programs, predicted: np.ndarray, *, figures: bool
 ) -> dict[str, float]:
     """How often test torques are within the bands of 95 %, in all and at the joint where that is furthest from it, and
     the share of test states that are outside the training data; draws `uncertainty.png`. None for a run without."""
     if run.uncertainty is None:
         return {}
-    test, dtype = task.sets.test, data_type(task.precision)
-    state = tuple(jnp.asarray(array, dtype) for array in (test.q, test.qd, test.qdd))
-    std, outside = (np.asarray(jax.jit(jax.vmap(each))(*state)) for each in (run.torque_std, run.outside))
+    test = task.sets.test
+    std, outside = bands(programs.double, run.parameters, run.uncertainty, test)
     shares = coverage(predicted - test.tau, std, levels=(LEVEL,)).shares[0]
     if figures:
         write_figure(folder / "uncertainty.png", torque_bands(test, predicted, std, outside, model=task.kind))
@@ -66,3 +70,25 @@ def uncertainty_metrics(
         "coverage_95_worst_joint_share": float(shares[np.argmax(abs(shares - LEVEL))]),
         "outside_share": float(outside.mean()),
     }
+
+
+def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations of the torques [N, d] at the samples, and whether each is outside the training data [N].
+
+    The estimate has compiled the program that linearises the torques, which `Run.torque_std` would compile again.
+    """
+    found, first = [], 0
+    with jax.enable_x64(True):
+        parameters = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), parameters)
+        for rows, *_ in linearised_chunks(model, parameters, data, CHUNK):
+            part = slice(first, first + len(rows))
+            found.append(_bands(uncertainty, rows, (data.q[part], data.qd[part], data.qdd[part])))
+            first = part.stop
+    std, outside = zip(*found, strict=True)
+    return np.concatenate(std), np.concatenate(outside)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+def _bands(uncertainty: Uncertainty, rows: Any, state: tuple[Any, ...]) -> tuple[Any, Any]:
+    return torque_deviation(rows, uncertainty), ~(highest(scores_of_rows(rows, state, uncertainty)) <= 1)

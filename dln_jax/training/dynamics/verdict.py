@@ -4,18 +4,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
 
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders import torque_noise
 from dln_jax.data.robots import Robot
 from dln_jax.data.schema import Trajectories
-from dln_jax.mechanics.equations import Driven, dynamics
+from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.trees import tree_system
-from dln_jax.metrics.errors import predictions
 from dln_jax.metrics.verdict import FitRefused, HeldOut, Verdict, held_out, judge, verdict_metrics, worst
-from dln_jax.precision import data_type
 from dln_jax.training.dynamics.options import Options
 from dln_jax.training.dynamics.task import Task
 
@@ -35,31 +32,29 @@ class Judged(NamedTuple):
     """Mean over joints of the squared error over the torque's variance."""
 
 
-def judge_torques(energies: Driven, task: Task, predicted: np.ndarray, *, mesh: Mesh | None) -> Judged:
+def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) -> Judged:
     """The graver verdict of the test and the validation motions, and of what a search for joint frames says of itself.
 
     Args:
-        energies: the trained model.
-        task: its data.
-        predicted: its torques in the test motions [N, d].
-        mesh: devices that share the samples.
+        task: the data.
+        on_test: the model's torques in the test motions [N, d].
+        on_validation: those in the validation motions.
     """
     if not task.objective.of_torques:
         return Judged(None, {}, float("nan"))
     test, validation, robot = task.sets.test, task.sets.validation, task.recorded.robot
-    of_validation = predictions(energies, validation, data_type(task.precision), mesh=mesh)["tau"]
     noise = torque_noise(task.sets.train)
-    on_test, on_validation = (
+    tested, validated = (
         held_out(tau, data.tau, noise=noise, file=None if robot is None else torques_of(robot, data))
-        for tau, data in ((predicted, test), (of_validation, validation))
+        for tau, data in ((on_test, test), (on_validation, validation))
     )
     names = None if robot is None else robot.tree.names
-    verdict, numbers = worst(judge(on_test, names), judge(on_validation, names)), {}
+    verdict, numbers = worst(judge(tested, names), judge(validated, names)), {}
     if task.search is not None:
-        of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, on_test)
+        of_search, numbers = searched(task.search.losses, task.search.agreeing, task.search.agreement, tested)
         verdict = verdict if of_search is None else worst(verdict, of_search)
-    nmse = {"test_nmse": _nmse(on_test), "validation_nmse": _nmse(on_validation)}
-    return Judged(verdict, {**nmse, **verdict_metrics(on_test, verdict), **numbers}, nmse["validation_nmse"])
+    nmse = {"test_nmse": _nmse(tested), "validation_nmse": _nmse(validated)}
+    return Judged(verdict, {**nmse, **verdict_metrics(tested, verdict), **numbers}, nmse["validation_nmse"])
 
 
 def say(judged: Judged) -> None:

@@ -1,0 +1,123 @@
+"""The programs that evaluate a model of dynamics, with its parameters as arguments: they compile while it trains."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from dln_jax.background import in_background
+from dln_jax.compilation import quick_compilation
+from dln_jax.data.schema import Trajectories
+from dln_jax.learning.linear import design
+from dln_jax.mechanics.equations import dynamics
+from dln_jax.metrics.errors import prediction_program, samples_of
+from dln_jax.metrics.rollouts import Records, metrics_of_motions, motion_program, records_of
+from dln_jax.models.model import Model
+from dln_jax.precision import data_type
+from dln_jax.training.dynamics.task import Task
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build
+
+CHUNK = 256
+"""Samples whose torques are linearised in the parameters by one call."""
+
+
+class Programs(NamedTuple):
+    """What evaluates the model of a task, for any of its parameters."""
+
+    model: Model
+    double: Model
+    """The same in float64, whose torques are linearised in the parameters."""
+    predict: Any
+    """(parameters, samples) -> answers for the validation and the test."""
+    follow: Any
+    """(parameters, records of the test) -> motions and energies."""
+    ceilings: Callable[[], dict[str, float]]
+    """() -> metrics of the true plant's rollouts; none where the scene is unknown or the test has no motions."""
+
+
+def programs_of(task: Task, mesh: Mesh | None) -> Programs:
+    """Returns programs that compile when they are first called."""
+    model = build(task.description)
+    predict = prediction_program(model.energies, mesh=mesh)
+    follow = motion_program(lambda parameters: dynamics(model.energies(parameters)))
+    double = model if task.precision == "f64" else build({**task.description, "precision": "f64"})
+    return Programs(model, double, compiled(predict), compiled(follow), lambda: plant_metrics(task))
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """`jax.jit` for programs of which each runs once or twice."""
+    return jax.jit(function, compiler_options=quick_compilation())
+
+
+def programs_ahead(task: Task, mesh: Mesh | None, *, uncertainty: bool) -> Programs:
+    """Returns programs that compile in a thread from now on, while the task's model trains.
+
+    Args:
+        task: a model that an optimiser trains, whose description stays as it is.
+        mesh: devices that share the samples; their programs compile when they are called.
+        uncertainty: whether the torques will be linearised in the parameters.
+    """
+    programs = programs_of(task, mesh)
+    if mesh is not None:
+        return programs
+    parameters = jax.eval_shape(programs.model.init, jax.random.key(0))
+    samples = samples_of(judged_data(task), data_type(task.precision))
+    records = records_or_none(task)
+
+    def compile_all() -> tuple[Callable, Callable, dict[str, float]]:
+        if uncertainty:
+            linearise_once(programs.double, task)
+        predict = programs.predict.lower(parameters, samples).compile()
+        follow = programs.follow if records is None else programs.follow.lower(parameters, records).compile()
+        return predict, follow, plant_metrics(task)
+
+    ready = in_background(compile_all)
+    return programs._replace(
+        predict=lambda *arguments: ready()[0](*arguments),
+        follow=lambda *arguments: ready()[1](*arguments),
+        ceilings=lambda: ready()[2],
+    )
+
+
+def judged_data(task: Task) -> Trajectories:
+    """Returns the samples of the test, followed by those of the validation: one program predicts both."""
+    test, validation = task.sets.test, task.sets.validation
+    keys = [key for key in ("q", "qd", "qdd", "tau", "p", "pd") if getattr(test, key) is not None]
+    return test._replace(**{key: np.concatenate([getattr(test, key), getattr(validation, key)]) for key in keys})
+
+
+def records_or_none(task: Task) -> Records | None:
+    """Returns the test's motions as they were recorded; `None` for independent states or motions of one sample."""
+    test = task.sets.test
+    if len(np.unique(test.trajectory)) == len(test.t):
+        return None
+    try:
+        return records_of(test, data_type(task.precision))
+    except InputError:
+        return None
+
+
+def plant_metrics(task: Task) -> dict[str, float]:
+    """Returns the metrics of rollouts of the true plant, the ceiling of any model's."""
+    test = task.sets.test
+    if task.scene is None or records_or_none(task) is None:
+        return {}
+    plant = dynamics(task.scene.energies)
+    motions, energies = compiled(motion_program(lambda _: plant))(None, records_of(test, None))
+    try:
+        return metrics_of_motions(motions, energies, test)
+    except InputError:  # a coordinate that rests; the model's own metrics say so
+        return {}
+
+
+def linearise_once(model: Model, task: Task) -> None:
+    """Compiles `learning.linear.design` of the model by calling it."""
+    with jax.enable_x64(True):
+        parameters = jax.eval_shape(model.init, jax.random.key(0))
+        zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape), parameters)
+        state = np.ones((CHUNK, task.sets.test.q.shape[1]))
+        design(model)(jax.tree.map(jnp.asarray, zeros), state, state, state)
