@@ -30,7 +30,10 @@ AS_USERS_COMPILE = (
         f"nn/test_differential_mlp.py::test_parameter_gradients_equal_those_through_autodiff[{case}]"
         for case in ("silu-sizes1", "gelu-sizes2")
     ),
-    *(f"cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[{name}]" for name in ("float32", "activations")),
+    *(
+        f"cli/commands/test_stability.py::test_hard_cases_meet_their_bounds[{name}]"
+        for name in ("float32", "activations")
+    ),
     "cli/commands/test_train_models.py::test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes",
 )
 """What fusion, fast approximations and reordering could break, cheap enough to compile with them."""

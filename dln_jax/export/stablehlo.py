@@ -106,7 +106,7 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
         raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
-    if any(each.dtype == "float64" for each in exported.in_avals):
+    if any(in_aval.dtype == "float64" for in_aval in exported.in_avals):
         require_double_precision(str(path))
     return _refusing(path, exported)
 
@@ -138,7 +138,7 @@ def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
         try:
             return exported.call(*arguments)
         except (ValueError, TypeError) as error:
-            got = ", ".join(str(getattr(each, "aval", type(each).__name__)) for each in arguments)
+            got = ", ".join(str(getattr(argument, "aval", type(argument).__name__)) for argument in arguments)
             raise InputError(f"{path} takes ({', '.join(map(str, wanted))}), got ({got})") from error
 
     return call

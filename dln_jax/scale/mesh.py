@@ -192,11 +192,11 @@ def _with_empty_arrays_made_inside(function: OfBatch) -> OfBatch:
     """
 
     def on_one(shared: Any, batch: Any) -> Any:
-        given = _made_if_empty((shared, batch))
+        arguments = _made_if_empty((shared, batch))
         # Tracing brings to light what the function has closed over, in its loops too.
-        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*given)
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         closed = core.ClosedJaxpr(traced.jaxpr, _made_if_empty(traced.consts))
-        return jax.tree.unflatten(jax.tree.structure(shapes), core.jaxpr_as_fun(closed)(*jax.tree.leaves(given)))
+        return jax.tree.unflatten(jax.tree.structure(shapes), core.jaxpr_as_fun(closed)(*jax.tree.leaves(arguments)))
 
     return on_one
 

@@ -91,7 +91,7 @@ def make_minimiser(
             if done == 1 and not np.isfinite(objective(x)[0]):
                 raise InputError("the function to minimise is not finite at the start; choose another")
             x = minimize(objective, x, jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}).x
-            value, constraints = (np.asarray(each) for each in evaluate(x, multipliers, rho, *arguments)[0][1])
+            value, constraints = (np.asarray(number) for number in evaluate(x, multipliers, rho, *arguments)[0][1])
             violation = float(np.max(constraints, initial=0.0))
             settled = violation <= tolerance and abs(before - value) <= 1e-3 * max(1.0, abs(float(value)))
             if settled:

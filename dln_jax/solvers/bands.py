@@ -71,12 +71,12 @@ def _eliminated(window: Float[Array, "pairs rows 2 systems"], rows: int) -> Floa
 
     def without(start: int, stop: int, earlier: int) -> Array:
         """Rows start:stop of the pair, less what the `earlier` pairs before it contribute."""
-        found = own[start:stop]
+        solution = own[start:stop]
         for distance, column in enumerate(before[:earlier], start=1):
             shift = PAIR * distance if stop <= rows else 0
             left, right = column[start + shift : stop + shift], column[PAIR * distance : PAIR * (distance + 1)]
-            found -= sum(left[:, None, i] * right[None, :, i] for i in range(PAIR))
-        return found
+            solution -= sum(left[:, None, i] * right[None, :, i] for i in range(PAIR))
+        return solution
 
     pairs = [without(row, row + PAIR, len(before) - row // PAIR) for row in range(0, rows, PAIR)]
     (first, _), (corner, second) = pairs[0]

@@ -29,15 +29,17 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     def of_many(_: int, batched: Sequence[bool], *arguments: Array) -> tuple[Any, Any]:
         def merged(call: Callable[..., Any], members: Sequence[Array]) -> Any:
             rest = iter(members)
-            return call(*(next(rest) if split else each for each, split in zip(arguments, batched, strict=True)))
+            return call(
+                *(next(rest) if split else argument for argument, split in zip(arguments, batched, strict=True))
+            )
 
         def in_turn(*members: Array) -> Any:
-            return lax.map(lambda each: merged(of_one, each), members)
+            return lax.map(lambda member: merged(of_one, member), members)
 
         def at_once(*members: Array) -> Any:
-            return jax.vmap(lambda *each: merged(function, each))(*members)
+            return jax.vmap(lambda *members: merged(function, members))(*members)
 
-        split = [each for each, split in zip(arguments, batched, strict=True) if split]
+        split = [argument for argument, split in zip(arguments, batched, strict=True) if split]
         results = lax.platform_dependent(*split, cpu=in_turn, default=at_once)
         return results, jax.tree.map(lambda _: True, results)
 

@@ -63,9 +63,9 @@ def solve(
         raise InputError(f"ridge is {ridge}; expected a number >= 0")
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(A.shape))
-    for name, given in (("rank_tolerance", rank_tolerance), ("negligible", negligible)):
-        if not 0 <= given < 1:
-            raise InputError(f"{name} is {given}; expected a number in [0, 1)")
+    for name, value in (("rank_tolerance", rank_tolerance), ("negligible", negligible)):
+        if not 0 <= value < 1:
+            raise InputError(f"{name} is {value}; expected a number in [0, 1)")
 
     norms = np.linalg.norm(A, axis=0)
     seen = norms > negligible * norms.max(initial=0.0)

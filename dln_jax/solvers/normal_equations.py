@@ -78,10 +78,10 @@ def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size:
 
 def check_precision(tree: Any, what: str) -> None:
     """Raises InputError where a leaf is not float64."""
-    found = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
-    if found:
+    others = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
+    if others:
         raise InputError(
-            f"{what} are {', '.join(sorted(found))}; Gauss-Newton needs float64, for normal equations square the "
+            f"{what} are {', '.join(sorted(others))}; Gauss-Newton needs float64, for normal equations square the "
             "condition number: set jax_enable_x64 (--precision f64) before arrays are made"
         )
 
@@ -137,7 +137,7 @@ def normal_equations(
     edges = np.linspace(0, size, -(-size // _ROWS_PER_BLOCK) + 1).astype(int)
 
     def one(*sample):
-        return jax.vjp(lambda each: jnp.ravel(sample_residual(each, *sample)), parameters)
+        return jax.vjp(lambda tree: jnp.ravel(sample_residual(tree, *sample)), parameters)
 
     def forward(samples: tuple[Any, ...]) -> Array:
         def along(direction: Array) -> Array:
@@ -205,7 +205,7 @@ def pull_back(
 
     def reverse(product: Array, piece) -> tuple[Array, None]:
         samples, vector = piece
-        _, pull = jax.vjp(lambda each: residuals_of(sample_residual, each, samples), parameters)
+        _, pull = jax.vjp(lambda tree: residuals_of(sample_residual, tree, samples), parameters)
         return product + ravel_pytree(pull(vector)[0])[0], None
 
     zero = jnp.zeros(count(parameters))

@@ -151,19 +151,19 @@ static PyObject *called(const function *f, PyObject *self, PyObject *const *give
 
 def binding(name: str, functions: Mapping[str, Signature], precision: str) -> str:
     """Text of the source, to be compiled together with that of the export."""
-    leaves = [leaf for each in functions.values() for leaf in (*each.arguments, *each.results)]
+    leaves = [leaf for function in functions.values() for leaf in (*function.arguments, *function.results)]
     text = _START.substitute(
         name=name,
         real=PRECISIONS[precision][1],
         format=_format("real", precision),
         axes=max([1, *(len(leaf.shape) for leaf in leaves)]),
-        most=max(1, *(len(each.arguments) + len(each.results) for each in functions.values())),
+        most=max(1, *(len(function.arguments) + len(function.results) for function in functions.values())),
     )
-    for number, (key, each) in enumerate(functions.items()):
-        text += _function(number, f"{name}_{key}", each, precision)
+    for number, (key, signature) in enumerate(functions.items()):
+        text += _function(number, f"{name}_{key}", signature, precision)
     methods = "".join(
-        f'    {{"{key}", call_{number}, FAST_WITH_KEYWORDS, "{_described(key, each)}"}},\n'
-        for number, (key, each) in enumerate(functions.items())
+        f'    {{"{key}", call_{number}, FAST_WITH_KEYWORDS, "{_described(key, signature)}"}},\n'
+        for number, (key, signature) in enumerate(functions.items())
     )
     made = f"PyObject *{name}_python(int k, PyObject *self)"
     returned = "return PyCMethod_New(&methods[k], self, NULL, NULL);"
@@ -175,10 +175,14 @@ def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], 
     make = library[f"{name}_python"]
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
     made = {}
-    for number, (key, each) in enumerate(functions.items()):
-        group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in each.results])
-        results = () if each.returns else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in each.results]
-        convert = functools.partial(_converted, key, each.arguments, precision)
+    for number, (key, signature) in enumerate(functions.items()):
+        group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in signature.results])
+        results = (
+            ()
+            if signature.returns
+            else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in signature.results]
+        )
+        convert = functools.partial(_converted, key, signature.arguments, precision)
         made[key] = make(number, (convert, group, *(array.copy for array in results)))
     return collections.namedtuple("Functions", made)(**made)
 
@@ -236,19 +240,21 @@ def _described(key: str, signature: Signature) -> str:
 
 
 def _converted(
-    name: str, leaves: tuple[Leaf, ...], precision: str, given: tuple[Any, ...], names: tuple[str, ...] = ()
+    name: str, leaves: tuple[Leaf, ...], precision: str, arguments: tuple[Any, ...], names: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, ...]:
     """Arguments in order, as arrays of their types; InputError where they are none."""
     expected = [leaf.name for leaf in leaves]
-    placed = dict(zip([*expected[: len(given) - len(names)], *names], given, strict=False))
-    if len(placed) < len(given) or set(placed) != set(expected):
-        others = len(given) - len(set(placed) & set(expected))
-        raise InputError(f"{name} takes {', '.join(expected)}; got {len(given)} of them{' and others' * bool(others)}")
+    placed = dict(zip([*expected[: len(arguments) - len(names)], *names], arguments, strict=False))
+    if len(placed) < len(arguments) or set(placed) != set(expected):
+        others = len(arguments) - len(set(placed) & set(expected))
+        raise InputError(
+            f"{name} takes {', '.join(expected)}; got {len(arguments)} of them{' and others' * bool(others)}"
+        )
     return tuple(_array(leaf, placed[leaf.name], precision) for leaf in leaves)
 
 
-def _array(leaf: Leaf, given: Any, precision: str) -> np.ndarray:
+def _array(leaf: Leaf, argument: Any, precision: str) -> np.ndarray:
     if leaf.kind == "bool":
-        given = np.asarray(given)
-        given = given.astype(np.int32) if given.dtype == bool else given
-    return np.array(as_shaped(leaf.name, given, leaf.shape), _type(leaf.kind, precision), order="C")
+        argument = np.asarray(argument)
+        argument = argument.astype(np.int32) if argument.dtype == bool else argument
+    return np.array(as_shaped(leaf.name, argument, leaf.shape), _type(leaf.kind, precision), order="C")

@@ -58,7 +58,7 @@ class Source:
 
     def copy(self) -> "Source":
         """What may be changed without this one."""
-        shared = {each.name: copy(getattr(self, each.name)) for each in fields(self)}
+        shared = {attribute.name: copy(getattr(self, attribute.name)) for attribute in fields(self)}
         return Source(**shared)
 
     def table(self, numbers: np.ndarray, dtype: str) -> str:
@@ -126,7 +126,7 @@ class Body:
 
     def finished(self, step: Node) -> None:
         """Gives arrays back that no later step reads."""
-        for source in sorted(self.plan.reads.get(step, ()), key=lambda each: each.number):
+        for source in sorted(self.plan.reads.get(step, ()), key=lambda node: node.number):
             left = self.plan.readers[source]
             left.discard(step)
             if not left and source in self.names:
@@ -162,7 +162,7 @@ class Body:
             if is_constant(node):
                 return self.literal(np.asarray(values(node).ravel()[positions]), node.dtype, names)
             positions = np.asarray(np.asarray(node.value).ravel()[positions])
-            starts = np.cumsum([0, *(each.size for each in node.args)])
+            starts = np.cumsum([0, *(arg.size for arg in node.args)])
             owner = np.searchsorted(starts, positions, side="right") - 1
             first = int(owner.flat[0])
             assert (owner == first).all(), "a loop reads from several arrays"
@@ -181,10 +181,10 @@ class Body:
     def index(self, positions: np.ndarray, names: Sequence[str]) -> str:
         """C expression of an index."""
         terms, first = [], 0
-        found = strides(positions)
-        if found is None:
+        linear = strides(positions)
+        if linear is None:
             # What moves by equal steps is not stored.
-            even = {axis: each for axis in range(positions.ndim) if (each := _step(positions, axis)) is not None}
+            even = {axis: step for axis in range(positions.ndim) if (step := _step(positions, axis)) is not None}
             kept = positions[tuple(0 if axis in even else slice(None) for axis in range(positions.ndim))]
             table, names_kept = self.source.table(kept.astype(np.int32), "int"), []
             for axis, name in enumerate(names):
@@ -195,8 +195,8 @@ class Body:
             inside = self.index(np.arange(kept.size).reshape(kept.shape), names_kept)
             terms.append((1, f"{table}[{inside}]"))
         else:
-            first, terms = found[0], list(zip(found[1], names, strict=True))
-        texts = [f"{step} * {name}" if step != 1 else name for step, name in terms if step]
+            first, terms = linear[0], list(zip(linear[1], names, strict=True))
+        texts = [f"{stride} * {name}" if stride != 1 else name for stride, name in terms if stride]
         return " + ".join([*texts, *([str(first)] if first or not texts else [])]).replace("+ -", "- ")
 
     def literal(self, numbers: np.ndarray, dtype: str, names: Sequence[str]) -> str:
@@ -230,9 +230,9 @@ class Body:
     def projected(self, loop: Node) -> set[int]:
         """Which results of a loop are read."""
         return {
-            each.attribute
-            for each, mask in self.plan.needed.items()
-            if each.op == "project" and each.args[0] is loop and mask.any()
+            node.attribute
+            for node, mask in self.plan.needed.items()
+            if node.op == "project" and node.args[0] is loop and mask.any()
         }
 
     def uses(self, node: Node) -> bool:

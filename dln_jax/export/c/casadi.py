@@ -138,9 +138,9 @@ def _with_derivatives(
     except InputError as error:
         raise InputError(f"{symbol}: {error}") from error
     texts, largest = "", 1
-    for prefix, given, results, ways in _derivatives(inputs, outputs, flat):
-        largest = max(largest, *(each.size for each in given))
-        source, text = _function(source, prefix + symbol, given, results, ways, stack)
+    for prefix, blocks, results, ways in _derivatives(inputs, outputs, flat):
+        largest = max(largest, *(block.size for block in blocks))
+        source, text = _function(source, prefix + symbol, blocks, results, ways, stack)
         texts += text
     return source, texts, largest
 
@@ -153,13 +153,13 @@ def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[B
     if not inputs:
         raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
     outputs = [_block(leaf) for leaf in result_leaves(jax.eval_shape(function, *examples), arguments)]
-    cuts = np.cumsum([each.size for each in inputs])[:-1]
+    cuts = np.cumsum([block.size for block in inputs])[:-1]
 
     def flat(x: jax.Array) -> jax.Array:
         # A matrix that is read in column-major order is its transpose.
-        given = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
-        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
-        return jnp.concatenate([jnp.ravel(jnp.asarray(each).T).astype(x.dtype) for each in results])
+        arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
+        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, arguments)))
+        return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
 
     return inputs, outputs, flat
 
@@ -175,16 +175,21 @@ def _block(leaf: Leaf) -> Block:
 
 
 def _check_names(symbol: str, blocks: list[Block]) -> None:
-    names = [prefix + each.name for prefix in ("", "out_", "adj_", "fwd_") for each in blocks]
-    for each in (symbol, *names):
-        if "__" in each or each.endswith("_") or each in ("null", "jac", "hess") or names.count(each) > 1:
-            raise InputError(f"CasADi has no such name as {each}, or derivatives have it too; choose another")
+    names = [prefix + block.name for prefix in ("", "out_", "adj_", "fwd_") for block in blocks]
+    for candidate in (symbol, *names):
+        if (
+            "__" in candidate
+            or candidate.endswith("_")
+            or candidate in ("null", "jac", "hess")
+            or names.count(candidate) > 1
+        ):
+            raise InputError(f"CasADi has no such name as {candidate}, or derivatives have it too; choose another")
 
 
 def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
     """Prefix, inputs and outputs of each function, and ways to compute it from inputs and seeds, the best first."""
     x_parts, y_parts = (
-        [slice(*ends) for ends in pairwise([0, *accumulate(each.size for each in blocks)])]
+        [slice(*ends) for ends in pairwise([0, *accumulate(block.size for block in blocks)])]
         for blocks in (inputs, outputs)
     )
 
@@ -199,25 +204,25 @@ def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterab
         return jnp.concatenate([block.ravel() for row in blocks for block in row])
 
     def of(prefix: str, blocks: list[Block]) -> list[Block]:
-        return [each._replace(name=f"{prefix}_{each.name}", dense=prefix != "out") for each in blocks]
+        return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
 
-    def jacobians(results: list[Block], given: list[Block]) -> list[Block]:
+    def jacobians(results: list[Block], variables: list[Block]) -> list[Block]:
         return [
-            Block(f"jac_{result.name}_{each.name}", result.size, each.rows * each.columns, each.dense)
+            Block(f"jac_{result.name}_{variable.name}", result.size, variable.rows * variable.columns, variable.dense)
             for result in results
-            for each in given
+            for variable in variables
         ]
 
     both, adjoints = [*inputs, *of("out", outputs)], of("adj", inputs)
     seeded, pulls = [*both, *of("adj", outputs)], (sensitivities.pull, sensitivities.pull_forward)
-    more_inputs = sum(each.size for each in inputs) > sum(each.size for each in outputs)
+    more_inputs = sum(block.size for block in inputs) > sum(block.size for block in outputs)
     directions = (sensitivities.forward, sensitivities.reverse)[:: -1 if more_inputs else 1]
     yield "", inputs, outputs, [lambda x, _: flat(x)]
     yield "jac_", both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]
     yield "fwd1_", [*both, *of("fwd", inputs)], of("fwd", outputs), [partial(sensitivities.push, flat)]
     yield "adj1_", seeded, adjoints, [partial(pull, flat) for pull in pulls]
-    given = [*seeded, *of("out", adjoints)]
-    yield "jac_adj1_", given, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
+    with_adjoints = [*seeded, *of("out", adjoints)]
+    yield "jac_adj1_", with_adjoints, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
 
 
 def _function(
@@ -235,9 +240,9 @@ def _function(
             blocks = [*inputs, *outputs]
             return body.source, _TEXT.format(
                 symbol=symbol,
-                names=", ".join(f'"{each.name}"' for each in blocks),
-                length=3 + max(0 if each.dense else each.columns for each in blocks),
-                sparsities=", ".join(f"{{{each.rows}, {each.columns}, {int(each.dense)}}}" for each in blocks),
+                names=", ".join(f'"{block.name}"' for block in blocks),
+                length=3 + max(0 if block.dense else block.columns for block in blocks),
+                sparsities=", ".join(f"{{{block.rows}, {block.columns}, {int(block.dense)}}}" for block in blocks),
                 operations=body.operations, bytes=body.bytes, inputs=len(inputs), outputs=len(outputs),
                 lines="\n".join(body.lines),
             )  # fmt: skip
@@ -248,9 +253,9 @@ def _function(
 
 
 def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callable[..., jax.Array]) -> Body:
-    cuts = np.cumsum([each.size for each in outputs if each.dense])[:-1]
-    dense = [k for k, each in enumerate(inputs) if each.dense]
-    n = sum(each.size for each in takewhile(lambda each: each.dense, inputs))
+    cuts = np.cumsum([output.size for output in outputs if output.dense])[:-1]
+    dense = [k for k, block in enumerate(inputs) if block.dense]
+    n = sum(block.size for block in takewhile(lambda block: block.dense, inputs))
 
     def evaluate(*columns: jax.Array) -> list[jax.Array]:
         x, seeds = jnp.split(jnp.concatenate(columns), [n])
@@ -266,7 +271,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
     body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
     region(body, ())
     writers = written(body, results, apart=False)
-    for j, write in zip((j for j, each in enumerate(outputs) if each.dense), writers, strict=True):
+    for j, write in zip((j for j, output in enumerate(outputs) if output.dense), writers, strict=True):
         body.opened(f"if (res[{j}])")
         write(f"res[{j}]")
         body.closed()

@@ -52,7 +52,7 @@ def written(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callabl
 
 def _moved_from_argument(body: Body, node: Node) -> bool:
     if node.op == "arrange" and node not in body.plan.arrays:
-        return any(_moved_from_argument(body, each) for each in node.args)
+        return any(_moved_from_argument(body, arg) for arg in node.args)
     return node.op == "input" and not body.inputs[node.attribute][1]
 
 
@@ -76,13 +76,13 @@ def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, o
 
 def ancestors(body: Body, nodes: Sequence[Node]) -> set[Node]:
     """These nodes and all that they need, with the loops that compute it."""
-    found, waiting = set(), list(nodes)
+    needed, waiting = set(), list(nodes)
     while waiting:
         node = waiting.pop()
-        if node not in found:
-            found.add(node)
+        if node not in needed:
+            needed.add(node)
             waiting += [*node.args, *([body.plan.root[node]] if node in body.plan.root else [])]
-    return found
+    return needed
 
 
 def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -> None:
@@ -96,15 +96,15 @@ def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -
         elements.written_out(body, node)
     elif node.op == "contract":
         members = [
-            each for each in plan.order[node.region]
-            if each.op == "contract" and each not in done and each not in plan.written_out
-            and (only is None or each in only)
-            and each.args[1] is node.args[1] and plan.levels[each] == plan.levels[node]
+            other for other in plan.order[node.region]
+            if other.op == "contract" and other not in done and other not in plan.written_out
+            and (only is None or other in only)
+            and other.args[1] is node.args[1] and plan.levels[other] == plan.levels[node]
         ]  # fmt: skip
         done.update(members)
         products.contracted(body, [node, *members])
-        for each in members:
-            body.finished(each)
+        for member in members:
+            body.finished(member)
     elif node.op in OPERATIONS or node.op == "take":
         elements.looped(body, node)
     else:
@@ -116,15 +116,15 @@ def part(caller: Body, key: Any) -> Called:
     source = caller.source
     if key not in source.parts:
         program, results = caller.program.parts[key]
-        inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda each: each.attribute)
-        named = {each.attribute: (f"a{each.attribute}_", False) for each in inputs}
+        inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda argument: argument.attribute)
+        named = {argument.attribute: (f"a{argument.attribute}_", False) for argument in inputs}
         targets = [f"r{k}_" for k in range(len(results))]
         body = body_of(source, program, results, named, targets, apart=True)
-        parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
+        parameters = [f"const {C_TYPES[argument.dtype]} *RESTRICT a{argument.attribute}_" for argument in inputs]
         parameters += [
-            f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)
+            f"{C_TYPES[result.dtype]} *RESTRICT {target}" for result, target in zip(results, targets, strict=True)
         ]
-        unused = [f"    (void)a{each.attribute}_;" for each in inputs if not body.uses(each)]
+        unused = [f"    (void)a{argument.attribute}_;" for argument in inputs if not body.uses(argument)]
         lines = "\n".join([*unused, *body.lines])
         text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
         name = source.names.setdefault(text, f"part_{len(source.names)}")
@@ -149,8 +149,8 @@ def _stored(body: Body, node: Node, handed_on: list[Node], turns: list[int] | No
     number = np.ravel(node.attribute)[0]
     read = body.projected(node)
     names = [f"c{number}_{index}" for index in range(len(handed_on))]
-    for name, each, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
-        body.declared(name, each.dtype, max(each.size * count, 1))
+    for name, result, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
+        body.declared(name, result.dtype, max(result.size * count, 1))
     for name in (name for index, name in enumerate(names) if index not in read):
         body.line(f"(void){name};")
     return names
@@ -190,19 +190,19 @@ def _repeat(body: Body, node: Node) -> None:
     for name, start in zip(names, node.args, strict=True):
         copied(body, start, name)
     read = body.projected(node)
-    stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
+    stacked = {carried + k: result for k, result in enumerate(loop.results[carried:]) if carried + k in read}
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    counters = (each for each in body.plan.needed if each.op == "counter" and each.attribute == number)
+    counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
     if stacked or any(map(body.uses, counters)):
         body.line(f"const long long i_{number} = {turn};")
     region(body, (*node.region, number))
-    for index, each in stacked.items():
+    for index, result in stacked.items():
         body.opened("")
-        body.declared(f"n{number}_{index}", each.dtype, max(each.size, 1))
-        copied(body, each, f"n{number}_{index}")
-        target = f"c{number}_{index}[i_{number} * {each.size} + k_]"
-        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{index}[k_];")
+        body.declared(f"n{number}_{index}", result.dtype, max(result.size, 1))
+        copied(body, result, f"n{number}_{index}")
+        target = f"c{number}_{index}[i_{number} * {result.size} + k_]"
+        body.line(f"for (int k_ = 0; k_ < {result.size}; ++k_) {target} = n{number}_{index}[k_];")
         body.closed()
     _handed_on(body, loop, names, number)
     body.closed(max(length, 1))

@@ -123,7 +123,7 @@ def functions_of_system(
 
 def _traced_once(system: Any) -> Any:
     """Its functions jitted."""
-    fields = {name: jax.jit(each) for name, each in system._asdict().items() if callable(each)}
+    fields = {name: jax.jit(field) for name, field in system._asdict().items() if callable(field)}
     if isinstance(system, LoadedSystem):
         fields["link"] = _traced_once(system.link)
     return system._replace(**fields)
@@ -171,8 +171,11 @@ def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tupl
     """Every argument is a vector of this size, but for those of other shapes."""
     shapes["dt"] = ()
     return {
-        name: (each, tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(each).parameters))
-        for name, each in functions.items()
+        name: (
+            function,
+            tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(function).parameters),
+        )
+        for name, function in functions.items()
     }
 
 
@@ -180,7 +183,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     motion = dynamics(system, degrees_of_freedom=d)
     forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
     inverse_jacobians, coriolis_jacobians = (
-        functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
+        functools.partial(jacobian, system)
+        for jacobian in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
     )
     link = _link(system)
     natural = isinstance(link, Natural)
@@ -243,7 +247,7 @@ def _of_layers(layers: Layers, activation: Activation) -> Named:
     def mean(derivatives: Callable[..., Any]) -> Function:
         def function(x: Array) -> Any:
             every = [derivatives(tuple(member), x, activation=activation) for member in members]
-            return jax.tree.map(lambda *each: sum(each) / len(members), *every)
+            return jax.tree.map(lambda *results: sum(results) / len(members), *every)
 
         return function
 
@@ -279,13 +283,13 @@ def _with_derivatives(name: str, function: Function) -> Named:
 
     @functools.wraps(function)
     def derivatives(*state: Array) -> Mapping[str, Array]:
-        rows = sum(each.size for each in jax.tree.leaves(jax.eval_shape(function, *state)))
-        if rows < sum(each.size for each in state):
+        rows = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(function, *state)))
+        if rows < sum(array.size for array in state):
             slopes = jax.jacrev(function, argnums=tuple(places))(*state)
         else:
             # By each apart: what does not depend on it passes nothing.
-            each = [jax.jacfwd(function, argnums=place)(*state) for place in places]
-            slopes = {result: [slope[result] for slope in each] for result in each[0]}
+            columns = [jax.jacfwd(function, argnums=place)(*state) for place in places]
+            slopes = {result: [slope[result] for slope in columns] for result in columns[0]}
         return OrderedDict((f"{result}_{arguments[k]}", by[k]) for result, by in slopes.items() for k in places)
 
     return {name: function, f"{name}_{'gradient' if name in SCALARS else 'jacobian'}": derivatives}

@@ -33,16 +33,16 @@ def gather(program: Program, parameters: dict[str, Any], operand: Node, indices:
     def placed(array: np.ndarray) -> np.ndarray:
         return np.broadcast_to(array, (*batch, *window)).transpose(order)
 
-    each = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
+    windows = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
     positions = program.elementwise(
-        "add", program.arrange([start], placed(each)), program.constant(placed(offsets), "index")
+        "add", program.arrange([start], placed(windows)), program.constant(placed(offsets), "index")
     )
     taken = take(program, operand, positions)
     if inside is None:
         return taken
     fill = parameters["fill_value"]
     fill = _filled(operand.dtype) if fill is None else fill
-    return program.select(program.arrange([inside], placed(each)), program.constant(fill, operand.dtype), taken)
+    return program.select(program.arrange([inside], placed(windows)), program.constant(fill, operand.dtype), taken)
 
 
 def _filled(kind: str) -> Any:
@@ -70,13 +70,13 @@ def scatter(name: str):
         )  # fmt: skip
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
         arranged = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
-        each = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
+        windows = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
         shape = arranged.shape
         offsets = program.constant(np.broadcast_to(_offsets(operand.shape, kept, window), shape), "index")
-        targets = program.elementwise("add", program.arrange([start], np.broadcast_to(each, shape)), offsets)
+        targets = program.elementwise("add", program.arrange([start], np.broadcast_to(windows, shape)), offsets)
         if inside is not None:
             minus = program.constant(-1, "index")
-            targets = program.select(program.arrange([inside], np.broadcast_to(each, shape)), minus, targets)
+            targets = program.select(program.arrange([inside], np.broadcast_to(windows, shape)), minus, targets)
         return put(program, _UPDATES[name], operand, targets, program.arrange([updates], arranged))
 
     return rule
@@ -132,7 +132,7 @@ def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Nod
     order = program.make("order", rows[0].shape, "index", rows[: parameters["num_keys"]])
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
-    return [program.arrange([take(program, each, order)], back) for each in rows]
+    return [program.arrange([take(program, row, order)], back) for row in rows]
 
 
 def _window(program: Program, shape, sizes, starts) -> Node:
@@ -150,7 +150,9 @@ def _starts(program: Program, indices: Node, shape, sizes, axes, mode, batched) 
     index = np.arange(indices.size).reshape(indices.shape)
     flat = program.constant(np.zeros(batch, np.int64), "index")
     for axis, of_indices in batched:
-        counted = np.arange(batch[of_indices]).reshape([-1 if each == of_indices else 1 for each in range(len(batch))])
+        counted = np.arange(batch[of_indices]).reshape(
+            [-1 if dimension == of_indices else 1 for dimension in range(len(batch))]
+        )
         corner = np.broadcast_to(counted, batch) * _stride(shape, axis)
         flat = program.elementwise("add", flat, program.constant(corner, "index"))
     fills, inside = "FILL" in str(mode).upper(), None
@@ -195,7 +197,7 @@ def _offsets(shape, axes, sizes) -> np.ndarray:
     offsets = np.zeros([1] * len(sizes), np.int64)
     for place, (axis, size) in enumerate(zip(axes, sizes, strict=True)):
         steps = np.arange(size) * _stride(shape, axis)
-        offsets = offsets + steps.reshape([-1 if each == place else 1 for each in range(len(sizes))])
+        offsets = offsets + steps.reshape([-1 if other == place else 1 for other in range(len(sizes))])
     return offsets
 
 

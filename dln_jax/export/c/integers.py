@@ -95,7 +95,7 @@ def definitions(names: Iterable[str], precision: str) -> str:
         if f"remainder_{kind}" in names:
             text += _function(f"{c} elementary_remainder_{kind}({c} a, {c} b)", "b == 0", "a", _REMAINDER[signed])
         types = {"c": c, "u": f"u{c.removeprefix('u')}", "s": c.removeprefix("u")}
-        for shift in (each for each in SHIFTS if f"shift_{each}_{kind}" in names):
+        for shift in (name for name in SHIFTS if f"shift_{name}_{kind}" in names):
             text += _function(f"{c} elementary_shift_{shift}_{kind}({c} a, {c} b)",
                               f"({types['u']})b >= {8 * np.dtype(NUMPY_TYPES[kind]).itemsize}",
                               _ALL_SHIFTED_OUT[shift].format(**types), _SHIFTED[shift].format(**types))  # fmt: skip

@@ -49,7 +49,7 @@ def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> li
     except (ValueError, TypeError):
         names = []
     names += [f"argument_{k}" for k in range(len(names), len(examples))]
-    leaves = [leaf for name, each in zip(names, examples, strict=False) for leaf in _leaves(name, each)]
+    leaves = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
     return _checked(leaves, "argument")
 
 
@@ -62,14 +62,14 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 
 
 def _leaves(name: str, tree: Any) -> list[Leaf]:
-    found = []
+    leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
         whole = "_".join(part for part in (name, *parts) if part)
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
-        found.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
-    return found
+        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
+    return leaves
 
 
 def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
@@ -86,14 +86,14 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
     """The prototype of a function, without its semicolon."""
     kinds = {**KINDS, "real": real}
     parameters = [
-        f"{kinds[kind]} {each}" if shape == () else f"const {kinds[kind]} {each}[{_length(shape)}]"
-        for each, kind, shape in signature.arguments
+        f"{kinds[kind]} {argument}" if shape == () else f"const {kinds[kind]} {argument}[{_length(shape)}]"
+        for argument, kind, shape in signature.arguments
     ]
     result = "void"
     if signature.returns:
         result = str(kinds[signature.results[0].kind])
     else:
-        parameters += [f"{kinds[kind]} {each}[{_length(shape)}]" for each, kind, shape in signature.results]
+        parameters += [f"{kinds[kind]} {result}[{_length(shape)}]" for result, kind, shape in signature.results]
     return f"{result} {name}_{function}({', '.join(parameters) or 'void'})"
 
 
@@ -106,12 +106,12 @@ def description(name: str, precision: str, version: str, functions: Mapping[str,
     """JSON values that state an export."""
     stated = {
         key: {
-            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.arguments],
-            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.results],
-            "stack_bytes": each.stack_bytes,
-            "operations": each.operations,
+            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.arguments],
+            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.results],
+            "stack_bytes": function.stack_bytes,
+            "operations": function.operations,
         }
-        for key, each in functions.items()
+        for key, function in functions.items()
     }
     return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
 
@@ -130,9 +130,9 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
     try:
         if stated.get("name") != name or precision not in PRECISIONS:
             raise InputError(f"name is {stated.get('name')!r:.60} and precision {precision!r:.60}")
-        functions = {str(key): _signature(each) for key, each in dict(stated["functions"]).items()}
-        for key, each in functions.items():
-            if f"{declaration(name, check_name(key), each, PRECISIONS[precision][1])};" not in header:
+        functions = {str(key): _signature(value) for key, value in dict(stated["functions"]).items()}
+        for key, function in functions.items():
+            if f"{declaration(name, check_name(key), function, PRECISIONS[precision][1])};" not in header:
                 raise InputError(f"{key} is not declared so in {name}.h")
     except (InputError, TypeError, ValueError, KeyError) as error:
         raise InputError(f"{path}: contradicts itself ({error!s:.200}); {AGAIN}") from error
@@ -141,11 +141,11 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
 
 def _signature(stated: Any) -> Signature:
     def leaves(key: str) -> tuple[Leaf, ...]:
-        found = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
-        for leaf in found:
+        known = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
+        for leaf in known:
             counts = all(type(size) is int and size >= 0 for size in leaf.shape)
             if leaf.kind not in KINDS or not counts or np.prod(leaf.shape, dtype=float) > LARGEST:
                 raise InputError(f"{leaf.name} is {leaf}")
-        return found
+        return known
 
     return Signature(leaves("arguments"), leaves("results"))

@@ -41,18 +41,20 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
     def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
         """Number of equations, those of calls included, and a digest of primitives, types and constants."""
         size, digest = 0, hashlib.sha256()
-        for each in consts:
-            digest.update(np.asarray(each).tobytes())
+        for const in consts:
+            digest.update(np.asarray(const).tobytes())
         for equation in jaxpr.eqns:
             within = 0
             literals = [variable.val for variable in equation.invars if hasattr(variable, "val")]
             types = [
-                (each.aval.shape, str(each.aval.dtype)) for each in equation.outvars if hasattr(each.aval, "dtype")
+                (variable.aval.shape, str(variable.aval.dtype))
+                for variable in equation.outvars
+                if hasattr(variable.aval, "dtype")
             ]
             digest.update(repr((equation.primitive.name, types)).encode())
-            digest.update(b"".join(np.asarray(each).tobytes() for each in literals))
+            digest.update(b"".join(np.asarray(literal).tobytes() for literal in literals))
             values = equation.params.values() if _of_jax(equation.primitive) else ()
-            for inner in (each for value in values for each in _jaxprs(value)):
+            for inner in (nested for value in values for nested in _jaxprs(value)):
                 inside, likeness = called(inner)
                 within += inside
                 digest.update(likeness)
@@ -70,12 +72,12 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
 
     for closed in every:
         visit(closed.jaxpr, closed.consts)
-    return {each for each, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
+    return {identity for identity, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
 
 
 def _jaxprs(value: Any) -> list[Any]:
     if isinstance(value, list | tuple):
-        return [each for one in value for each in _jaxprs(one)]
+        return [jaxpr for item in value for jaxpr in _jaxprs(item)]
     return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
 
 
@@ -85,7 +87,7 @@ def expanded(primitive: Any) -> Any:
     def expand(*leaves: Any) -> list[Any]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
 
-    examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
+    examples = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in primitive.in_avals_flat]
     return jax.make_jaxpr(expand)(*examples)
 
 
@@ -101,11 +103,11 @@ def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
 
     def run(*unknown: Any) -> list[Any]:
         left = iter(unknown)
-        args = [next(left) if each is None else each for each in known]
+        args = [next(left) if value is None else value for value in known]
         return jax.tree.leaves(primitive.impl(*args, **equation.params))
 
-    avals = [variable.aval for variable, each in zip(equation.invars, known, strict=True) if each is None]
-    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(each.shape, each.dtype) for each in avals))
+    avals = [variable.aval for variable, value in zip(equation.invars, known, strict=True) if value is None]
+    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals))
 
 
 def _of_jax(primitive: Any) -> bool:

@@ -13,7 +13,7 @@ from dln_jax.types import InputError
 def _matrices(program: Program, node: Node) -> list[Node]:
     """Each [rows, columns] of a batch."""
     index = np.arange(node.size).reshape(-1, *node.shape[-2:])
-    return [program.arrange([node], each) for each in index]
+    return [program.arrange([node], positions) for positions in index]
 
 
 def _stacked(program: Program, nodes: list[Node], shape: Any) -> Node:
@@ -21,8 +21,8 @@ def _stacked(program: Program, nodes: list[Node], shape: Any) -> Node:
 
 
 def _cholesky(program: Program, _, a: Node) -> Node:
-    each = [program.make("cholesky", one.shape, "real", [one]) for one in _matrices(program, a)]
-    return _stacked(program, each, a.shape)
+    factors = [program.make("cholesky", one.shape, "real", [one]) for one in _matrices(program, a)]
+    return _stacked(program, factors, a.shape)
 
 
 def _triangular_solve(program: Program, parameters: dict[str, Any], a: Node, b: Node) -> Node:
@@ -58,19 +58,19 @@ def _lu(program: Program, _, a: Node) -> list[Node]:
 def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> Node:
     size = parameters["permutation_size"]
     index = np.arange(pivots.size).reshape(-1, pivots.shape[-1])
-    each = [program.make("permutation", (size,), "int", [program.arrange([pivots], row)]) for row in index]
-    return _stacked(program, each, (*pivots.shape[:-1], size))
+    orders = [program.make("permutation", (size,), "int", [program.arrange([pivots], row)]) for row in index]
+    return _stacked(program, orders, (*pivots.shape[:-1], size))
 
 
 def _parts(program: Program, nodes: list[Node], first: int, shape: tuple[int, ...], batch: list[int]) -> Node:
     """An array of that shape from each flat node, read from element `first` on."""
     index = first + np.arange(prod(shape))
-    return _stacked(program, [program.arrange([each], index) for each in nodes], (*batch, *shape))
+    return _stacked(program, [program.arrange([node], index) for node in nodes], (*batch, *shape))
 
 
 def _geqrf(program: Program, _, a: Node) -> list[Node]:
     (*batch, m, n), k = a.shape, min(a.shape[-2:])
-    nodes = [program.make("geqrf", (m * n + k,), "real", [each]) for each in _matrices(program, a)]
+    nodes = [program.make("geqrf", (m * n + k,), "real", [matrix]) for matrix in _matrices(program, a)]
     return [_parts(program, nodes, 0, (m, n), batch), _parts(program, nodes, m * n, (k,), batch)]
 
 
@@ -103,8 +103,8 @@ def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
     if parameters["subset_by_index"] not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
     row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if parameters["lower"] else 1]
-    matrices = [program.arrange([each], row * n + column) for each in _matrices(program, a)]
-    nodes = [program.make("eigh", (n * n + n,), "real", [each]) for each in matrices]
+    matrices = [program.arrange([matrix], row * n + column) for matrix in _matrices(program, a)]
+    nodes = [program.make("eigh", (n * n + n,), "real", [matrix]) for matrix in matrices]
     return [_parts(program, nodes, 0, (n, n), batch), _parts(program, nodes, n * n, (n,), batch)]
 
 

@@ -64,10 +64,10 @@ def load_c(
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
     """Runs a C compiler; InputError where there is none, or where it fails."""
     names = [compiler] if compiler else [os.environ.get("CC", "cc"), "cc", "gcc", "clang"]
-    found = next((path for candidate in names if candidate and (path := shutil.which(candidate))), None)
-    if found is None:
+    chosen = next((path for candidate in names if candidate and (path := shutil.which(candidate))), None)
+    if chosen is None:
         raise InputError(f"no C compiler ({', '.join(names)}) on the PATH; install gcc or clang, or set CC")
-    result = subprocess.run([found, *arguments], capture_output=True, text=True, errors="replace")
+    result = subprocess.run([chosen, *arguments], capture_output=True, text=True, errors="replace")
     if result.returncode:
         complaint = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr.strip())
-        raise InputError(f"{found} could not compile the model: {complaint}; export it again, or name other flags")
+        raise InputError(f"{chosen} could not compile the model: {complaint}; export it again, or name other flags")

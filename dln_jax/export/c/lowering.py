@@ -109,11 +109,9 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
     if name not in _RULES:
         why = next((reason for part, reason in _REFUSED.items() if part in name), None)
-        inner = (
-            None if why else implementation(equation, [values(each) if is_constant(each) else None for each in args])
-        )
+        inner = None if why else implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
         if inner is not None:
-            return _inline(program, inner, [each for each in args if not is_constant(each)])
+            return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
     results = _RULES[name](program, parameters, *args)
     return list(results) if isinstance(results, list | tuple) else [results]
@@ -135,14 +133,14 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
         inside = [
             part.constant(values(arg), arg.dtype)
             if k in fixed
-            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(each < k for each in fixed))
+            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
             for k, arg in enumerate(args)
         ]
         results = _inline(part, closed, inside)
         program.lowered[call] = part.identity(results)
         program.parts.setdefault(program.lowered[call], Part(part, results))
     key = program.lowered[call]
-    shapes = [(each.shape, each.dtype) for each in program.parts[key].results]
+    shapes = [(result.shape, result.dtype) for result in program.parts[key].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
     node = program.make("call", (), "int", passed, attribute=key)
     return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
@@ -165,8 +163,8 @@ def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], i
 def _carries(program: Program, number: int, outer: tuple[int, ...], start: Sequence[Node]) -> list[Node]:
     region = (*outer, number)
     return [
-        program.make("carry", each.shape, each.dtype, attribute=(number, index), region=region)
-        for index, each in enumerate(start)
+        program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=region)
+        for index, carry in enumerate(start)
     ]
 
 
@@ -185,7 +183,7 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
     results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
     program.loops[number] = Loop(carries, [condition], results)
-    return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
+    return _projections(program, "while", number, outer, start, [(carry.shape, carry.dtype) for carry in start])
 
 
 def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -194,20 +192,20 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     length, reverse = parameters["length"], parameters["reverse"]
     if length == 0:
         left = parameters["jaxpr"].out_avals[count:]
-        return [*start, *(program.constant(np.zeros((0, *each.shape)), kind_of(each.dtype)) for each in left)]
+        return [*start, *(program.constant(np.zeros((0, *aval.shape)), kind_of(aval.dtype)) for aval in left)]
     outer, number = _region(program, args)
     carries = _carries(program, number, outer, start)
     turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
     slices = []
-    for each in stacked:
-        size = each.size // max(length, 1)
-        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "index")
+    for array in stacked:
+        size = array.size // max(length, 1)
+        offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
         first = program.elementwise("mul", turn, program.constant(size, "index"))
-        slices.append(indexing.take(program, each, program.elementwise("add", first, offsets)))
+        slices.append(indexing.take(program, array, program.elementwise("add", first, offsets)))
     results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
     program.loops[number] = Loop(carries, [], results, length, reverse)
-    shapes = [(each.shape, each.dtype) for each in start]
-    shapes += [((length, *each.shape), each.dtype) for each in results[count:]]
+    shapes = [(carry.shape, carry.dtype) for carry in start]
+    shapes += [((length, *result.shape), result.dtype) for result in results[count:]]
     return _projections(program, "repeat", number, outer, start, shapes)
 
 
@@ -226,7 +224,7 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     program.floor = floor
     for inside, results in every:
         program.loops[inside] = Loop([], [], results)
-    shapes = [(each.shape, each.dtype) for each in every[0][1]]
+    shapes = [(result.shape, result.dtype) for result in every[0][1]]
     numbers = tuple(inside for inside, _ in every)
     branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
     return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
@@ -234,7 +232,7 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
 
 def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
     """Which branch is that of a processor: the one for all others, where none is its own."""
-    places = [k for k, each in enumerate(parameters["platforms"]) if each is None or "cpu" in each]
+    places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
     return [program.constant(np.int32(places[0]), "int")]
 
 

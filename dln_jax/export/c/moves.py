@@ -21,7 +21,7 @@ def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[in
         if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
             continue
         before = kept[-1] if kept else None
-        joined = before is not None and all(each is not None and each[before] == each[axis] * extent for each in steps)
+        joined = before is not None and all(step is not None and step[before] == step[axis] * extent for step in steps)
         if joined:
             result[-1] *= extent
             kept[-1] = axis
@@ -54,7 +54,7 @@ def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequ
     """Reading, through an arrange that is itself kept where it is its own copy."""
     if not (own and node.op == "arrange"):
         return body.read(node, positions, names)
-    starts = np.cumsum([0, *(each.size for each in node.args)])
+    starts = np.cumsum([0, *(arg.size for arg in node.args)])
     inside = np.asarray(np.asarray(node.value).ravel()[positions])
     first = int(np.searchsorted(starts, inside.flat[0], side="right")) - 1
     return body.read(node.args[first], np.asarray(inside - starts[first]), names)
@@ -64,7 +64,7 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
     """Boxes of elements that a loop can follow, each from one source."""
     if node.op != "arrange" or node.value is None:
         return [index]
-    starts = np.cumsum([0, *(each.size for each in node.args)])
+    starts = np.cumsum([0, *(arg.size for arg in node.args)])
     owner = (np.searchsorted(starts, node.value, side="right") - 1).ravel()
     flat = node.value.ravel()
 
@@ -73,9 +73,11 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
         if strides(at) is not None and (of == of.flat[0]).all():
             return [box]
         cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
-        axis = min((each for each in cuts if len(cuts[each]) > 2), key=lambda each: len(cuts[each]), default=None)
+        axis = min(
+            (choice for choice in cuts if len(cuts[choice]) > 2), key=lambda choice: len(cuts[choice]), default=None
+        )
         if axis is None:
-            axis = next(each for each in range(at.ndim) if at.shape[each] > 1)
+            axis = next(choice for choice in range(at.ndim) if at.shape[choice] > 1)
             cuts[axis] = list(range(at.shape[axis] + 1))
         return [
             part
@@ -88,14 +90,14 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
     """Elements of each source, [leading axes along which the source is the same, its elements of the others]."""
-    starts = np.cumsum([0, *(each.size for each in node.args)])
+    starts = np.cumsum([0, *(arg.size for arg in node.args)])
     owner = np.searchsorted(starts, np.asarray(node.value), side="right") - 1
     leading = []
     while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
         leading.append(index.shape[len(leading)])
         owner = owner[0]
     rows = index.reshape(*leading, -1)
-    return [rows[..., owner.ravel() == each] for each in np.unique(owner)]
+    return [rows[..., owner.ravel() == source] for source in np.unique(owner)]
 
 
 def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:

@@ -51,14 +51,14 @@ class Loop(NamedTuple):
 
 def is_constant(node: Node) -> bool:
     """Whether it is known beforehand."""
-    return node.op == "const" or (node.op == "arrange" and all(each.op == "const" for each in node.args))
+    return node.op == "const" or (node.op == "arrange" and all(arg.op == "const" for arg in node.args))
 
 
 def values(node: Node) -> np.ndarray:
     """Numbers of a node that is known beforehand."""
     if node.op == "const":
         return np.asarray(node.value)
-    return np.asarray(np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)])
+    return np.asarray(np.concatenate([values(arg).ravel() for arg in node.args])[np.asarray(node.value)])
 
 
 def is_all(node: Node, number: Any) -> bool:
@@ -76,7 +76,7 @@ def is_uniform(node: Node) -> bool:
 
 def without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Node], np.ndarray]:
     """Each source once, and only those of which something is taken."""
-    starts = np.cumsum([0, *(each.size for each in sources)])
+    starts = np.cumsum([0, *(source.size for source in sources)])
     owner = np.searchsorted(starts, positions, side="right") - 1
     kept, start, moved = {}, 0, np.zeros(len(sources), np.int64)
     for index in np.unique(owner):

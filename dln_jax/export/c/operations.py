@@ -145,7 +145,9 @@ def _beside_zero(op: str, args: Sequence[str]) -> str | None:
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
 """Exactly so, also in floating point."""
-TRANSCENDENTAL = frozenset(name for name, each in OPERATIONS.items() if each.function and name not in ("sqrt",))
+TRANSCENDENTAL = frozenset(
+    name for name, operation in OPERATIONS.items() if operation.function and name not in ("sqrt",)
+)
 """What calls a function."""
 VECTORISED = frozenset(_VECTORISED)
 """What is written so that loops of it vectorise."""

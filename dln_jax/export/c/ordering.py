@@ -47,8 +47,10 @@ def _function(kinds: Sequence[str]) -> str:
     comparisons = ""
     for place, kind in enumerate(kinds):
         nan_last = " || (KEY[{0}] == KEY[{0}] && KEY[{1}] != KEY[{1}])" if kind == "real" else ""
-        each = _COMPARISONS.replace("LAST_I", nan_last.format("i", "j")).replace("LAST_J", nan_last.format("j", "i"))
-        comparisons += each.replace("KEY", f"key{place}")
+        comparison = _COMPARISONS.replace("LAST_I", nan_last.format("i", "j")).replace(
+            "LAST_J", nan_last.format("j", "i")
+        )
+        comparisons += comparison.replace("KEY", f"key{place}")
     keys = "".join(f", const {C_TYPES[kind]} *key{place}" for place, kind in enumerate(kinds))
     passed = "".join(f", key{place}" for place in range(len(kinds)))
     return Template(_ORDER.replace("$name", _name(kinds))).substitute(keys=keys, passed=passed, comparisons=comparisons)

@@ -66,7 +66,9 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     arrays -= {node for node, into in root.items() if into is not node}
     levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
     order: dict[Region, list[Node]] = {}
-    for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
+    for node in sorted(
+        nodes, key=lambda candidate: (levels[candidate], not _is_product(candidate, written_out), candidate.number)
+    ):
         ends = root.get(node, node)
         if needed[ends].any() and (node in written_out or ends is node):
             order.setdefault(node.region, []).append(node)
@@ -109,20 +111,20 @@ def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
     """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
-    found, waiting = set(), list(results)
+    reached, waiting = set(), list(results)
     while waiting:
         node = waiting.pop()
-        if node not in found:
-            found.add(node)
+        if node not in reached:
+            reached.add(node)
             waiting += node.args
             for loop in inner(program, node):
                 waiting += [*loop.carries, *loop.conditions, *loop.results]
-    nodes = sorted(found, key=lambda node: node.number)
+    nodes = sorted(reached, key=lambda node: node.number)
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
     whole, contiguous = {node for node in results if node.size > WRITTEN_OUT}, set()
     for node in nodes:
-        for each in node.args:
-            readers[each].append(node)
+        for arg in node.args:
+            readers[arg].append(node)
         if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_written_out(node)):
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
         for loop in inner(program, node):
@@ -143,7 +145,7 @@ def _is_written_out(node: Node) -> bool:
         return False
     if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
         return True
-    scattered = any(each.op == "arrange" and not is_direct(each) for each in node.args)
+    scattered = any(arg.op == "arrange" and not is_direct(arg) for arg in node.args)
     return node.size <= WRITTEN_OUT and scattered and node.op not in TRANSCENDENTAL
 
 
@@ -173,7 +175,7 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
     levels: dict[Node, int] = {}
     highest: dict[int, int] = {}
     for node in nodes:
-        level = max((levels[each] for each in node.args), default=0)
+        level = max((levels[arg] for arg in node.args), default=0)
         for number in (node.attribute if node.op == "branch" else (node.attribute,)) if inner(program, node) else ():
             level = max(level, highest.get(number, 0))
         levels[node] = level + (node.op == "contract")
@@ -185,7 +187,7 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
 def sources(node: Node, arrays: set[Node]) -> set[Node]:
     """Arrays that a reading of a node reads."""
     if node.op == "arrange" and node not in arrays:
-        return {source for each in node.args for source in sources(each, arrays)}
+        return {source for arg in node.args for source in sources(arg, arrays)}
     return {node} & arrays
 
 
@@ -198,8 +200,8 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
         read = [*node.args]
         for loop in inner(program, node):
             read += [*loop.results, *loop.conditions]
-        for each in read:
-            for source in sources(each, arrays):
+        for argument in read:
+            for source in sources(argument, arrays):
                 # Where a loop inside of the array's region reads it, the loop does.
                 depth = len(source.region)
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
@@ -220,31 +222,31 @@ def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node,
         if node in arrays:
             mask[:] = True
         for loop in inner(program, node):
-            for k, each in enumerate(loop.results):
+            for k, result in enumerate(loop.results):
                 if k < len(loop.carries) or k in projected.get(node, ()):
-                    needed[each][:] = True
-            for each in (*loop.conditions, *loop.carries):
-                needed[each][:] = True
+                    needed[result][:] = True
+            for result in (*loop.conditions, *loop.carries):
+                needed[result][:] = True
         if node.op == "project":
             projected.setdefault(node.args[0], set()).add(node.attribute)
         if node.op == "arrange":
-            starts = np.cumsum([0, *(each.size for each in node.args)])
+            starts = np.cumsum([0, *(arg.size for arg in node.args)])
             positions = np.asarray(node.value).ravel()[mask]
-            for each, start in zip(node.args, starts, strict=False):
-                needed[each][positions[(positions >= start) & (positions < start + each.size)] - start] = True
+            for arg, start in zip(node.args, starts, strict=False):
+                needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
         elif node in written_out and node.op == "take":
             needed[node.args[0]][:] = True
             needed[node.args[1]][...] |= mask
         elif node in written_out and node.op in OPERATIONS:
-            for each in node.args:
-                needed[each][...] |= mask if each.size == node.size else mask.any()
+            for arg in node.args:
+                needed[arg][...] |= mask if arg.size == node.size else mask.any()
         elif node in written_out and node.op == "contract":
             rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
-            for each, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
-                needed[each][...] |= np.broadcast_to(used, each.shape).ravel()
+            for arg, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
+                needed[arg][...] |= np.broadcast_to(used, arg.shape).ravel()
         elif node in written_out and node.op.startswith("reduce_"):
             needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
-            for each in node.args:
-                needed[each][:] = True
+            for arg in node.args:
+                needed[arg][:] = True
     return needed

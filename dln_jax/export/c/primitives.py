@@ -170,7 +170,7 @@ def _pad(program: Program, parameters, x: Node, padding: Node) -> Node:
         shape[axis] = inner
         spread = np.full(shape, x.size)
         np.moveaxis(spread, axis, 0)[:: interior + 1] = np.moveaxis(index, axis, 0)
-        wide = [(max(low, 0), max(high, 0)) if each == axis else (0, 0) for each in range(index.ndim)]
+        wide = [(max(low, 0), max(high, 0)) if other == axis else (0, 0) for other in range(index.ndim)]
         index = np.pad(spread, wide, constant_values=x.size)
         cut = slice(max(-low, 0), index.shape[axis] - max(-high, 0))
         index = index[(slice(None),) * axis + (cut,)]
@@ -215,7 +215,7 @@ def _reduce_precision(program: Program, parameters, x: Node) -> Node:
     own = np.finfo(program.real)
     if exponent >= own.nexp and mantissa >= own.nmant:
         return x
-    bits = [program.constant(min(*each), "real") for each in ((exponent, own.nexp), (mantissa, own.nmant))]
+    bits = [program.constant(min(*pair), "real") for pair in ((exponent, own.nexp), (mantissa, own.nmant))]
     return program.elementwise("rounded", x, *bits)
 
 

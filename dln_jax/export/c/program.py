@@ -87,7 +87,7 @@ class Program:
             raise InputError(
                 f"an array of shape {shape} is too large for generated C; expected at most {LARGEST} numbers"
             )
-        region = max((region, self.floor, *(each.region for each in args)), key=len)
+        region = max((region, self.floor, *(arg.region for arg in args)), key=len)
         # A value's type is part of it: 1.0 and 1 may have the same bytes in no case, but True and 1 do.
         key = (op, shape, dtype, args, attribute, None if value is None else (value.tobytes(), value.dtype.str))
         for known in self._interned.setdefault(key, []):
@@ -103,15 +103,15 @@ class Program:
         digest = hashlib.sha256()
         for node in self.nodes:
             value_type = None if node.value is None else node.value.dtype.str
-            args = [each.number for each in node.args]
+            args = [arg.number for arg in node.args]
             digest.update(
                 repr((node.op, node.shape, node.dtype, args, node.attribute, value_type, node.region)).encode()
             )
             digest.update(b"" if node.value is None else node.value.tobytes())
         for number, loop in self.loops.items():
-            inside = [[each.number for each in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
+            inside = [[node.number for node in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
             digest.update(repr((number, inside, loop.length, loop.reverse)).encode())
-        digest.update(repr([each.number for each in results]).encode())
+        digest.update(repr([result.number for result in results]).encode())
         return digest.digest()
 
     def constant(self, value: Any, dtype: str) -> Node:
@@ -132,10 +132,10 @@ class Program:
         inner, positions = without_unused(inner, positions)
         if not inner or positions.size == 0:
             return self.constant(np.zeros(positions.shape), sources[0].dtype)
-        if all(each.op == "const" for each in inner):
-            total = sum(each.size for each in inner)
+        if all(source.op == "const" for source in inner):
+            total = sum(source.size for source in inner)
             if positions.size <= max(total, 64):
-                joined = np.concatenate([each.value.ravel() for each in inner if each.value is not None])
+                joined = np.concatenate([source.value.ravel() for source in inner if source.value is not None])
                 return self.constant(joined[positions], inner[0].dtype)
         alone = len(inner) == 1 and inner[0].shape == positions.shape
         if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
@@ -153,13 +153,13 @@ class Program:
     def elementwise(self, op: str, *args: Node) -> Node:
         """An operation of `OPERATIONS`, on arguments of one kind that broadcast as NumPy's."""
         operation = OPERATIONS[op]
-        shape = np.broadcast_shapes(*(each.shape for each in args))
-        args = tuple(each if each.shape in ((), shape) else self.broadcast(each, shape) for each in args)
-        kinds = {each.dtype for each in (args[1:] if op == "select" else args)}
+        shape = np.broadcast_shapes(*(arg.shape for arg in args))
+        args = tuple(arg if arg.shape in ((), shape) else self.broadcast(arg, shape) for arg in args)
+        kinds = {arg.dtype for arg in (args[1:] if op == "select" else args)}
         assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
         dtype = operation.dtype or kinds.pop()
         # Real numbers that are only repeated stay so: a table of them would be read from memory.
-        known = all(each.op == "const" or (dtype != "real" and is_constant(each)) for each in args)
+        known = all(arg.op == "const" or (dtype != "real" and is_constant(arg)) for arg in args)
         if known and operation.fold is not None:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
@@ -169,7 +169,7 @@ class Program:
         if (pushed := self._below_broadcast(op, args, shape)) is not None:
             return pushed
         if op in COMMUTATIVE:
-            args = tuple(sorted(args, key=lambda each: each.number))
+            args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
 
     def contract(self, a: Node, b: Node) -> Node:
@@ -195,7 +195,7 @@ class Program:
         shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
         if is_constant(chosen):
             chosen_value = np.broadcast_to(values(chosen), shape)
-            both = [self.broadcast(each, shape) for each in (if_false, if_true)]
+            both = [self.broadcast(case, shape) for case in (if_false, if_true)]
             index = np.arange(chosen_value.size).reshape(shape)
             return self.arrange(both, np.where(chosen_value, index + chosen_value.size, index))
         return self.elementwise("select", chosen, if_true, if_false)
@@ -222,20 +222,20 @@ class Program:
 
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
         """The operation before the arguments are repeated, where all are repeated in the same way."""
-        repeated = [each for each in args if each.size > 1 and not is_uniform(each)]
-        others = [each for each in args if each.size == 1 or is_uniform(each)]
-        if not shape or any(each.op == "const" for each in repeated) or len(repeated) + len(others) < len(args):
+        repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
+        others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
+        if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):
             return None
         if not repeated:
             if prod(shape) <= 1:
                 return None
             return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
         positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
-        for each in repeated:
-            alike = each.op == "arrange" and len(each.args) == 1 and each.args[0].shape == source[0].shape
-            if not alike or each.args[0].size >= each.size or not np.array_equal(np.asarray(each.value), positions):
+        for arg in repeated:
+            alike = arg.op == "arrange" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
+            if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
                 return None
-        below = [each.args[0] if any(each is one for one in repeated) else self._one(each) for each in args]
+        below = [arg.args[0] if any(arg is one for one in repeated) else self._one(arg) for arg in args]
         return self.arrange([self.elementwise(op, *below)], positions)
 
     def _one(self, node: Node) -> Node:

@@ -44,7 +44,7 @@ def export_run(
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     chosen = functions_of_run(trained, precision=precision, names=functions, iterations=iterations)
     # CasADi has the first and second derivatives of what it is given.
-    itself = casadi if functions else casadi and [each for each in chosen if not each.endswith(DERIVATIVES)]
+    itself = casadi if functions else casadi and [function for function in chosen if not function.endswith(DERIVATIVES)]
     return export_c(
         chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
         leave_out_large=functions is None,

@@ -133,13 +133,13 @@ def _source_files(
 ) -> dict[str, bytes]:
     source, signatures, texts, left_out = Source(precision, libm), {}, [], []
     every = {
-        check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
+        check_name(key, "the name of a function"): _traced(key, *pair, precision) for key, pair in functions.items()
     }
-    repeated = repeated_calls([each.closed for each in every.values()])
-    for key, each in every.items():
+    repeated = repeated_calls([function.closed for function in every.values()])
+    for key, traced_function in every.items():
         before = source.copy()
         try:
-            signature, text, lines = _function(source, name, key, each, repeated, stack)
+            signature, text, lines = _function(source, name, key, traced_function, repeated, stack)
             if leave_out_large and lines > LINES:
                 raise TooLargeError(f"{key}, of {lines} lines")
         except TooLargeError as error:
@@ -163,7 +163,7 @@ def _source_files(
     }
     if casadi:
         chosen = {
-            key: each for key, each in functions.items() if key in signatures and (casadi is True or key in casadi)
+            key: pair for key, pair in functions.items() if key in signatures and (casadi is True or key in casadi)
         }
         files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large, stack)
     if (longest := max(map(len, files.values()))) > LENGTH:
@@ -178,7 +178,7 @@ def _for_casadi(
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
     source, text, left_out = external.external_functions(name, functions, libm=libm, stack=stack, leave_out=leave_out)
-    absent = "\n".join(f"Left out: {each}" for each in left_out)
+    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
     about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
     return {
         f"{name}_casadi.c": about + _preamble(source, name) + text,
@@ -204,14 +204,14 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
 
 
 def _function(
-    source: Source, name: str, key: str, each: _Traced, repeated: Collection[int], stack: int
+    source: Source, name: str, key: str, traced_function: _Traced, repeated: Collection[int], stack: int
 ) -> tuple[Signature, str, int]:
     """Signature, C text and lines of one function, those of functions that it calls included."""
-    signature = Signature(tuple(each.arguments), tuple(each.results))
-    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
+    signature = Signature(tuple(traced_function.arguments), tuple(traced_function.results))
+    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(traced_function.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, _, results = program_of(each.closed, repeated, precision=source.precision)
+        program, _, results = program_of(traced_function.closed, repeated, precision=source.precision)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -263,13 +263,13 @@ def _preamble(source: Source, name: str) -> str:
 
 
 def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]) -> str:
-    absent = "\n".join(f"Left out: {each}; ask for it by name." for each in left_out)
+    absent = "\n".join(f"Left out: {reason}; ask for it by name." for reason in left_out)
     about, guard = comment(f"{name}.h", written_by, _PROMISES, *[absent] * bool(absent)), f"{name.upper()}_H"
     declared = ""
-    for key, each in signatures.items():
-        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in each.results if leaf.shape)
-        facts = f"{each.operations} floating-point operations, {each.stack_bytes} bytes of stack"
-        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, each, real)};\n"
+    for key, signature in signatures.items():
+        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in signature.results if leaf.shape)
+        facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
+        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, signature, real)};\n"
     return (
         f'{about}#ifndef {guard}\n#define {guard}\n\n#include <stdint.h>\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
         f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"

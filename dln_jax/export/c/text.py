@@ -78,8 +78,8 @@ _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", bre
 def table(name: str, array: np.ndarray, precision: str) -> str:
     """A constant array."""
     kind = "real" if array.dtype.kind == "f" else kind_of(array.dtype)
-    texts = (number(each, precision) if kind == "real" else integer(int(each), kind) for each in array.ravel())
-    lines = "\n".join(_wrapper.wrap(" ".join(f"{each}," for each in texts)))
+    texts = (number(value, precision) if kind == "real" else integer(int(value), kind) for value in array.ravel())
+    lines = "\n".join(_wrapper.wrap(" ".join(f"{text}," for text in texts)))
     return f"static const {C_TYPES[kind]} {name}[{array.size}] = {{\n{lines}\n}};\n"
 
 

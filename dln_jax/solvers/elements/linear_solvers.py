@@ -157,10 +157,10 @@ def _one_or_many(
         return x[np.argsort(order)].transpose(2, 0, 1)
 
     def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
-        each = jax.vmap(one)
+        of_each = jax.vmap(one)
         if len(values) < _FEWEST_BANDS:
-            return each(values, b)
-        return lax.platform_dependent(values, b, cpu=by_bands, default=each)
+            return of_each(values, b)
+        return lax.platform_dependent(values, b, cpu=by_bands, default=of_each)
 
     return shared_or_batched(one, many)
 
@@ -236,8 +236,8 @@ def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         # The lower triangle stands for both.
         wanted = np.maximum(row, column) * size + np.minimum(row, column)
         nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
-        found = np.where(key[order][nearest] == wanted, order[nearest], len(key))
-        return np.where((row == column) & fixed[row], _one(at), found)
+        place = np.where(key[order][nearest] == wanted, order[nearest], len(key))
+        return np.where((row == column) & fixed[row], _one(at), place)
 
     return places
 
@@ -254,8 +254,8 @@ def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
     """Reverse Cuthill-McKee, or the given order where its band is narrower (meshes built row by row)."""
     rows, columns = at.rows // at.width, at.columns // at.width
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
-    found = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
-    return min(found, np.arange(at.blocks), key=lambda order: _band(at, order))
+    ordering = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+    return min(ordering, np.arange(at.blocks), key=lambda order: _band(at, order))
 
 
 def _band(at: Pattern, order: np.ndarray) -> int:

@@ -134,8 +134,8 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
     def response(x: Blocks, leaves: list[Array], given_dots: list[Array], fixed_dot: Any) -> Blocks:
         data = structure.unflatten(leaves)
 
-        def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
-            replaced = dict(zip(varying, given, strict=True))
+        def gradient_of(x: Blocks, variables: list[Array]) -> Blocks:
+            replaced = dict(zip(varying, variables, strict=True))
             all_leaves = [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
             return gradient(energies, at, x, structure.unflatten(all_leaves))
 
@@ -144,11 +144,11 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
             curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
             return jnp.where(at.free, curved, v)
 
-        given = [leaves[i] for i in varying]
+        varied = [leaves[i] for i in varying]
         if moving:
-            _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
+            _, right = jax.jvp(gradient_of, (x, varied), (fixed_dot, given_dots))
         else:
-            _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
+            _, right = jax.jvp(lambda variables: gradient_of(x, variables), (varied,), (given_dots,))
         # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
         factor = _factor(total, *jax.lax.stop_gradient((x, data)))
         return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
