@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from dln_jax.solvers import lapack
 
 # Beyond this size the library call is faster, and the written-out program slow to compile.
-_WRITTEN_OUT_ROWS = 16
+_UNROLLED_ROWS = 16
 
 
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
@@ -24,7 +24,7 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[A
     """
     if b.shape[0] == 1:
         return b / matrix[0]
-    if b.shape[0] > _WRITTEN_OUT_ROWS:
+    if b.shape[0] > _UNROLLED_ROWS:
         return lapack.solve(matrix, b)
     return jax.lax.custom_linear_solve(
         functools.partial(jnp.matmul, matrix),
@@ -57,7 +57,7 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
 
 def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
     """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
-    if b.shape[0] > _WRITTEN_OUT_ROWS:
+    if b.shape[0] > _UNROLLED_ROWS:
         lower = jnp.tril(factor)
         fixed = jax.lax.stop_gradient(lower)
         return jax.lax.custom_linear_solve(

@@ -40,8 +40,8 @@ Arrays = tuple[Any, ...]
 """Samples on axis 0; `None` is handed on as it is."""
 FIRST_DAMPING = 1e-3
 """Relative to the largest diagonal entry of the first A."""
-LEAST_DAMPING = 1e-16
-MOST_ACCELERATION = 0.75
+LOWER_DAMPING = 1e-16
+UPPER_ACCELERATION = 0.75
 """The largest |a| / |v| that is used; 0 leaves acceleration out."""
 PROBE = 0.5
 """h."""
@@ -68,7 +68,7 @@ class Status(enum.IntEnum):
     """The loss is not finite where an iteration starts, or in its last trial; the parameters are as they were."""
 
 
-class State(NamedTuple):
+class LevenbergMarquardtState(NamedTuple):
     """All that the next iteration depends on: arrays only, with a leading axis of seeds where there are several."""
 
     parameters: Any
@@ -91,7 +91,7 @@ class State(NamedTuple):
     """Factorisations so far that Cholesky could not do."""
 
 
-def init(parameters: Any) -> State:
+def init(parameters: Any) -> LevenbergMarquardtState:
     """The state before the first iteration; its arrays are copies, so that a caller may donate them.
 
     Raises:
@@ -99,7 +99,7 @@ def init(parameters: Any) -> State:
     """
     equations.check_precision(parameters, "parameters")
     none = jnp.zeros((), int)
-    return State(
+    return LevenbergMarquardtState(
         parameters=jax.tree.map(jnp.array, parameters),
         iteration=none,
         status=jnp.full((), int(Status.RUNNING), int),
@@ -113,8 +113,13 @@ def init(parameters: Any) -> State:
 
 
 def run(
-    sample_residual: SampleResidual, state: State, arrays: Arrays, iterations: Any, *, improvement: float = 0.0
-) -> State:
+    sample_residual: SampleResidual,
+    state: LevenbergMarquardtState,
+    arrays: Arrays,
+    iterations: Any,
+    *,
+    improvement: float = 0.0,
+) -> LevenbergMarquardtState:
     """So many iterations, fewer where the status says so, or an iteration lowers F by no more than `improvement` F.
 
     States with a leading axis of seeds are taken one after the other instead of all in lockstep: no seed repeats
@@ -138,18 +143,18 @@ def in_chunks(arrays: Arrays, mesh: Mesh | None = None) -> Chunks:
 
 def run_on_chunks(
     sample_residual: SampleResidual,
-    state: State,
+    state: LevenbergMarquardtState,
     chunks: Chunks,
     iterations: Any,
     *,
     samples: int,
     improvement: float = 0.0,
     mesh: Mesh | None = None,
-) -> State:
+) -> LevenbergMarquardtState:
     """What `run` does for so many samples, by the devices of a mesh together, each with its chunks of them."""
 
     @jax.custom_batching.sequential_vmap
-    def run_one(state: State, chunks: Chunks, iterations: Array) -> State:
+    def run_one(state: LevenbergMarquardtState, chunks: Chunks, iterations: Array) -> LevenbergMarquardtState:
         end = state.iteration + iterations
         return lax.while_loop(
             lambda state: (state.status == Status.RUNNING) & (state.iteration < end),
@@ -157,7 +162,7 @@ def run_on_chunks(
             state,
         )
 
-    def on_one(shared: tuple[State, Array], chunks: Chunks) -> State:
+    def on_one(shared: tuple[LevenbergMarquardtState, Array], chunks: Chunks) -> LevenbergMarquardtState:
         state, iterations = shared
         over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
         # Devices of other makes round the solution of the equations otherwise: all go on from the first one's.
@@ -168,13 +173,13 @@ def run_on_chunks(
 
 def _iterate(
     sample_residual: SampleResidual,
-    state: State,
+    state: LevenbergMarquardtState,
     chunks: Chunks,
     samples: int,
     *,
     improvement: float,
     mesh: Mesh | None,
-) -> State:
+) -> LevenbergMarquardtState:
     """One iteration of one seed, whatever its status. Loops and branches depend on sums over all devices alone."""
     at = _linearise(sample_residual, state.parameters, chunks, samples, mesh)
     largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(at.matrix)), state.scale)
@@ -194,7 +199,7 @@ def _iterate(
         [int(Status.NON_FINITE), int(Status.FLAT), stalled, int(Status.IMPROVEMENT)],
         int(Status.RUNNING),
     )
-    return State(
+    return LevenbergMarquardtState(
         parameters=at.unravel(jnp.where(last.accepted, at.x + last.step, at.x)),
         iteration=state.iteration + (finite & ~flat),
         status=status.astype(state.status.dtype),  # no longer weakly typed: that would be another program
@@ -265,7 +270,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
         # Finite or NaN; the selection keeps the rounding of the division, which a fused multiply-add would skip.
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
         bend = -equations.solve(factor, slope - (1 - PROBE) * at.gradient + PROBE * damped * velocity) / PROBE**2
-        bounded = bend @ bend <= MOST_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
+        bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
         return jnp.where(bounded, velocity + bend, velocity)
 
     def evaluate(phase: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -285,7 +290,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
         step=step,
         loss=loss,
         accepted=accepted,
-        damping=jnp.maximum(trial.damping * factor_on_damping, LEAST_DAMPING),
+        damping=jnp.maximum(trial.damping * factor_on_damping, LOWER_DAMPING),
         growth=jnp.where(accepted, 2.0, 2 * trial.growth),
         tried=trial.tried + 1,
         fallbacks=trial.fallbacks + fell_back,

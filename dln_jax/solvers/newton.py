@@ -39,7 +39,7 @@ class Info(NamedTuple):
     """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
 
 
-class _State(NamedTuple):
+class _RootIterate(NamedTuple):
     x: Root
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -92,7 +92,7 @@ def _newton(
         value = function(x)
         return value, value
 
-    def iterate(state: _State) -> _State:
+    def iterate(state: _RootIterate) -> _RootIterate:
         # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
         jacobian, value = jax.jacfwd(twice, has_aux=True)(state.x)
         step = solve(jacobian, value)
@@ -100,7 +100,7 @@ def _newton(
         floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(state.x))
         converged = residual <= jnp.maximum(tolerance, floor)
         count = state.iterations + 1
-        return _State(
+        return _RootIterate(
             x=jnp.where(jnp.isfinite(step).all(), state.x - step, state.x),
             residual=residual,
             iterations=count,
@@ -109,7 +109,7 @@ def _newton(
         )
 
     unknown = jnp.asarray(jnp.inf, start.dtype)
-    first = _State(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
+    first = _RootIterate(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
     last = jax.lax.while_loop(lambda state: state.running, iterate, first)
     # `custom_root` takes real numbers only beside the root.
     real = start.dtype

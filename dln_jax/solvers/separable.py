@@ -22,7 +22,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.types import InputError, require_positive
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_TRIALS = 1e-3, 1e-12, 30
+FIRST_DAMPING, LOWER_DAMPING, TRIALS = 1e-3, 1e-12, 30
 """Of the scaled columns of J; and steps tried before an iteration gives up."""
 
 
@@ -140,14 +140,14 @@ def _descend(
     """The first step that lowers the sum of squares, and the next damping; the same point where none does."""
     left, sizes, right, scale = _svd(J)
     slope = left.T @ at.residual
-    for _ in range(MOST_TRIALS if len(sizes) else 0):
+    for _ in range(TRIALS if len(sizes) else 0):
         step = -(right.T @ (sizes / (sizes**2 + damping) * slope)) / scale
         if np.abs(step).max() > longest_step:
             damping *= 5
             continue
         trial = project(n + step)
         if trial.residual @ trial.residual < at.residual @ at.residual:  # False for NaN
-            return n + step, trial, max(damping / 9, LEAST_DAMPING)
+            return n + step, trial, max(damping / 9, LOWER_DAMPING)
         damping *= 5
     return n, at, damping
 
@@ -171,8 +171,8 @@ def _svd(
     scale = np.where(seen, norms, 1.0)
     orthogonal, triangle = np.linalg.qr(np.where(seen, A, 0.0) / scale)
     left, sizes, right = np.linalg.svd(triangle, full_matrices=False)
-    least = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance
-    counts = sizes > least * sizes.max(initial=0.0)
+    lower = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance
+    counts = sizes > lower * sizes.max(initial=0.0)
     return orthogonal @ left[:, counts], sizes[counts], right[counts], scale
 
 

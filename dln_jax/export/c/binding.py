@@ -46,7 +46,7 @@ typedef struct {
     int flags;
     const char *text;
 } PyMethodDef;
-enum { CONTIGUOUS_WITH_FORMAT = 0x3C, WRITABLE = 1, FAST_WITH_KEYWORDS = 0x82, MOST = $most };
+enum { CONTIGUOUS_WITH_FORMAT = 0x3C, WRITABLE = 1, FAST_WITH_KEYWORDS = 0x82, MAXIMUM = $maximum };
 
 extern PyObject PyFloat_Type;
 int PyObject_GetBuffer(PyObject *, Py_buffer *, int);
@@ -76,7 +76,7 @@ typedef struct {
 typedef struct {
     int arguments, results;
     PyObject *(*run)(void **); /* the number that is returned, or NULL where results are arrays */
-    leaf leaves[MOST];
+    leaf leaves[MAXIMUM];
 } function;
 
 /* Whether an object is an array of this type and shape; its buffer is to be released then */
@@ -98,11 +98,11 @@ static int fits(PyObject *given, Py_buffer *buffer, const leaf *expected, int fl
 /* Results of arguments; NULL without an error where an argument does not fit */
 static PyObject *results_of(const function *f, PyObject *self, PyObject *const *given)
 {
-    Py_buffer buffers[MOST];
-    void *memory[MOST];
-    real numbers[MOST];
+    Py_buffer buffers[MAXIMUM];
+    void *memory[MAXIMUM];
+    real numbers[MAXIMUM];
     PyObject *results = PyTuple_New(f->results), *result = NULL;
-    int held[MOST], k = 0;
+    int held[MAXIMUM], k = 0;
     for (; results && k < f->arguments + f->results; ++k) {
         const leaf *expected = &f->leaves[k];
         const int place = k - f->arguments;
@@ -138,7 +138,7 @@ static PyObject *called(const function *f, PyObject *self, PyObject *const *give
     }
     if (all) converted = PyObject_CallFunctionObjArgs(PyTuple_GetItem(self, 0), all, names, NULL);
     if (converted) {
-        PyObject *fitting[MOST];
+        PyObject *fitting[MAXIMUM];
         for (int k = 0; k < f->arguments; ++k) fitting[k] = PyTuple_GetItem(converted, k);
         result = results_of(f, self, fitting);
         Py_DecRef(converted);
@@ -157,7 +157,7 @@ def binding(name: str, functions: Mapping[str, Signature], precision: str) -> st
         real=PRECISIONS[precision][1],
         format=_format("real", precision),
         axes=max([1, *(len(leaf.shape) for leaf in leaves)]),
-        most=max(1, *(len(function.arguments) + len(function.results) for function in functions.values())),
+        maximum=max(1, *(len(function.arguments) + len(function.results) for function in functions.values())),
     )
     for number, (key, signature) in enumerate(functions.items()):
         text += _function(number, f"{name}_{key}", signature, precision)

@@ -25,7 +25,7 @@ import numpy as np
 
 from dln_jax.export.c import sensitivities
 from dln_jax.export.c.body import Body, Source
-from dln_jax.export.c.emit import region, written
+from dln_jax.export.c.emit import region, result_writers
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
@@ -270,7 +270,7 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
             body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
     body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
     region(body, ())
-    writers = written(body, results, apart=False)
+    writers = result_writers(body, results, apart=False)
     for j, write in zip((j for j, output in enumerate(outputs) if output.dense), writers, strict=True):
         body.opened(f"if (res[{j}])")
         write(f"res[{j}]")

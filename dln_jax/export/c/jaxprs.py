@@ -1,4 +1,4 @@
-"""What jaxprs say about themselves: how they are made, what they call, and where each equation comes from."""
+"""Jaxprs: how to make them, which calls they repeat, and which line of Python an equation comes from."""
 
 import hashlib
 from collections import Counter
@@ -12,14 +12,14 @@ from jax.extend import core
 from dln_jax.types import InputError
 
 _LARGE_CALL = 600
-"""Equations from which on a jitted function that is called several times is a C function of its own."""
+"""Smallest number of equations at which a jitted function that is called several times becomes a C function."""
 
 
 def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
-    """The closed jaxpr of a function, and the tree of its results.
+    """Returns the closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: side effects, or whole numbers beyond 64 bits.
+        InputError: the function has side effects, or integers beyond 64 bits.
     """
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
@@ -31,15 +31,15 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Jaxprs, by `id`, of jitted functions that are large and that these closed ones seem to call several times.
+    """Returns the `id`s of the large jaxprs that these closed jaxprs seem to call several times.
 
-    Calls that look alike here become one function only if their programs are identical, see `Program.identity`.
+    Calls that look alike here become one function only if their programs are identical (`Program.identity`).
     """
     known: dict[int, tuple[int, bytes]] = {}
     counts: Counter[bytes] = Counter()
 
     def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
-        """Number of equations, those of calls included, and a digest of primitives, types and constants."""
+        """Returns the number of equations, calls included, and a digest of primitives, types and constants."""
         size, digest = 0, hashlib.sha256()
         for const in consts:
             digest.update(np.asarray(const).tobytes())
@@ -82,7 +82,7 @@ def _jaxprs(value: Any) -> list[Any]:
 
 
 def expanded(primitive: Any) -> Any:
-    """What JAX 0.11 keeps of a function with derivatives of its own, such as `custom_root`, in other primitives."""
+    """Returns the jaxpr of a high-level primitive of JAX 0.11, such as `custom_root`, in ordinary primitives."""
 
     def expand(*leaves: Any) -> list[Any]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
@@ -92,10 +92,11 @@ def expanded(primitive: Any) -> Any:
 
 
 def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
-    """What a primitive of another library, such as Equinox, is in JAX's own: its `impl`; None for one of JAX's own.
+    """Returns the jaxpr of the `impl` of a primitive of another library, such as Equinox; None for JAX's primitives.
 
     Args:
-        known: the numbers of each argument that is constant, None for others; only those are arguments of the jaxpr.
+        equation: that applies the primitive.
+        known: values of the constant arguments, None for the others, which become the arguments of the jaxpr.
     """
     primitive = equation.primitive
     if _of_jax(primitive):
@@ -111,12 +112,12 @@ def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
 
 
 def _of_jax(primitive: Any) -> bool:
-    """Whether a primitive is one of JAX's own."""
+    """Returns whether JAX itself defines a primitive."""
     return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
 
 
 def is_error_of_equinox(equation: Any) -> bool:
-    """Whether an equation is the callback that raises the error of `equinox.error_if`."""
+    """Returns whether an equation is the callback that raises the error of `equinox.error_if`."""
     if equation.primitive.name != "pure_callback":
         return False
     callback = equation.params["callback"]
@@ -124,12 +125,12 @@ def is_error_of_equinox(equation: Any) -> bool:
 
 
 def closed_jaxpr(jaxpr: Any) -> Any:
-    """With its constants, which an open one has not."""
+    """Returns a jaxpr as a closed one; an open jaxpr has no constants."""
     return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
 
 
 def made_at(equation: Any) -> str:
-    """File and line of the user's code that made an equation, nothing where the call around it knows."""
+    """Returns " (made at FILE:LINE)" for the user's code that made an equation, or "" if JAX kept no traceback."""
     traceback = equation.source_info.traceback
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
@@ -137,9 +138,9 @@ def made_at(equation: Any) -> str:
 
 
 def scanned(equation: Any) -> dict[str, int]:
-    """How many arguments of a scan are the same in each turn, and carried: releases of JAX state it differently.
+    """Returns how many arguments of a scan are constant ("fixed") and how many are carried.
 
-    What is stacked has another shape outside than inside.
+    Releases of JAX store these numbers differently, so they are counted: stacked arguments differ in shape inside.
     """
     inner = closed_jaxpr(equation.params["jaxpr"]).jaxpr
 

@@ -13,11 +13,11 @@ from dln_jax.types import InputError
 def _matrices(program: Program, node: Node) -> list[Node]:
     """Each [rows, columns] of a batch."""
     index = np.arange(node.size).reshape(-1, *node.shape[-2:])
-    return [program.arrange([node], positions) for positions in index]
+    return [program.gather([node], positions) for positions in index]
 
 
 def _stacked(program: Program, nodes: list[Node], shape: Any) -> Node:
-    return program.arrange(nodes, np.arange(sum(node.size for node in nodes)).reshape(shape))
+    return program.gather(nodes, np.arange(sum(node.size for node in nodes)).reshape(shape))
 
 
 def _cholesky(program: Program, _, a: Node) -> Node:
@@ -58,14 +58,14 @@ def _lu(program: Program, _, a: Node) -> list[Node]:
 def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> Node:
     size = parameters["permutation_size"]
     index = np.arange(pivots.size).reshape(-1, pivots.shape[-1])
-    orders = [program.make("permutation", (size,), "int", [program.arrange([pivots], row)]) for row in index]
+    orders = [program.make("permutation", (size,), "int", [program.gather([pivots], row)]) for row in index]
     return _stacked(program, orders, (*pivots.shape[:-1], size))
 
 
 def _parts(program: Program, nodes: list[Node], first: int, shape: tuple[int, ...], batch: list[int]) -> Node:
     """An array of that shape from each flat node, read from element `first` on."""
     index = first + np.arange(prod(shape))
-    return _stacked(program, [program.arrange([node], index) for node in nodes], (*batch, *shape))
+    return _stacked(program, [program.gather([node], index) for node in nodes], (*batch, *shape))
 
 
 def _geqrf(program: Program, _, a: Node) -> list[Node]:
@@ -76,7 +76,7 @@ def _geqrf(program: Program, _, a: Node) -> list[Node]:
 
 def _householder_product(program: Program, _, a: Node, tau: Node) -> Node:
     rows = program.reshape(tau, (-1, tau.shape[-1]))
-    factors = [program.arrange([rows], row) for row in np.arange(rows.size).reshape(rows.shape)]
+    factors = [program.gather([rows], row) for row in np.arange(rows.size).reshape(rows.shape)]
     pairs = zip(_matrices(program, a), factors, strict=True)
     return _stacked(program, [program.make("householder_product", x.shape, "real", [x, t]) for x, t in pairs], a.shape)
 
@@ -92,9 +92,9 @@ def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
     zero, rows, columns = program.constant(0.0, "real"), m if full else min(m, n), m if full or m < n else n
     index = np.arange(a.size).reshape(a.shape)
     wide = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, max(columns - n, 0))], constant_values=a.size)
-    q = _householder_product(program, {}, program.arrange([packed, zero], wide[..., :columns]), tau)
+    q = _householder_product(program, {}, program.gather([packed, zero], wide[..., :columns]), tau)
     upper = np.where(np.arange(rows)[:, None] <= np.arange(n), index[..., :rows, :], a.size)
-    return [q, program.arrange([packed, zero], upper)]
+    return [q, program.gather([packed, zero], upper)]
 
 
 def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
@@ -103,7 +103,7 @@ def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
     if parameters["subset_by_index"] not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
     row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if parameters["lower"] else 1]
-    matrices = [program.arrange([matrix], row * n + column) for matrix in _matrices(program, a)]
+    matrices = [program.gather([matrix], row * n + column) for matrix in _matrices(program, a)]
     nodes = [program.make("eigh", (n * n + n,), "real", [matrix]) for matrix in matrices]
     return [_parts(program, nodes, 0, (n, n), batch), _parts(program, nodes, n * n, (n,), batch)]
 

@@ -1,4 +1,4 @@
-"""A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
+"""Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -23,7 +23,7 @@ _CALLS = {
 _REFUSED = {
     "random": "random numbers; draw them outside and pass them as arguments",
     "threefry": "random numbers; draw them outside and pass them as arguments",
-    "callback": "a callback into Python, which a robot has not",
+    "callback": "a callback into Python, which C cannot call",
     "debug_print": "printing, a side effect",
 }
 _RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
@@ -33,16 +33,16 @@ _TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
 def program_of(
     closed: Any, repeated: Collection[int] = (), *, precision: str = "f64"
 ) -> tuple[Program, list[Node], list[Node]]:
-    """The program of a closed jaxpr, its inputs and its results.
+    """Returns the program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: as `jaxprs.traced`.
-        repeated: calls of these jaxprs, by `id`, are calls in the program too.
-        precision: of real numbers.
+        closed: the jaxpr, as `jaxprs.traced` returns it.
+        repeated: `id`s of jaxprs whose calls stay calls in the program.
+        precision: f32 or f64.
 
     Raises:
-        InputError: what has no C: an unsupported primitive, with the line that made it, random numbers, another type of
-            number, a shape that is not known.
+        InputError: the jaxpr has no C: an unsupported primitive (the message names the line that made it), random
+            numbers, an unsupported dtype, or a shape that is unknown at compile time.
     """
     program = Program(real=PRECISIONS[precision][0], repeated=repeated)
     inputs = [
@@ -53,7 +53,7 @@ def program_of(
 
 
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
-    """Results of a closed jaxpr."""
+    """Returns the results of a closed jaxpr."""
     jaxpr = closed.jaxpr
     known: dict[Any, Node] = {}
 
@@ -118,14 +118,14 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
 
 
 def _failed(program: Program, aval: Any) -> Node:
-    """What stands for an error that C cannot raise: NaN, the largest whole number, or true, as by EQX_ON_ERROR=nan."""
+    """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
     kind = kind_of(aval.dtype)
     value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
     return program.broadcast(program.constant(value, kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
-    """A call of a function of its own, which has the constants among its arguments inside."""
+    """Returns the results of a call; constant arguments become part of the called function."""
     fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
     call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
     if call not in program.lowered:
@@ -154,7 +154,7 @@ def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: lis
 
 
 def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], int]:
-    """Where a loop over these nodes is, and its number."""
+    """Returns the region of a loop over these nodes, and its number."""
     number = len(program.loops)
     program.loops[number] = Loop([], [], [])
     return max((program.floor, *(node.region for node in nodes)), key=len), number
@@ -231,7 +231,7 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
 
 
 def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
-    """Which branch is that of a processor: the one for all others, where none is its own."""
+    """Returns the index of the branch for the CPU: its own, or the default."""
     places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
     return [program.constant(np.int32(places[0]), "int")]
 

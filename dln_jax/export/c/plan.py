@@ -13,7 +13,7 @@ from dln_jax.export.c.nodes import Loop, Node, Region, is_constant
 from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
 from dln_jax.export.c.program import Program
 
-WRITTEN_OUT = 64
+UNROLL_LIMIT = 64
 """Elements of a result, or products of a sum, up to which they may be written out one by one."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
@@ -27,7 +27,7 @@ class Plan(NamedTuple):
 
     order: dict[Region, list[Node]]
     """Nodes of each region as they are computed."""
-    written_out: set[Node]
+    unrolled: set[Node]
     """Computed element by element."""
     arrays: set[Node]
     """Kept in an array; scalars otherwise."""
@@ -47,30 +47,30 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     """The plan for a program with these results."""
     results = list(results)
     nodes, readers, whole, contiguous = _reached(program, results)
-    written_out = {node for node in nodes if _is_written_out(node)}
+    unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
     # What loops read is an array; of an arrange whose elements a loop cannot follow, a copy is.
     for node in reversed(nodes):
         looped = any(
-            reader in followed if reader.op == "arrange" else reader not in written_out for reader in readers[node]
+            reader in followed if reader.op == "gather" else reader not in unrolled for reader in readers[node]
         )
-        if node.op == "arrange" and node not in contiguous and not (looped and not is_direct(node)):
+        if node.op == "gather" and node not in contiguous and not (looped and not is_direct(node)):
             followed |= {node} if looped or node in whole else set()
-        elif node.op == "arrange":
+        elif node.op == "gather":
             arrays.add(node)
-            (written_out if node.size <= WRITTEN_OUT else followed).add(node)
-        elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
+            (unrolled if node.size <= UNROLL_LIMIT else followed).add(node)
+        elif (node.size > 1 and (looped or node in whole)) or not (node in unrolled or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
-    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), written_out)
+    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
+    levels, needed = _levels(program, nodes), _needed(program, nodes, unrolled, arrays, results)
     order: dict[Region, list[Node]] = {}
     for node in sorted(
-        nodes, key=lambda candidate: (levels[candidate], not _is_product(candidate, written_out), candidate.number)
+        nodes, key=lambda candidate: (levels[candidate], not _is_product(candidate, unrolled), candidate.number)
     ):
         ends = root.get(node, node)
-        if needed[ends].any() and (node in written_out or ends is node):
+        if needed[ends].any() and (node in unrolled or ends is node):
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root)
     steps: dict[Node, set[Node | None]] = {}
@@ -79,7 +79,7 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     for step, read in every:
         for source in read:
             steps.setdefault(source, set()).add(step)
-    return Plan(order, written_out, arrays, root, needed, levels, reads, steps)
+    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps)
 
 
 def inner(program: Program, node: Node) -> list[Loop]:
@@ -121,48 +121,48 @@ def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[No
                 waiting += [*loop.carries, *loop.conditions, *loop.results]
     nodes = sorted(reached, key=lambda node: node.number)
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
-    whole, contiguous = {node for node in results if node.size > WRITTEN_OUT}, set()
+    whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
     for node in nodes:
         for arg in node.args:
             readers[arg].append(node)
-        if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_written_out(node)):
+        if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_unrolled(node)):
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
         for loop in inner(program, node):
             whole |= {*loop.results, *loop.conditions, *node.args}
     return nodes, readers, whole, contiguous
 
 
-def _is_written_out(node: Node) -> bool:
-    if node.op == "contract":
+def _is_unrolled(node: Node) -> bool:
+    if node.op == "dot_general":
         count, columns = node.args[1].shape[1:]
         beside = is_constant(node.args[1]) and columns >= _VECTOR_OF_FUNCTIONS
-        return node.size * count <= WRITTEN_OUT and not beside
+        return node.size * count <= UNROLL_LIMIT and not beside
     if node.op.startswith(("reduce_", "arg")):
-        return node.args[0].size <= WRITTEN_OUT and node.op.startswith("reduce_")
+        return node.args[0].size <= UNROLL_LIMIT and node.op.startswith("reduce_")
     if node.op == "take":
         return node.size < _VECTOR
     if node.op not in OPERATIONS:
         return False
     if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
         return True
-    scattered = any(arg.op == "arrange" and not is_direct(arg) for arg in node.args)
-    return node.size <= WRITTEN_OUT and scattered and node.op not in TRANSCENDENTAL
+    scattered = any(arg.op == "gather" and not is_direct(arg) for arg in node.args)
+    return node.size <= UNROLL_LIMIT and scattered and node.op not in TRANSCENDENTAL
 
 
 def _is_scalar(node: Node) -> bool:
     """Whether what computes it can leave it without memory."""
-    return node.size == 1 and node.op not in ("contract", *_FACTORED) and node.op[:4] != "put_"
+    return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
-def _is_product(node: Node, written_out: set[Node]) -> bool:
-    return node.op == "contract" and node not in written_out
+def _is_product(node: Node, unrolled: set[Node]) -> bool:
+    return node.op == "dot_general" and node not in unrolled
 
 
-def _fused(nodes, readers, whole, written_out) -> dict[Node, Node]:
+def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
     """The loop that each elementwise node is in."""
     root: dict[Node, Node] = {}
     for node in reversed(nodes):
-        if node.op not in OPERATIONS or node in written_out:
+        if node.op not in OPERATIONS or node in unrolled:
             continue
         into = {root.get(reader) for reader in readers[node]}
         alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
@@ -178,7 +178,7 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
         level = max((levels[arg] for arg in node.args), default=0)
         for number in (node.attribute if node.op == "branch" else (node.attribute,)) if inner(program, node) else ():
             level = max(level, highest.get(number, 0))
-        levels[node] = level + (node.op == "contract")
+        levels[node] = level + (node.op == "dot_general")
         for number in node.region:
             highest[number] = max(highest.get(number, 0), levels[node])
     return levels
@@ -186,7 +186,7 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
 
 def sources(node: Node, arrays: set[Node]) -> set[Node]:
     """Arrays that a reading of a node reads."""
-    if node.op == "arrange" and node not in arrays:
+    if node.op == "gather" and node not in arrays:
         return {source for arg in node.args for source in sources(arg, arrays)}
     return {node} & arrays
 
@@ -195,7 +195,7 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
     reads: dict[Node, set[Node]] = {}
     loops = {number: node for node in nodes if inner(program, node) for number in np.ravel(node.attribute)}
     for node in nodes:
-        if node.op == "arrange" and node not in arrays:
+        if node.op == "gather" and node not in arrays:
             continue
         read = [*node.args]
         for loop in inner(program, node):
@@ -209,7 +209,7 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
     return reads
 
 
-def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
+def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
     """Elements that something reads, of each node."""
     needed = {node: np.zeros(node.size, bool) for node in nodes}
     projected: dict[Node, set[int]] = {}
@@ -229,22 +229,22 @@ def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node,
                 needed[result][:] = True
         if node.op == "project":
             projected.setdefault(node.args[0], set()).add(node.attribute)
-        if node.op == "arrange":
+        if node.op == "gather":
             starts = np.cumsum([0, *(arg.size for arg in node.args)])
             positions = np.asarray(node.value).ravel()[mask]
             for arg, start in zip(node.args, starts, strict=False):
                 needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
-        elif node in written_out and node.op == "take":
+        elif node in unrolled and node.op == "take":
             needed[node.args[0]][:] = True
             needed[node.args[1]][...] |= mask
-        elif node in written_out and node.op in OPERATIONS:
+        elif node in unrolled and node.op in OPERATIONS:
             for arg in node.args:
                 needed[arg][...] |= mask if arg.size == node.size else mask.any()
-        elif node in written_out and node.op == "contract":
+        elif node in unrolled and node.op == "dot_general":
             rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
             for arg, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
                 needed[arg][...] |= np.broadcast_to(used, arg.shape).ravel()
-        elif node in written_out and node.op.startswith("reduce_"):
+        elif node in unrolled and node.op.startswith("reduce_"):
             needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
             for arg in node.args:

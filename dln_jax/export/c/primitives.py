@@ -37,7 +37,7 @@ def _moved(move: Callable[..., np.ndarray]) -> Rule:
     """A rule of what only moves elements: `move` does so to an array of their indices."""
 
     def rule(program: Program, parameters: dict[str, Any], node: Node, *_: Node) -> Node:
-        return program.arrange([node], move(np.arange(node.size).reshape(node.shape), parameters))
+        return program.gather([node], move(np.arange(node.size).reshape(node.shape), parameters))
 
     return rule
 
@@ -174,29 +174,29 @@ def _pad(program: Program, parameters, x: Node, padding: Node) -> Node:
         index = np.pad(spread, wide, constant_values=x.size)
         cut = slice(max(-low, 0), index.shape[axis] - max(-high, 0))
         index = index[(slice(None),) * axis + (cut,)]
-    return program.arrange([x, padding], index)
+    return program.gather([x, padding], index)
 
 
 def _concatenate(program: Program, parameters, *nodes: Node) -> Node:
     starts = np.cumsum([0, *(node.size for node in nodes)])
     pieces = [np.arange(node.size).reshape(node.shape) + start for node, start in zip(nodes, starts, strict=False)]
-    return program.arrange(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
+    return program.gather(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
 
 
 def _stack(program: Program, parameters, *nodes: Node) -> Node:
     pieces = np.arange(sum(node.size for node in nodes)).reshape(len(nodes), *nodes[0].shape)
-    return program.arrange(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
+    return program.gather(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
 
 
 def _unstack(program: Program, parameters, node: Node) -> list[Node]:
     index = np.moveaxis(np.arange(node.size).reshape(node.shape), parameters["axis"], 0)
-    return [program.arrange([node], piece) for piece in index]
+    return [program.gather([node], piece) for piece in index]
 
 
 def _split(program: Program, parameters, node: Node) -> list[Node]:
     index = np.arange(node.size).reshape(node.shape)
     pieces = np.split(index, np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"])
-    return [program.arrange([node], piece) for piece in pieces]
+    return [program.gather([node], piece) for piece in pieces]
 
 
 def _iota(program: Program, parameters, dtype: str) -> Node:

@@ -1,15 +1,15 @@
 """A program of small arrays: a graph of interned nodes, simplified as it is built.
 
 There are few kinds of nodes, because whatever only moves numbers (slices, transposes, concatenations, padding, gathers
-and selections that are known beforehand) is one of them, an `arrange`: for each of its elements, which element of which
+and selections that are known beforehand) is one of them, a `gather`: for each of its elements, which element of which
 source it is. Arranges of arranges are one arrange.
 
 | op | value |
 |---|---|
 | `input`, `const` | an argument's leaf; numbers |
-| `arrange` | elements of the sources, laid end to end, at the positions `value` |
+| `gather` | elements of the sources, laid end to end, at the positions `value` |
 | a name of `operations.OPERATIONS` | elementwise, of arguments of one shape or scalars |
-| `contract` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
+| `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
 | `reduce_*`, `arg*` | over the last axis of an argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
 | `order` | flat indices that sort rows by keys [o, n], each row by the first key, then the next |
@@ -119,11 +119,11 @@ class Program:
         array = np.asarray(value).astype(self.real if dtype == "real" else NUMPY_TYPES[dtype])
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
-    def arrange(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
+    def gather(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
         """Elements of the sources, laid end to end, at the positions [shape]."""
         inner, flat, start = [], [], 0
         for source in sources:
-            parts = source.args if source.op == "arrange" else (source,)
+            parts = source.args if source.op == "gather" else (source,)
             within = np.arange(source.size) if source.value is None or source.op == "const" else source.value.ravel()
             inner += parts
             flat.append(within + start)
@@ -140,15 +140,15 @@ class Program:
         alone = len(inner) == 1 and inner[0].shape == positions.shape
         if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
             return inner[0]
-        return self.make("arrange", positions.shape, inner[0].dtype, inner, value=positions)
+        return self.make("gather", positions.shape, inner[0].dtype, inner, value=positions)
 
     def reshape(self, node: Node, shape: Sequence[int]) -> Node:
         """The same elements in the same order."""
-        return self.arrange([node], np.arange(node.size).reshape(shape))
+        return self.gather([node], np.arange(node.size).reshape(shape))
 
     def broadcast(self, node: Node, shape: Sequence[int]) -> Node:
         """As NumPy broadcasts."""
-        return self.arrange([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
+        return self.gather([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
     def elementwise(self, op: str, *args: Node) -> Node:
         """An operation of `OPERATIONS`, on arguments of one kind that broadcast as NumPy's."""
@@ -172,7 +172,7 @@ class Program:
             args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
 
-    def contract(self, a: Node, b: Node) -> Node:
+    def dot_general(self, a: Node, b: Node) -> Node:
         """sum_k a[b, m, k] b[b, k, n]; a constant comes second."""
         (batch, m, k), n = a.shape, b.shape[2]
         if a.op == b.op == "const" and a.value is not None and b.value is not None:
@@ -183,12 +183,12 @@ class Program:
             product = "and" if a.dtype == "bool" else "mul"
             return self.elementwise(product, self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
-            return self.transpose(self.contract(self.transpose(b), self.transpose(a)))
-        return self.make("contract", (batch, m, n), a.dtype, (a, b))
+            return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
+        return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
 
     def transpose(self, node: Node) -> Node:
         """With the last two axes exchanged."""
-        return self.arrange([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
+        return self.gather([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
 
     def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
         """Elementwise, moved beforehand where the choice is known."""
@@ -197,7 +197,7 @@ class Program:
             chosen_value = np.broadcast_to(values(chosen), shape)
             both = [self.broadcast(case, shape) for case in (if_false, if_true)]
             index = np.arange(chosen_value.size).reshape(shape)
-            return self.arrange(both, np.where(chosen_value, index + chosen_value.size, index))
+            return self.gather(both, np.where(chosen_value, index + chosen_value.size, index))
         return self.elementwise("select", chosen, if_true, if_false)
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
@@ -232,15 +232,15 @@ class Program:
             return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
         positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
         for arg in repeated:
-            alike = arg.op == "arrange" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
+            alike = arg.op == "gather" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
             if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
                 return None
         below = [arg.args[0] if any(arg is one for one in repeated) else self._one(arg) for arg in args]
-        return self.arrange([self.elementwise(op, *below)], positions)
+        return self.gather([self.elementwise(op, *below)], positions)
 
     def _one(self, node: Node) -> Node:
         """The scalar that all elements are."""
-        return node if node.shape == () else self.arrange([node], np.zeros((), np.int64))
+        return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
 
 
 def _neutral(op: str, dtype: str) -> Any:

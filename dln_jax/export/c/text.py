@@ -84,10 +84,10 @@ def table(name: str, array: np.ndarray, precision: str) -> str:
 
 
 def integer(value: int, kind: str) -> str:
-    """A literal of a whole number; C has none for the least ones."""
-    least = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
-    if value in least:
-        return least[value]
+    """Returns a whole number as a literal; C has none for the lowest of 32 and 64 bits, which have names."""
+    lower = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
+    if value in lower:
+        return lower[value]
     return str(value) + {"unsigned": "U", "unsigned_long": "ULL"}.get(kind, "")
 
 

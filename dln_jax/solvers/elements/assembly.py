@@ -143,7 +143,7 @@ def _components(of_corners: Any) -> Float[Array, "s m"]:
     return of_corners.reshape(len(of_corners), -1).T
 
 
-def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys most"]:
+def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys terms"]:
     """The places of each key 0 .. keys - 1, in a padded table."""
     counts = np.bincount(key, minlength=keys)
     table = np.full((keys, max(1, counts.max(initial=0))), padding)

@@ -29,7 +29,7 @@ class ElementEnergy(NamedTuple):
     """(unknowns x[i][j] of one element, its data) -> energy."""
     indices: Int[np.ndarray, "m k"]
     """Blocks of unknowns of each element; an element may name a block once."""
-    written_out: bool = False
+    unrolled: bool = False
     """Whether the energy takes `Corners`, scalars in place of an array [k, b]: arithmetic of scalars fuses over all
     elements, so that its derivatives are several times faster; for elements of up to a dozen unknowns."""
 
@@ -42,7 +42,7 @@ def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> 
 
 def local(element: ElementEnergy, x: Blocks) -> Any:
     """The unknowns of all elements, as the energy takes them: [m, k, b], or scalars [m] in nested tuples."""
-    if not element.written_out:
+    if not element.unrolled:
         return x[element.indices]
     corners = (_take(x, corner) for corner in element.indices.T)
     return tuple(tuple(corner[:, j] for j in range(x.shape[1])) for corner in corners)
@@ -51,7 +51,7 @@ def local(element: ElementEnergy, x: Blocks) -> Any:
 def element_hessians(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> tuple[Array, ...]:
     """Lower triangles of the Hessian of each element, row by row: [s (s + 1)/2, m] for each energy, s = k b."""
     return tuple(
-        _written_out_hessians(e, x, of) if e.written_out else _array_hessians(e, x, of)
+        _unrolled_hessians(e, x, of) if e.unrolled else _array_hessians(e, x, of)
         for e, of in zip(energies, data, strict=True)
     )
 
@@ -75,7 +75,7 @@ def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array
     return lower_triangles(whole.reshape(-1, s, s))
 
 
-def _written_out_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
     def of_one(corners: Corners, data: Any) -> list[Array]:
         scalars, structure = jax.tree.flatten(corners)
 

@@ -22,7 +22,7 @@ class Point(NamedTuple):
     gradient: Blocks
 
 
-class _Trial(NamedTuple):
+class _LineSearchTrial(NamedTuple):
     point: Point
     length: Float[Array, ""]
     accepted: Bool[Array, ""]
@@ -56,19 +56,21 @@ def line_search(
 
     before = size(start.gradient)
 
-    def attempt(trial: _Trial) -> _Trial:
+    def attempt(trial: _LineSearchTrial) -> _LineSearchTrial:
         x = start.x + trial.length * direction
         energy, gradient = evaluate(x)
         change = energy - start.energy
         lower = change <= _DECREASE * trial.length * slope
         flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
         accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
-        return _Trial(Point(x, energy, gradient), trial.length / 2, accepted)
+        return _LineSearchTrial(Point(x, energy, gradient), trial.length / 2, accepted)
 
     one = jnp.ones((), start.x.dtype)
     smallest = 2.0**-_HALVINGS
     last = jax.lax.while_loop(
-        lambda trial: ~trial.accepted & (trial.length > smallest), attempt, _Trial(start, one, jnp.asarray(False))
+        lambda trial: ~trial.accepted & (trial.length > smallest),
+        attempt,
+        _LineSearchTrial(start, one, jnp.asarray(False)),
     )
     kept = [jnp.where(last.accepted, new, old) for new, old in zip(last.point, start, strict=True)]
     return Point(*kept), last.accepted

@@ -36,7 +36,7 @@ _DENSE_UNKNOWNS = 160
 # Of so many at once, bands up to here are factorised faster than each matrix by LAPACK; as measured with 56 to 120
 # unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
-_FEWEST_BANDS = 4
+_LOWER_BANDS = 4
 # Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
 # rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
 # unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
@@ -50,15 +50,15 @@ _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
 # Where the products of a search are measured, they still come with so many times the Newton iterations.
 _MORE_ITERATIONS = 1.75
-_FEWEST_PRODUCTS = 20
+_LOWER_PRODUCTS = 20
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
-_MOST_ENTRIES = 3e7
+_UPPER_ENTRIES = 3e7
 
 
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
-_MOST_PRODUCTS = 10_000
+_UPPER_PRODUCTS = 10_000
 
 
 class LinearSolver(NamedTuple):
@@ -101,7 +101,7 @@ def least_work(
         return dense
     size = _band(at, _ordering(at)) * at.width
     stored = at.unknowns * size
-    if stored > _MOST_ENTRIES:
+    if stored > _UPPER_ENTRIES:
         return matrix_free
     factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
     product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
@@ -111,7 +111,7 @@ def least_work(
         return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
     affordable = int(factorisation / (_MORE_ITERATIONS * product))
     # So few would gain little, and the measurement costs a compilation.
-    if affordable < _FEWEST_PRODUCTS or not search_takes_at_most(affordable):
+    if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
         return block_tridiagonal
     return matrix_free
 
@@ -158,7 +158,7 @@ def _one_or_many(
 
     def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
         of_each = jax.vmap(one)
-        if len(values) < _FEWEST_BANDS:
+        if len(values) < _LOWER_BANDS:
             return of_each(values, b)
         return lax.platform_dependent(values, b, cpu=by_bands, default=of_each)
 
@@ -219,7 +219,7 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
             return (inverse @ x[..., None])[..., 0]
 
         right = jnp.where(at.free, right, 0)
-        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_MOST_PRODUCTS)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
 
     return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
 

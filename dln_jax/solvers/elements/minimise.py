@@ -41,7 +41,7 @@ class _Sum(NamedTuple):
     solver: LinearSolver
 
 
-class _State(NamedTuple):
+class _MinimumIterate(NamedTuple):
     point: Point
     floor: Blocks
     unclear: Float[Array, ""]
@@ -170,13 +170,13 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
     def evaluate(x: Blocks) -> tuple[Array, Blocks]:
         return value_and_gradient(energies, at, x, data)
 
-    def within(state: _State) -> Array:
+    def within(state: _MinimumIterate) -> Array:
         return (jnp.abs(state.point.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
 
-    def running(state: _State) -> Array:
+    def running(state: _MinimumIterate) -> Array:
         return ~within(state) & ~state.stuck & (state.iterations < iterations)
 
-    def iterate(state: _State) -> _State:
+    def iterate(state: _MinimumIterate) -> _MinimumIterate:
         x, energy, gradient = state.point
         hessians = element_hessians(energies, x, data)
         values = entries(at, hessians)
@@ -188,10 +188,12 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
         point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
-        return _State(point, floor, unclear, state.iterations + 1, ~accepted)
+        return _MinimumIterate(point, floor, unclear, state.iterations + 1, ~accepted)
 
     first = Point(x0, *evaluate(x0))
-    start = _State(first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False))
+    start = _MinimumIterate(
+        first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False)
+    )
     last = jax.lax.while_loop(running, iterate, start)
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)
