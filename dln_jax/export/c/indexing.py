@@ -1,4 +1,4 @@
-"""Gather, scatter and dynamic slices as flat positions, which are numbers where the indices are known beforehand."""
+"""Rules for gather, scatter, dynamic slices and sort, by flat positions, which are constants if the indices are."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ _UPDATES = {"scatter": "put_set", **{f"scatter-{name}": op for op, name in _ELEM
 
 
 def _gather(program: Program, parameters: dict[str, Any], operand: Node, indices: Node) -> Node:
-    """`lax.gather`; windows that reach out of the operand are moved inside, or filled."""
+    """Applies `lax.gather`; windows that reach outside the operand are moved inside, or filled."""
     numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     window = [size for axis, size in enumerate(sizes) if axis not in dropped]
@@ -46,7 +46,7 @@ def _gather(program: Program, parameters: dict[str, Any], operand: Node, indices
 
 
 def _filled(kind: str) -> Any:
-    """What JAX fills places outside with, where nothing is said."""
+    """Returns JAX's default fill value for positions outside the operand."""
     if kind in ("real", "bool"):
         return np.nan if kind == "real" else True
     limits = np.iinfo(NUMPY_TYPES[kind])
@@ -54,7 +54,7 @@ def _filled(kind: str) -> Any:
 
 
 def _scatter(name: str):
-    """The rule of `lax.scatter` and its kin."""
+    """Returns the rule of `lax.scatter`, or of its variant that combines updates."""
 
     def rule(program: Program, parameters: dict[str, Any], operand: Node, indices: Node, updates: Node) -> Node:
         numbers = parameters["dimension_numbers"]
@@ -83,14 +83,14 @@ def _scatter(name: str):
 
 
 def take(program: Program, operand: Node, positions: Node) -> Node:
-    """Flat elements of the operand at positions, which are inside."""
+    """Returns the elements of the flat operand at positions, which must be inside."""
     if is_constant(positions):
         return program.gather([operand], values(positions))
     return program.make("take", positions.shape, operand.dtype, [operand, positions])
 
 
 def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node) -> Node:
-    """The operand with updates at flat targets; negative targets are dropped."""
+    """Returns the operand with updates at flat targets; negative targets are dropped."""
     if not is_constant(targets):
         return program.make(op, operand.shape, operand.dtype, [operand, targets, updates])
     flat, index = values(targets).ravel(), np.arange(operand.size)
@@ -98,7 +98,7 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
         index[flat[flat >= 0]] = operand.size + np.flatnonzero(flat >= 0)
         return program.gather([operand, updates], index.reshape(operand.shape))
     left = np.flatnonzero(flat >= 0)
-    while left.size:  # one pass for each time that a target repeats
+    while left.size:  # a pass handles one update of every target
         _, first = np.unique(flat[left], return_index=True)
         now = left[first]
         combined = program.elementwise(
@@ -112,19 +112,19 @@ def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node)
 
 
 def _dynamic_slice(program: Program, parameters: dict[str, Any], operand: Node, *starts: Node) -> Node:
-    """`lax.dynamic_slice`."""
+    """Applies `lax.dynamic_slice`."""
     sizes = parameters["slice_sizes"]
     positions = _window(program, operand.shape, sizes, starts[: len(sizes)])
     return take(program, operand, positions)
 
 
 def _dynamic_update_slice(program: Program, _, operand: Node, update: Node, *starts: Node) -> Node:
-    """`lax.dynamic_update_slice`."""
+    """Applies `lax.dynamic_update_slice`."""
     return _put(program, "put_set", operand, _window(program, operand.shape, update.shape, starts), update)
 
 
 def _sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
-    """`lax.sort` along an axis by the first `num_keys` arrays: stable, and NaN comes last."""
+    """Applies `lax.sort` along an axis by the first `num_keys` arrays: stable, NaN last."""
     axis, shape = parameters["dimension"], nodes[0].shape
     if shape[axis] < 2 or nodes[0].size == 0:
         return list(nodes)
@@ -136,7 +136,7 @@ def _sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[No
 
 
 def _window(program: Program, shape, sizes, starts) -> Node:
-    """Flat positions of a window whose corner is clamped into the operand."""
+    """Returns the flat positions of a window whose corner is clamped into the operand."""
     flat = program.constant(0, "index")
     for axis, start in enumerate(starts):
         flat = _plus(program, flat, _clamped(program, start, shape[axis] - sizes[axis]), _stride(shape, axis))
@@ -145,7 +145,7 @@ def _window(program: Program, shape, sizes, starts) -> Node:
 
 
 def _starts(program: Program, indices: Node, shape, sizes, axes, mode, batched) -> tuple[Node, Node | None]:
-    """Flat position of each window's corner, and whether the windows are inside where those outside are dropped."""
+    """Returns the flat positions of the windows' corners; if windows outside are dropped, also which are inside."""
     batch = indices.shape[:-1]
     index = np.arange(indices.size).reshape(indices.shape)
     flat = program.constant(np.zeros(batch, np.int64), "index")
@@ -178,7 +178,7 @@ def _clamped(program: Program, start: Node, last: int) -> Node:
 
 
 def _index(program: Program, start: Node, upper: int) -> Node:
-    """As an index, which does not hold all unsigned numbers of 64 bits: those are bounded before."""
+    """Returns an index, clamped before the conversion if it is unsigned with 64 bits, which an index cannot hold."""
     if start.dtype == "unsigned_long":
         start = program.elementwise("min", start, program.constant(max(upper, 0), start.dtype))
     return convert(program, start, "index")
@@ -193,7 +193,7 @@ def _stride(shape, axis: int | np.integer) -> int:
 
 
 def _offsets(shape, axes, sizes) -> np.ndarray:
-    """Flat offsets [sizes] of a window that spans the given axes."""
+    """Returns the flat offsets [sizes] of a window along these axes."""
     offsets = np.zeros([1] * len(sizes), np.int64)
     for place, (axis, size) in enumerate(zip(axes, sizes, strict=True)):
         steps = np.arange(size) * _stride(shape, axis)
@@ -208,4 +208,4 @@ RULES = {
     "sort": _sort,
     **{name: _scatter(name) for name in _UPDATES},
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""

@@ -1,4 +1,4 @@
-"""What an exported source declares: functions, their arguments and results, and the description that states them."""
+"""Interface of an exported source: signatures of its functions, their C declarations, and the JSON description."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -14,14 +14,14 @@ from dln_jax.export.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
 FORMAT = 4
-"""Version of the names and signatures in exported sources, and of their description."""
+"""Version of the names and signatures in exported sources and of the JSON description."""
 LARGEST = 1 << 22
-"""Numbers of an argument or result."""
+"""Largest number of elements of an argument or result."""
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
 class Leaf(NamedTuple):
-    """An argument or a result."""
+    """An array among the arguments or results of a C function."""
 
     name: str
     kind: str
@@ -29,7 +29,7 @@ class Leaf(NamedTuple):
 
 
 class Signature(NamedTuple):
-    """Of one function."""
+    """Arguments, results and cost of a C function."""
 
     arguments: tuple[Leaf, ...]
     results: tuple[Leaf, ...]
@@ -38,12 +38,12 @@ class Signature(NamedTuple):
 
     @property
     def returns(self) -> bool:
-        """Whether it returns its one number, in place of writing to an array."""
+        """Whether the function returns its only result, a scalar, instead of writing to an array."""
         return len(self.results) == 1 and self.results[0].shape == ()
 
 
 def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
-    """Arguments by the names of the function's parameters; a tree's leaves by their path too."""
+    """Returns the argument arrays, named after the function's parameters and, in a tree, the path of the leaf."""
     try:
         names = list(inspect.signature(function).parameters)
     except (ValueError, TypeError):
@@ -54,7 +54,7 @@ def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> li
 
 
 def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
-    """Results by their keys, `result` where there are none."""
+    """Returns the result arrays, named after their keys, or `result` if there are none."""
     leaves = _leaves("", shapes) if jax.tree.structure(shapes) != jax.tree.structure(0) else _leaves("result", shapes)
     used = {leaf.name for leaf in taken}
     leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
@@ -83,7 +83,7 @@ def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
 
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
-    """The prototype of a function, without its semicolon."""
+    """Returns the prototype of a function, without the semicolon."""
     kinds = {**KINDS, "real": real}
     parameters = [
         f"{kinds[kind]} {argument}" if shape == () else f"const {kinds[kind]} {argument}[{_length(shape)}]"
@@ -98,12 +98,12 @@ def declaration(name: str, function: str, signature: Signature, real: str) -> st
 
 
 def _length(shape: tuple[int, ...]) -> int:
-    """Of an array in C, which has no empty ones."""
+    """Returns the length of an array in C, at least 1, because C has no empty arrays."""
     return max(int(np.prod(shape)), 1)
 
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
-    """JSON values that state an export."""
+    """Returns the JSON description of an export, without digests."""
     stated = {
         key: {
             "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.arguments],
@@ -117,10 +117,10 @@ def description(name: str, precision: str, version: str, functions: Mapping[str,
 
 
 def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
-    """Precision and signatures of an export, nothing merely believed, with its header and source.
+    """Returns the precision and the signatures of an export, checked against its header, and its files.
 
     Raises:
-        InputError: a file is missing or altered, the format is another, or what is stated contradicts the header.
+        InputError: a file is missing or altered, the format differs, or the description contradicts the header.
     """
     path = directory / f"{name}.json"
     stated, files = read_export(path, (f"{name}.h", f"{name}.c"))

@@ -1,4 +1,4 @@
-"""Factorisations and triangular solves, which become loops of their own in C."""
+"""Rules for factorisations and triangular solves, which C computes in functions of its own."""
 
 from math import prod
 from typing import Any
@@ -11,7 +11,7 @@ from dln_jax.types import InputError
 
 
 def _matrices(program: Program, node: Node) -> list[Node]:
-    """Each [rows, columns] of a batch."""
+    """Returns the matrices of a batch."""
     index = np.arange(node.size).reshape(-1, *node.shape[-2:])
     return [program.gather([node], positions) for positions in index]
 
@@ -63,7 +63,7 @@ def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> 
 
 
 def _parts(program: Program, nodes: list[Node], first: int, shape: tuple[int, ...], batch: list[int]) -> Node:
-    """An array of that shape from each flat node, read from element `first` on."""
+    """Returns a batch of arrays of this shape, read from flat nodes starting at element `first`."""
     index = first + np.arange(prod(shape))
     return _stacked(program, [program.gather([node], index) for node in nodes], (*batch, *shape))
 
@@ -82,7 +82,7 @@ def _householder_product(program: Program, _, a: Node, tau: Node) -> Node:
 
 
 def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
-    """Composed of the two rules above as in JAX."""
+    """Applies `qr` by the two rules above, as JAX does."""
     (*batch, m, n), full = a.shape, parameters["full_matrices"]
     if parameters["pivoting"]:
         raise InputError("the primitive 'qr' has C without pivoting; got pivoting=True")
@@ -98,7 +98,7 @@ def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
 
 
 def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
-    """Reads the lower or upper triangle alone; the signs of eigenvectors may differ from LAPACK's."""
+    """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
     *batch, n, _ = a.shape
     if parameters["subset_by_index"] not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
@@ -118,4 +118,4 @@ RULES = {
     "lu": _lu,
     "lu_pivots_to_permutation": _permutation,
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""

@@ -1,4 +1,4 @@
-"""Sorting in C: the order of rows of numbers by one or several keys."""
+"""C that sorts rows of numbers by one or several keys."""
 
 from collections.abc import Collection, Sequence
 from string import Template
@@ -43,7 +43,7 @@ def _name(kinds: Sequence[str]) -> str:
 
 
 def _function(kinds: Sequence[str]) -> str:
-    """The function that sorts by keys of these kinds, the first before the second."""
+    """Returns the C function that sorts by keys of these kinds, the first key first."""
     comparisons = ""
     for place, kind in enumerate(kinds):
         nan_last = " || (KEY[{0}] == KEY[{0}] && KEY[{1}] != KEY[{1}])" if kind == "real" else ""
@@ -57,12 +57,12 @@ def _function(kinds: Sequence[str]) -> str:
 
 
 def definitions(orders: Collection[tuple[str, ...]]) -> str:
-    """C text of the functions that sort by keys of these kinds."""
+    """Returns the C functions that sort by keys of these kinds."""
     return "".join(map(_function, sorted(orders)))
 
 
 def order(body: Body, node: Node) -> None:
-    """A call of the function that sorts by the kinds of keys of a node."""
+    """Writes a call of the function that sorts by the keys of a node."""
     rows, n = node.shape
     kinds, merged = tuple(key.dtype for key in node.args), f"v{node.number}_merged"
     body.source.orders.add(kinds)

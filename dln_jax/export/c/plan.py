@@ -1,7 +1,7 @@
-"""Which nodes of a program become scalars, loops or nothing at all, where they are kept, and in which order.
+"""Decides which nodes of a program become scalars or loops, which get arrays, and in which order they are computed.
 
-Small arrays are written out, element by element, so that moving elements costs nothing and a compiler keeps them in
-registers. Others are loops over arrays; elementwise ones that nothing else reads are part of the loop that reads them.
+Small arrays are unrolled into scalars, so that moving elements costs nothing and a compiler keeps them in registers.
+Others are loops over arrays; an elementwise operation with one reader is fused into the loop of its reader.
 """
 
 from collections.abc import Iterable
@@ -14,42 +14,42 @@ from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
 from dln_jax.export.c.program import Program
 
 UNROLL_LIMIT = 64
-"""Elements of a result, or products of a sum, up to which they may be written out one by one."""
+"""Largest number of elements of a result, or of products of a sum, that may be unrolled."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
-"""What reads arguments through a pointer."""
+"""Operations that read arguments through a pointer."""
 
 
 class Plan(NamedTuple):
-    """What is decided about the nodes that the results need."""
+    """Decisions about the nodes that the results need."""
 
     order: dict[Region, list[Node]]
-    """Nodes of each region as they are computed."""
+    """Nodes of a region in the order of their computation."""
     unrolled: set[Node]
-    """Computed element by element."""
+    """Nodes that are computed element by element."""
     arrays: set[Node]
-    """Kept in an array; scalars otherwise."""
+    """Nodes that are stored in an array; others are scalars."""
     root: dict[Node, Node]
-    """The loop that an elementwise node is computed in, of each that has a loop."""
+    """Last node of the loop that computes an elementwise node."""
     needed: dict[Node, np.ndarray]
-    """Of what is written out, the elements that something reads."""
+    """Elements that something reads, of every node."""
     levels: dict[Node, int]
-    """Number of products that come before, one after the other."""
+    """Length of the longest chain of products before a node."""
     reads: dict[Node, set[Node]]
-    """Arrays of its region that each step reads; a loop reads what is read inside."""
+    """Arrays of its region that a step reads; a loop reads the arrays that its body reads."""
     readers: dict[Node, set[Node | None]]
-    """Steps that read an array, and None for the results."""
+    """Steps that read an array; None stands for the results."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
-    """The plan for a program with these results."""
+    """Returns the plan for a program with these results."""
     results = list(results)
     nodes, readers, whole, contiguous = _reached(program, results)
     unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
-    # What loops read is an array; of an arrange whose elements a loop cannot follow, a copy is.
+    # Loops read arrays. A gather that a loop cannot index linearly is copied to an array first.
     for node in reversed(nodes):
         looped = any(
             reader in followed if reader.op == "gather" else reader not in unrolled for reader in readers[node]
@@ -83,19 +83,19 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
 
 
 def inner(program: Program, node: Node) -> list[Loop]:
-    """What is inside of a loop or branch."""
+    """Returns the bodies of a loop or branch."""
     if node.op == "branch":
         return [program.loops[number] for number in node.attribute]
     return [program.loops[node.attribute]] if node.op in ("while", "repeat") else []
 
 
 def is_direct(node: Node) -> bool:
-    """Whether a loop follows an arrange with an index that is linear in its own."""
+    """Returns whether the positions of a gather are linear in the indices of a loop."""
     return len(node.args) == 1 and strides(node.value) is not None
 
 
 def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
-    """(first, steps) with positions = first + sum_a steps_a i_a, or None."""
+    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
     assert positions is not None
     if positions.size == 0:
         return 0, (0,) * positions.ndim
@@ -110,7 +110,7 @@ def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
 
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
-    """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
+    """Returns the needed nodes in order, their readers, the nodes that are read whole, and those read by pointer."""
     reached, waiting = set(), list(results)
     while waiting:
         node = waiting.pop()
@@ -150,7 +150,7 @@ def _is_unrolled(node: Node) -> bool:
 
 
 def _is_scalar(node: Node) -> bool:
-    """Whether what computes it can leave it without memory."""
+    """Returns whether a node can be a variable without an array."""
     return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
@@ -159,7 +159,7 @@ def _is_product(node: Node, unrolled: set[Node]) -> bool:
 
 
 def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
-    """The loop that each elementwise node is in."""
+    """Returns the last node of the loop that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
     for node in reversed(nodes):
         if node.op not in OPERATIONS or node in unrolled:
@@ -185,7 +185,7 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
 
 
 def sources(node: Node, arrays: set[Node]) -> set[Node]:
-    """Arrays that a reading of a node reads."""
+    """Returns the arrays that a reading of a node reads."""
     if node.op == "gather" and node not in arrays:
         return {source for arg in node.args for source in sources(arg, arrays)}
     return {node} & arrays
@@ -202,7 +202,7 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
             read += [*loop.results, *loop.conditions]
         for argument in read:
             for source in sources(argument, arrays):
-                # Where a loop inside of the array's region reads it, the loop does.
+                # A reading in a nested loop counts as a reading by that loop.
                 depth = len(source.region)
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
                 reads.setdefault(step, set()).add(source)
@@ -210,7 +210,7 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
 
 
 def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
-    """Elements that something reads, of each node."""
+    """Returns which elements of every node something reads."""
     needed = {node: np.zeros(node.size, bool) for node in nodes}
     projected: dict[Node, set[int]] = {}
     for node in results:
