@@ -1,17 +1,17 @@
-"""JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
+"""Exports JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
 
-CasADi (3.6 and later) looks beside a function f for these, and takes what they give for its derivatives:
+CasADi (3.6 and later) takes the derivatives of a function f from these functions of the same library:
 
 | symbol | inputs | outputs |
 |---|---|---|
 | `f` | x | y |
-| `jac_f` | x, y | dy_j/dx_i, of all i for each j in turn |
+| `jac_f` | x, y | dy_j/dx_i for all i, then the next j |
 | `fwd1_f` | x, y, seeds of x | (dy/dx) seeds |
 | `adj1_f` | x, y, seeds of y | (dy/dx)ᵀ seeds |
 | `jac_adj1_f` | x, y, seeds of y, outputs of `adj1_f` | derivatives of these outputs with respect to all inputs |
 
-Outputs among the inputs are declared without elements, and so are derivatives with respect to them. Everything else is
-dense and column-major, vectors are n x 1, and pointers may be null: an input of zeros, an output that nobody wants.
+Outputs among the inputs are declared without elements, and so are derivatives with respect to them. All other matrices
+are dense and column-major, vectors are n x 1. A null pointer stands for an input of zeros or an unwanted output.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -82,7 +82,7 @@ endif()
 
 
 class Block(NamedTuple):
-    """An input or output: a matrix with all elements, or none."""
+    """An input or output: a dense matrix, or one declared without elements."""
 
     name: str
     rows: int
@@ -98,20 +98,18 @@ class Block(NamedTuple):
 def external_functions(
     name: str, functions: Mapping[str, Any], *, libm: bool, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
-    """The source with the tables that `casadi_NAME_F` and its derivatives read for each function F, and their C text.
-
-    Third is why functions are left out, if they may be.
+    """Returns the source of tables, the C text of `casadi_NAME_F` and its derivatives for every F, and refusals.
 
     Args:
-        name: of the export.
-        functions: as `export_c` takes them.
+        name: name of the export.
+        functions: as for `export_c`.
         libm: call the C library's elementary functions.
-        stack: bytes that a function may take.
-        leave_out: functions that would be refused.
+        stack: bytes of stack that a function may use.
+        leave_out: omit functions that CasADi cannot take, and return the reasons.
 
     Raises:
-        InputError: what CasADi cannot take: numbers that are not real, more than two axes, some names; or a function
-            without arguments, without derivatives, or that takes more stack.
+        InputError: CasADi cannot take a function: its arrays are not real or have more than two axes, a name is
+            reserved, or it has no arguments or no derivatives, or needs more stack.
     """
     source, texts, largest, left_out = Source("f64", libm), [], 1, []
     for key, (function, examples) in functions.items():
@@ -131,7 +129,7 @@ def external_functions(
 def _with_derivatives(
     source: Source, symbol: str, function: Callable[..., Any], examples: Sequence[Any], stack: int
 ) -> tuple[Source, str, int]:
-    """The source, the text of a function and its derivatives, and the elements of the largest input."""
+    """Returns the source, the text of a function and its derivatives, and the size of the largest input."""
     try:
         inputs, outputs, flat = _flat(function, examples)
         _check_names(symbol, [*inputs, *outputs])
@@ -146,7 +144,7 @@ def _with_derivatives(
 
 
 def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[Block], list[Block], Any]:
-    """Inputs, outputs, and the function from all inputs, column-major and end to end, to all outputs likewise."""
+    """Returns inputs, outputs, and the function between the vectors of all inputs and of all outputs, column-major."""
     leaves, tree = jax.tree.flatten(tuple(examples))
     arguments = argument_leaves(function, examples)
     inputs, shapes = [_block(leaf) for leaf in arguments], [np.shape(leaf) for leaf in leaves]
@@ -156,7 +154,7 @@ def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[B
     cuts = np.cumsum([block.size for block in inputs])[:-1]
 
     def flat(x: jax.Array) -> jax.Array:
-        # A matrix that is read in column-major order is its transpose.
+        # Column-major order of a matrix is row-major order of its transpose.
         arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
         results = jax.tree.leaves(function(*jax.tree.unflatten(tree, arguments)))
         return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
@@ -187,13 +185,13 @@ def _check_names(symbol: str, blocks: list[Block]) -> None:
 
 
 def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Prefix, inputs and outputs of each function, and ways to compute it from inputs and seeds, the best first."""
+    """Yields prefix, inputs and outputs of all derivatives, and functions that compute them, the cheapest first."""
     x_parts, y_parts = (
         [slice(*ends) for ends in pairwise([0, *accumulate(block.size for block in blocks)])]
         for blocks in (inputs, outputs)
     )
 
-    # Rows of a transposed Jacobian are a block's columns.
+    # Rows of the transposed Jacobian are columns of the Jacobian, which CasADi stores one after the other.
     def slopes(way: Any, x: jax.Array, _: Any) -> jax.Array:
         transposed = way(flat, x)
         return jnp.concatenate([transposed[i, j].ravel() for j in y_parts for i in x_parts])
@@ -228,12 +226,12 @@ def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterab
 def _function(
     source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Any], stack: int
 ) -> tuple[Source, str]:
-    """The source and the C text of the first way that can be compiled."""
+    """Returns the source and the C text by the first method that can be compiled."""
     failure: Exception | None = None
     for way in ways:
         try:
             body = _body(source.copy(), inputs, outputs, way)
-        except (TypeError, ValueError, NotImplementedError) as error:  # what JAX cannot differentiate, or has no C
+        except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
             failure = error
             continue
         if body.bytes <= stack:

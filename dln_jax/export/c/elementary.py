@@ -1,4 +1,4 @@
-"""Elementary functions of exported C: plain C99 without branches or tables, which compilers turn into vector code.
+"""Elementary functions in exported C: plain C99 without branches or tables, which compilers vectorise.
 
 Each is right to two units in the last place over its range, with the usual values at zeros, infinities and NaN; only
 `exp` rounds to zero what is below the smallest normal number. The ideas are standard (Cody and Waite, Software Manual
