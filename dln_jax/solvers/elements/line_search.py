@@ -1,4 +1,4 @@
-"""A backtracking line search that still sees descent where the energy is lost in rounding."""
+"""A backtracking line search that still detects descent when rounding hides changes of the energy."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,7 +15,7 @@ _HALVINGS = 40
 
 
 class Point(NamedTuple):
-    """A point and what is known there."""
+    """A point with its energy and gradient."""
 
     x: Blocks
     energy: Float[Array, ""]
@@ -36,18 +36,18 @@ def line_search(
     unclear: Float[Array, ""],
     scale: Float[Array, "n 1"],
 ) -> tuple[Point, Bool[Array, ""]]:
-    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell.
+    """Takes the first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient if rounding hides that.
 
-    Changes of the energy below `unclear` tell nothing: terms that cancel at rest are that large. A stiff body's
-    gradient is balanced to many digits after its energy has become blind. Returns the point, which is the start if no
-    step is accepted, and whether one is.
+    Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
+    improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and whether a
+    step is accepted.
 
     Args:
         evaluate: x -> energy and gradient.
-        start: where the search starts.
-        direction: of descent.
-        slope: of the energy along the direction, <= 0.
-        unclear: what the energy cannot tell from zero.
+        start: the point where the search starts.
+        direction: a descent direction.
+        slope: derivative of the energy along the direction, <= 0.
+        unclear: changes of the energy that rounding hides.
         scale: unit of the gradient's rows.
     """
 
