@@ -142,8 +142,7 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
     key = program.lowered[call]
     shapes = [(result.shape, result.dtype) for result in program.parts[key].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    node = program.make("call", (), "int", passed, attribute=key)
-    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
+    return _projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
 
 
 def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -168,11 +167,8 @@ def _carries(program: Program, number: int, outer: tuple[int, ...], start: Seque
     ]
 
 
-def _projections(program: Program, op: str, number: int, outer, start, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
-    loop = program.make(op, (), "int", start, attribute=number, region=outer)
-    return [
-        program.make("project", shape, dtype, [loop], attribute=index) for index, (shape, dtype) in enumerate(shapes)
-    ]
+def _projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
+    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
 
 
 def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -183,7 +179,8 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
     results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
     program.loops[number] = Loop(carries, [condition], results)
-    return _projections(program, "while", number, outer, start, [(carry.shape, carry.dtype) for carry in start])
+    loop = program.make("while", (), "int", start, attribute=number, region=outer)
+    return _projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
 
 
 def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -206,7 +203,7 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     program.loops[number] = Loop(carries, [], results, length, reverse)
     shapes = [(carry.shape, carry.dtype) for carry in start]
     shapes += [((length, *result.shape), result.dtype) for result in results[count:]]
-    return _projections(program, "repeat", number, outer, start, shapes)
+    return _projections(program, program.make("repeat", (), "int", start, attribute=number, region=outer), shapes)
 
 
 def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -227,7 +224,7 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     shapes = [(result.shape, result.dtype) for result in every[0][1]]
     numbers = tuple(inside for inside, _ in every)
     branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
-    return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
+    return _projections(program, branch, shapes)
 
 
 def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:

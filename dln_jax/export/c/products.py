@@ -162,7 +162,7 @@ def _whole(body: Body, node: Node) -> None:
 
 
 def _dots(body: Body, node: Node) -> None:
-    """A product with one column."""
+    """Writes a product with one column."""
     a, b = node.args
     batch, m, count = a.shape
     body.spend(2 * batch * m * count)
