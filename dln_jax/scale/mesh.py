@@ -159,7 +159,7 @@ def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
 
 def total(tree: Any, mesh: Mesh | None) -> Any:
-    """Within a function of `on_devices`: the sum over devices."""
+    """Returns the sum over devices, within a function of `on_devices`."""
     return tree if mesh is None else lax.psum(tree, AXIS)
 
 

@@ -241,7 +241,7 @@ def _function(name: str, precision: str, ending: str = "") -> str:
 
 
 def _values(precision: str) -> dict[str, str]:
-    """What the texts leave open."""
+    """Returns the values of the placeholders in the C text."""
     numpy_type = PRECISIONS[precision][0]
     mantissa, bias = np.finfo(numpy_type).nmant, np.finfo(numpy_type).maxexp - 1
     word, suffix = {"f64": ("uint64_t", "ULL"), "f32": ("uint32_t", "U")}[precision]
