@@ -1,4 +1,4 @@
-"""Trained models as jitted functions."""
+"""Exports of models: low-latency functions, StableHLO artefacts and C99 source."""
 
 from dln_jax.export.c import export_c, export_run, functions_of_run, functions_of_system, load_c
 from dln_jax.export.low_latency import enable_low_latency, low_latency

@@ -1,8 +1,8 @@
-"""Files of an export: written together, never over a run's, and read only while they belong together.
+"""Writes and reads the files of an export as a unit, and never overwrites a run.
 
-A description, JSON beside what it describes, holds the SHA-256 of each file and its own. Every new file is complete
-before the first takes its place, and descriptions come last: whatever ends the renaming leaves old or new files, or a
-description whose digests do not fit, which readers refuse. Digests find accidents, and do not say who wrote a file.
+A description, a JSON file beside the others, holds the SHA-256 of all files and its own. All new files are complete
+before the first is renamed into place, and descriptions come last. An interruption therefore leaves the old files, the
+new files, or a description whose digests do not fit, which readers refuse. Digests detect accidents, not forgery.
 """
 
 import hashlib
@@ -19,21 +19,21 @@ AGAIN = "export it again"
 
 
 def described(facts: Mapping[str, Any], files: Mapping[str, bytes]) -> bytes:
-    """The description of files (bytes by name): facts, JSON values, and the digests."""
+    """Returns the JSON description of files (name -> bytes): the facts and the digests."""
     values = {**facts, "files": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}}
     return json.dumps({**values, "sha256": _digest(values)}, indent=2).encode() + b"\n"
 
 
 def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: bool) -> list[Path]:
-    """Writes files by name, all or none, descriptions (.json) last; creates the folder where it is missing.
+    """Writes all files or none, descriptions (.json) last, and creates the folder if it is missing.
 
     Args:
-        directory: of an export, and of no run.
-        files: what is to be written, descriptions of it included.
-        overwrite: replace files that exist, but a .json only where it describes files of these names.
+        directory: folder of the export, not of a run.
+        files: name -> bytes, descriptions included.
+        overwrite: replace existing files, but a .json only if it describes files of the same names.
 
     Raises:
-        InputError: the folder is a run's, a file is there that may not be replaced, or nothing can be written there.
+        InputError: the folder belongs to a run, a file may not be replaced, or the folder cannot be written to.
     """
     if any("tensor_file" in _values(path) for path in directory.glob("*.json")):
         raise InputError(f"{directory} is the folder of a run; export to another, such as {directory / 'exported'}")
@@ -53,17 +53,17 @@ def write_exports(directory: Path, files: Mapping[str, bytes], *, overwrite: boo
     except OSError as error:
         raise InputError(f"{directory}: cannot write there ({error.strerror}); choose another folder") from error
     with ExitStack() as stack:
-        # What is entered last is renamed first.
+        # The stack renames in reverse order, so descriptions are entered first.
         for name in sorted(files, key=lambda name: not name.endswith(".json")):
             stack.enter_context(writing(directory / name)).write_bytes(files[name])
     return [directory / name for name in files]
 
 
 def read_export(path: Path, names: Iterable[str]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What a description says, its digests apart, and the bytes of the files of these names beside it.
+    """Returns the facts of a description, and the bytes of the named files beside it.
 
     Raises:
-        InputError: one is missing, cannot be read, or is not as it was written.
+        InputError: a file is missing, unreadable or altered.
     """
     values = read_json(path, remedy=f"{AGAIN}, and keep its files together")
     stated, digests = values.pop("sha256", None), values.get("files")
@@ -85,7 +85,7 @@ def read_export(path: Path, names: Iterable[str]) -> tuple[dict[str, Any], dict[
 
 
 def _values(path: Path) -> dict[str, Any]:
-    """What is in a JSON file, nothing if that is no object."""
+    """Returns the object in a JSON file, empty if there is none."""
     with suppress(InputError):
         return read_json(path, remedy="")
     return {}

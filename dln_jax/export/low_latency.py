@@ -1,12 +1,12 @@
-"""Single calls with the least time between question and answer, for a control loop.
+"""Low-latency calls on the CPU, for control loops.
 
-By default JAX hands a computation on the CPU to another thread and returns at once, which costs a loop that waits for
-the answer a change of threads each way. `enable_low_latency` computes in the calling thread instead; the setting is
-read when the backend starts, and silently ignored afterwards, so that it is refused then. It serves single calls; large
-batches, whose preparation overlaps with the computation, may be slower by it.
+By default JAX hands a computation on the CPU to another thread and returns at once. A loop that waits for the result
+pays for two thread switches. `enable_low_latency` makes JAX compute in the calling thread. JAX reads the setting when
+its backend starts and silently ignores it afterwards, so a late call is refused. Single calls gain; large batches,
+whose preparation overlaps with the computation, may become slower.
 
-A jitted function with its parameters closed over is 1 to 2 us faster than what `lower().compile()` returns, whose call
-passes through more Python; it is therefore what is used here.
+A jitted function with its parameters closed over is 1 to 2 us faster than the result of `lower().compile()`, whose call
+passes through more Python; `low_latency` therefore returns a jitted function.
 """
 
 from collections.abc import Callable
@@ -24,11 +24,11 @@ _SETTING = "jax_cpu_enable_async_dispatch"
 
 
 def enable_low_latency() -> None:
-    """Computes on the CPU in the calling thread from now on; the rest of the process included.
+    """Makes JAX compute on the CPU in the calling thread, in the whole process from now on.
 
     Raises:
-        InputError: a backend has started already (any array, or a list of devices, starts it), or JAX is to compute on
-            something other than the CPU.
+        InputError: a backend has already started (any array, or a list of devices, starts it), or JAX computes on a
+            device other than the CPU.
     """
     platforms = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
     if platforms and platforms.split(",")[0] != "cpu":
@@ -49,19 +49,20 @@ def enable_low_latency() -> None:
 
 
 def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = False) -> Callable[..., Any]:
-    """The function compiled for arguments like the examples, and called once.
+    """Returns the function compiled for arguments like the examples, after one call.
 
     Args:
-        function: of arrays, its parameters closed over, for instance `load(folder).dynamics.inverse_dynamics`.
-        examples: one argument each, of the shape and type that calls will have.
-        numpy: arguments are copied into one buffer, which costs one transfer instead of one for each, and results are
-            NumPy arrays. Arguments must have one type; others are converted to it. The buffer makes the callable
-            serve one thread at a time. By default arguments are NumPy or device arrays (device arrays are faster, 2 us
-            for each argument) and results device arrays; another shape or type compiles anew.
+        function: a function of arrays with its parameters closed over, such as
+            `load(folder).dynamics.inverse_dynamics`.
+        examples: one example per argument, with the shape and dtype of later calls.
+        numpy: copy all arguments into one buffer, for a single transfer, and return NumPy arrays. Arguments are
+            converted to one common dtype. The callable serves one thread at a time, because of the buffer. By default
+            arguments are NumPy or device arrays (a device array saves 2 us) and results are device arrays; another
+            shape or dtype compiles again.
 
     Raises:
-        InputError: no examples, or with `numpy` ones of several types; a default device that is no CPU; from the
-            callable with `numpy`, an argument of another shape than its example.
+        InputError: there are no examples, or with `numpy` they have several dtypes, or the default device is not a CPU;
+            with `numpy`, the callable raises it for an argument whose shape differs from its example.
     """
     if (platform := jax.default_backend()) != "cpu":
         raise InputError(_only_on_cpu(platform))
@@ -69,7 +70,7 @@ def low_latency(function: Callable[..., Any], *examples: Any, numpy: bool = Fals
         raise InputError("low_latency got no example; give one argument of each kind that calls will have")
     if not numpy:
         compiled = jax.jit(function)
-        # Each kind of array has its own short cut through the dispatch, which the first call makes.
+        # JAX caches a fast path of the dispatch for NumPy and for device arrays, at the first call with such arrays.
         for convert in (np.asarray, jnp.asarray):
             jax.block_until_ready(compiled(*map(convert, examples)))
         return compiled
@@ -88,12 +89,12 @@ def _only_on_cpu(platform: str) -> str:
 
 
 def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
-    """The argument where it is an array of this shape, else such an array of the numbers that it holds.
+    """Returns the argument as a real array of this shape, without a copy if it already is one.
 
-    To be copied into the host's memory, where an assignment would broadcast silently.
+    The check is needed because the assignment to a buffer would broadcast silently.
 
     Raises:
-        InputError: another shape, or nothing that is an array of numbers.
+        InputError: the argument has another shape, or is not an array of real numbers.
     """
     try:
         if argument.shape == shape and argument.dtype.kind in "fiu":
@@ -103,7 +104,7 @@ def as_shaped(name: str, argument: Any, shape: tuple[int, ...]) -> Any:
     try:
         array = np.asarray(argument)
     except (ValueError, TypeError):
-        raise InputError(f"{name} makes no array; expected real numbers of shape {shape}") from None
+        raise InputError(f"{name} is not an array; expected real numbers of shape {shape}") from None
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} has type {array.dtype}; expected real numbers of shape {shape}")
     require_shape(name, array.shape, shape)
@@ -123,12 +124,12 @@ def _packed(function: Callable[..., Any], arrays: list[np.ndarray]) -> Callable[
         return function(*map(jnp.reshape, jnp.split(packed, ends), shapes))
 
     single = isinstance(jax.eval_shape(compiled, jnp.asarray(buffer)), jax.ShapeDtypeStruct)
-    # A copy, also where JAX would hand back memory of its own or the buffer's.
+    # Results are copied, because JAX may return a view of its own memory or of the buffer.
     copied = np.array if single else partial(jax.tree.map, np.array)
 
     def evaluate(*arguments):
         if len(arguments) != len(views):
-            raise InputError(f"{len(arguments)} arguments were given; expected {len(views)}, as in the examples")
+            raise InputError(f"got {len(arguments)} arguments; expected {len(views)}, as in the examples")
         for (name, shape, view), argument in zip(views, arguments, strict=True):
             view[...] = as_shaped(name, argument, shape)
         return copied(compiled(buffer))

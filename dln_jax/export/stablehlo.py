@@ -1,8 +1,8 @@
-"""Functions as `jax.export` artefacts: StableHLO with a calling convention, run by any JAX without this package.
+"""Exports functions as `jax.export` artefacts: StableHLO that any JAX runs without this package.
 
-Beside each artefact, NAME.json states what it was made with and for, and its digest. JAX promises to read artefacts
-for six months after the release that wrote them; an older one is exported again from its run folder. They are compiled
-where they are loaded, for the platforms they were lowered for. Writing and reading need the package `flatbuffers`.
+NAME.json, beside the artefact, states its platforms, shapes, JAX release and digest. JAX promises to read artefacts for
+six months after the release that wrote them; export older ones again from the run folder. Artefacts are compiled where
+they are loaded, for the platforms that they were lowered for. Writing and reading need the package `flatbuffers`.
 """
 
 import importlib.util
@@ -33,18 +33,18 @@ def export_stablehlo(
     platforms: Sequence[str] = ("cpu",),
     overwrite: bool = False,
 ) -> Path:
-    """Writes the function, for arguments like the examples, to a file that ends in .stablehlo, and a note beside it.
+    """Writes a function, for arguments like the examples, as an artefact with its JSON note, and returns the path.
 
     Args:
-        function: of arrays, its parameters closed over.
-        examples: one argument each: an array, a number, or a `jax.ShapeDtypeStruct`.
-        path: of the artefact.
-        platforms: what it may run on: cpu, cuda, rocm, tpu.
-        overwrite: replace an artefact and its note that exist.
+        function: a function of arrays with its parameters closed over.
+        examples: one example per argument: an array, a number, or a `jax.ShapeDtypeStruct`.
+        path: path of the artefact; must end in .stablehlo.
+        platforms: platforms to lower for: cpu, cuda, rocm, tpu.
+        overwrite: replace an existing artefact and its note.
 
     Raises:
-        InputError: another ending, a file that exists, the folder of a run, an example that is no array, a platform
-            that JAX does not know, or no `flatbuffers`.
+        InputError: the ending is wrong, the file exists, the folder belongs to a run, an example is not an array, JAX
+            does not know a platform, or `flatbuffers` is missing.
     """
     path = Path(path)
     if path.suffix != SUFFIX:
@@ -62,17 +62,17 @@ def export_dynamics(
     platforms: Sequence[str] = ("cpu",),
     overwrite: bool = False,
 ) -> list[Path]:
-    """Artefacts inverse_dynamics, forward_dynamics, energy and mass_matrix of a model, as far as it has them.
+    """Writes the inverse_dynamics, forward_dynamics, energy and mass_matrix that a model has, and returns the paths.
 
     Args:
-        dynamics: of one state, for instance `load(folder).dynamics`.
+        dynamics: functions of one state, such as `load(folder).dynamics`.
         degrees_of_freedom: d.
-        directory: is created where it is missing; all artefacts are written, or none.
-        dtype: of the arguments; float64 needs `jax_enable_x64`.
-        platforms, overwrite: as `export_stablehlo`.
+        directory: folder of the artefacts, created if missing; all are written, or none.
+        dtype: dtype of the arguments; float64 needs `jax_enable_x64`.
+        platforms, overwrite: as for `export_stablehlo`.
 
     Raises:
-        InputError: as `export_stablehlo`, or degrees of freedom that are no count.
+        InputError: as for `export_stablehlo`, or `degrees_of_freedom` is not a positive integer.
     """
     if type(degrees_of_freedom) is not int or degrees_of_freedom < 1:
         raise InputError(f"degrees_of_freedom is {degrees_of_freedom!r}; expected a whole number from 1")
@@ -87,11 +87,11 @@ def export_dynamics(
 
 
 def load_stablehlo(path: str | Path) -> Callable[..., Any]:
-    """The function of an artefact, jitted; it takes arrays, or lists of numbers, of the exported shapes, and no others.
+    """Returns the jitted function of an artefact, which takes arrays or lists of numbers of the exported shapes.
 
     Raises:
-        InputError: no such file, no note beside it, one that is altered, too old, for other platforms, or in double
-            precision while JAX computes in single, or no `flatbuffers`.
+        InputError: the file or its note is missing, altered, too old or for other platforms, the artefact is in double
+            precision while JAX computes in single, or `flatbuffers` is missing.
     """
     path = Path(path)
     if path.suffix != SUFFIX or not path.is_file():
@@ -100,24 +100,24 @@ def load_stablehlo(path: str | Path) -> Callable[..., Any]:
     data = read_export(note_of(path), (path.name,))[1][path.name]
     try:
         exported = export.deserialize(bytearray(data))
-    except Exception as error:  # the reader's exceptions are those of flatbuffers and of struct, and of no one class
+    except Exception as error:  # flatbuffers and struct raise exceptions without a common class
         raise InputError(f"{path}: no artefact that JAX {jax.__version__} can read; export it again") from error
     # A GPU is "gpu" as a backend, and "cuda" or "rocm" as a platform.
     platform, platforms = export.default_export_platform(), ", ".join(exported.platforms)
     if platform not in exported.platforms:
         raise InputError(f"{path} is for {platforms}, and JAX runs on {platform}; export it with that platform")
-    if any(each.dtype == "float64" for each in exported.in_avals):
+    if any(in_aval.dtype == "float64" for in_aval in exported.in_avals):
         require_double_precision(str(path))
     return _refusing(path, exported)
 
 
 def note_of(path: Path) -> Path:
-    """Path of the note beside an artefact."""
+    """Returns the path of the note beside an artefact."""
     return path.with_suffix(".json")
 
 
 def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
-    """The function, jitted; arguments that are arrays are converted to the exported types, other shapes refused."""
+    """Returns the jitted function; it converts arguments to the exported dtypes and refuses other shapes."""
     wanted = exported.in_avals
     plain = exported.in_tree == jax.tree.structure(((0,) * len(wanted), {}))
 
@@ -125,11 +125,11 @@ def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
         try:
             array = jnp.asarray(argument, like.dtype)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{name} makes no array; expected {like}") from error
+            raise InputError(f"{name} is not an array; expected {like}") from error
         require_shape(name, array.shape, like.shape)
         return array
 
-    # What is refused is refused where JAX traces, that is once for each shape and type.
+    # The checks run while JAX traces, so once for every shape and dtype.
     @jax.jit
     def call(*arguments):
         if plain and len(arguments) == len(wanted):
@@ -138,7 +138,7 @@ def _refusing(path: Path, exported: export.Exported) -> Callable[..., Any]:
         try:
             return exported.call(*arguments)
         except (ValueError, TypeError) as error:
-            got = ", ".join(str(getattr(each, "aval", type(each).__name__)) for each in arguments)
+            got = ", ".join(str(getattr(argument, "aval", type(argument).__name__)) for argument in arguments)
             raise InputError(f"{path} takes ({', '.join(map(str, wanted))}), got ({got})") from error
 
     return call
@@ -152,7 +152,7 @@ def _require_flatbuffers() -> None:
 def _artefact(
     name: str, function: Callable[..., Any], examples: Sequence[Any], platforms: Sequence[str]
 ) -> dict[str, bytes]:
-    """The artefact and its note, by file name."""
+    """Returns the bytes of the artefact and of its note, by file name."""
     _require_flatbuffers()
     if isinstance(platforms, str) or not platforms or not set(platforms) <= set(PLATFORMS):
         raise InputError(f"platforms is {platforms!r}; expected a tuple of {', '.join(PLATFORMS)}")
@@ -173,7 +173,7 @@ def _artefact(
 def _shape_of(number: int, example: Any) -> jax.ShapeDtypeStruct:
     known = (jax.ShapeDtypeStruct, jax.Array, np.ndarray, np.generic, int, float, complex)
     try:
-        # The type that JAX computes in; a list is none, though JAX would take it for several arguments.
+        # The dtype in which JAX computes. Lists are refused: JAX would treat one as several arguments.
         dtype = jnp.result_type(example) if isinstance(example, known) else None
     except TypeError:
         dtype = None

@@ -1,4 +1,4 @@
-"""The devices that JAX computes on: which they are, what float64 costs there, and a platform that cannot be had."""
+"""Describes the devices that JAX computes on: their kind, the cost of float64, and platforms that are unavailable."""
 
 import statistics
 import time
@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 
 _ROWS = 2048
-"""Of the matrices whose product is timed: 17 GFlop, which fills any device."""
+"""Size of the square matrices whose product is timed: 17 GFlop, enough to fill any device."""
 _REPETITIONS = 5
 _DEAR = 4.0
-"""From this cost of float64 on, in units of float32, a user is told what it is needed for."""
+"""Cost of float64, relative to float32, from which a user is advised to consider float32."""
 
 
 def unusable_platform() -> str | None:
-    """What is wrong with the platforms that a user asks JAX for, if they cannot be had here."""
+    """Returns a message if JAX cannot start the platforms that the user asks for, else None."""
     wanted = getattr(jax.config, "jax_platforms")  # noqa: B009  JAX adds its settings as it starts
     try:
         jax.devices()
-    except (RuntimeError, AssertionError):  # of a platform that JAX knows and has no library for, the latter
+    except (RuntimeError, AssertionError):  # AssertionError: JAX knows the platform but has no library for it
         return (
             f"JAX cannot start '{wanted}' here, which JAX_PLATFORMS asks for; leave it unset for what there is, "
             "or install JAX for it (pip install 'jax[cuda12]' for NVIDIA)"
@@ -27,7 +27,7 @@ def unusable_platform() -> str | None:
 
 
 def device_line() -> str:
-    """How many devices of which kind this process computes on, such as "1 gpu (NVIDIA H200)"."""
+    """Returns the number and kind of this process's devices, such as "1 gpu (NVIDIA H200)"."""
     devices = jax.local_devices()
     kinds = sorted({device.device_kind for device in devices})
     platform = devices[0].platform
@@ -36,15 +36,15 @@ def device_line() -> str:
 
 
 def double_precision_cost() -> float:
-    """Seconds of a matrix product in float64 over those in float32, on the first device.
+    """Measures the time of a float64 matrix product relative to float32, on the first device, in about a second.
 
-    1 to 2 on processors and on GPUs for computing centres; 32 or 64 on those for graphics. Takes about a second.
+    Typical values are 1 to 2 on CPUs and data-centre GPUs, and 32 or 64 on graphics cards.
     """
     seconds = {}
     with jax.enable_x64(True):
         for dtype in (jnp.float32, jnp.float64):
             square = jnp.ones((_ROWS, _ROWS), dtype) / _ROWS
-            # float32 as the library computes it, and not in fewer bits on units for that.
+            # "highest" keeps float32 from being computed in fewer bits on tensor cores.
             product = jax.jit(lambda x: jnp.matmul(x, x, precision="highest")).lower(square).compile()
             jax.block_until_ready(product(square))
             times = []
@@ -57,7 +57,7 @@ def double_precision_cost() -> float:
 
 
 def device_lines(precision: str) -> list[str]:
-    """What a training in a precision should say of the device; nothing on a CPU."""
+    """Returns the lines that a training prints about its device; none on a CPU."""
     if jax.default_backend() == "cpu":
         return []
     advice = precision_advice(precision, double_precision_cost()) if precision == "f64" else None
@@ -65,7 +65,7 @@ def device_lines(precision: str) -> list[str]:
 
 
 def precision_advice(precision: str, cost: float) -> str | None:
-    """What a user should know who computes in a precision ("f32", "f64") where float64 has such a cost."""
+    """Returns advice on the precision ("f32", "f64") for this cost of float64, or None if there is none."""
     if precision != "f64" or cost < _DEAR:
         return None
     return (

@@ -1,4 +1,4 @@
-"""Processes meet at the coordinator's port before JAX joins them, and compare what they were started with."""
+"""Lets processes compare options and versions at the coordinator's port before JAX connects them."""
 
 import importlib.metadata
 import json
@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 from dln_jax.types import InputError
 
 RECORD_BYTES = 2**16
-"""At most, of the options and versions of one process."""
+"""Largest size of the options and versions that a process sends."""
 REMEDY = "start the same command once for each --process-id"
 
 
 class Membership(NamedTuple):
-    """How a process joins others; where all is `None`, JAX reads it from the cluster's variables."""
+    """How a process joins others; if all fields are `None`, JAX reads them from the cluster's variables."""
 
     processes: int | None = None
     coordinator: str | None = None
@@ -26,7 +26,7 @@ class Membership(NamedTuple):
 
 
 def address(coordinator: str) -> tuple[str, int]:
-    """Host and port; an IPv6 address stands in brackets.
+    """Returns the host and port of a coordinator; an IPv6 address stands in brackets.
 
     Raises:
         InputError: the text is no host:port.
@@ -38,23 +38,23 @@ def address(coordinator: str) -> tuple[str, int]:
 
 
 def meet(member: Membership, options: Mapping[str, Any], seconds: int) -> None:
-    """Waits until all processes are there and have the same options and versions.
+    """Waits until all processes have arrived with the same options and versions.
 
-    Process 0 listens at the coordinator's port, which it leaves to JAX afterwards; the others report to it.
+    Process 0 listens at the coordinator's port, which JAX uses afterwards; the others report to it.
 
     Raises:
-        InputError: in all processes: one does not come, two differ, or the port is taken or out of reach.
+        InputError: a process is missing, two differ, or the port is taken or unreachable. All processes raise it.
     """
     packages = {name: importlib.metadata.version(name) for name in ("dln-jax", "jax", "jaxlib")}
     record = {"Python": platform.python_version(), **packages, "--processes": member.processes, **options}
-    record = json.loads(json.dumps(record))  # as the others' come over the line
+    record = json.loads(json.dumps(record))  # the same types as records that were received
     until = time.monotonic() + seconds
     if reason := _report(member, record, until) if member.process else _gather(member, record, until):
         raise InputError(reason)
 
 
 def _gather(member: Membership, record: Mapping[str, Any], until: float) -> str:
-    """What process 0 finds wrong, and tells the others; empty if nothing is."""
+    """Runs process 0's side: returns the reason for a refusal, and sends it to the others; empty if there is none."""
     port = address(member.coordinator or "")[1]
     family = {"family": socket.AF_INET6, "dualstack_ipv6": True} if socket.has_dualstack_ipv6() else {}
     try:
@@ -74,7 +74,7 @@ def _gather(member: Membership, record: Mapping[str, Any], until: float) -> str:
             except TimeoutError:
                 reason = f"processes {sorted(expected - peers.keys())} of {member.processes} did not come; {REMEDY}"
                 break
-            except (OSError, ValueError, TypeError):  # somebody else has called
+            except (OSError, ValueError, TypeError):  # not one of our processes
                 continue
             reason = f"--process-id {process} is given twice; {REMEDY}" if process in peers else ""
             reason = reason or _difference(record, other, process)
@@ -86,7 +86,7 @@ def _gather(member: Membership, record: Mapping[str, Any], until: float) -> str:
 
 
 def _report(member: Membership, record: Mapping[str, Any], until: float) -> str:
-    """What process 0 has found wrong."""
+    """Reports to process 0, and returns its reason for a refusal; empty if there is none."""
     where = address(member.coordinator or "")
     while True:
         try:
@@ -105,7 +105,7 @@ def _line(peer: socket.socket) -> bytes:
 
 
 def _difference(record: Mapping[str, Any], other: Mapping[str, Any], process: int) -> str:
-    """The first entry in which a process differs from process 0; empty if none does."""
+    """Returns the first difference between a process and process 0; empty if there is none."""
     for name in sorted({*record, *other}):
         if record.get(name) != other.get(name):
             values = f"{record.get(name)!r:.60} in process 0 and {other.get(name)!r:.60} in process {process}"

@@ -1,10 +1,10 @@
-"""Batches split over the devices of one process, or of all.
+"""Splits batches over the devices of one process or of all processes.
 
-A mesh has one axis. What is shared, such as parameters, lies whole on every device; a batch is split along axis 0, and
-each device works at its share. `spread` brings the results together again, in the order of the batch, so that what is
-done with them afterwards is the same program on any number of devices; `summed` adds them up, whose order, and so the
-rounding, depends on their number. A function of `on_devices` does that itself, wherever it needs to: by `total`,
-`mean` and `first`. Where there is no mesh (`None`), all are the function or the arrays themselves.
+A mesh has one axis. Shared arrays, such as parameters, are replicated on every device; a batch is split along axis 0,
+and a device computes its share. `spread` gathers the results in the order of the batch, so that the rest of a program
+does not depend on the number of devices. `summed` adds the results up, in an order, and so with a rounding, that
+depends on the number of devices. A function in `on_devices` calls the collectives `total`, `mean` and `first` itself.
+Without a mesh (`None`), all of these return the function or the arrays unchanged.
 """
 
 import functools
@@ -25,17 +25,17 @@ AXIS = "batch"
 SPLIT, WHOLE = PartitionSpec(AXIS), PartitionSpec()
 
 OfBatch = Callable[[Any, Any], Any]
-"""(what is shared, a batch on axis 0 of every leaf) -> results."""
+"""(shared arrays, batch on axis 0 of every leaf) -> results."""
 
 
 def batch_mesh(devices: int | None = None) -> Mesh | None:
-    """The devices that share batches, `None` where that is one alone.
+    """Returns the mesh of the devices that share batches, or `None` for a single device.
 
     Args:
-        devices: how many of every process (default: all that JAX sees).
+        devices: number of devices of every process; default: all that JAX sees.
 
     Raises:
-        InputError: a process has fewer.
+        InputError: a process has fewer devices.
     """
     local = jax.local_device_count()
     count = local if devices is None else devices
@@ -47,10 +47,10 @@ def batch_mesh(devices: int | None = None) -> Mesh | None:
 
 
 def shares(mesh: Mesh | None, count: int, what: str) -> int:
-    """How many of `count` each device has.
+    """Returns the number of items per device.
 
     Raises:
-        InputError: they cannot be divided; `what` names them, in the plural.
+        InputError: the number of devices does not divide `count`; `what` names the items, in the plural.
     """
     devices = 1 if mesh is None else mesh.size
     if count % devices:
@@ -60,10 +60,10 @@ def shares(mesh: Mesh | None, count: int, what: str) -> int:
 
 
 def shard(tree: Any, mesh: Mesh | None) -> Any:
-    """Arrays split along axis 0; every process gives the same whole ones, and keeps its part.
+    """Splits arrays along axis 0; all processes pass the same whole arrays, and keep their part.
 
     Raises:
-        InputError: the mesh does not divide an axis.
+        InputError: the number of devices does not divide the length of an array.
     """
     if mesh is None:
         return tree
@@ -73,12 +73,12 @@ def shard(tree: Any, mesh: Mesh | None) -> Any:
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:
-    """Arrays that lie whole on every device; every process gives the same."""
+    """Replicates arrays on every device; all processes pass the same arrays."""
     return tree if mesh is None else _placed(tree, NamedSharding(mesh, WHOLE))
 
 
 def gathered(tree: Any) -> Any:
-    """The same arrays, whole and readable in every process."""
+    """Returns the whole arrays, readable in every process."""
 
     def whole(leaf: Any) -> Any:
         split = isinstance(leaf, jax.Array) and not (leaf.is_fully_addressable or leaf.is_fully_replicated)
@@ -90,33 +90,33 @@ def gathered(tree: Any) -> Any:
 
 
 def program(function: Callable[..., Any], mesh: Mesh | None, **options: Any) -> Any:
-    """`jax.jit` of a function whose arguments and results lie whole on every device of the mesh.
+    """Applies `jax.jit` to a function whose arguments and results are replicated on every device of the mesh.
 
-    Arguments may be arrays of this process alone, if every process gives the same. `options` are those of `jax.jit`.
+    Arguments may be local arrays if all processes pass the same. `options` are passed to `jax.jit`.
     """
     whole = {} if mesh is None else dict.fromkeys(("in_shardings", "out_shardings"), NamedSharding(mesh, WHOLE))
     return jax.jit(function, **whole, **options)
 
 
 def local(tree: Any, mesh: Mesh | None) -> Any:
-    """Copies of arrays that lie whole on every device, on this process's first device alone."""
+    """Copies replicated arrays to the first device of this process."""
     return tree if mesh is None else jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
 
 
 def of_first_process(value: bool | float, mesh: Mesh | None) -> bool | float:
-    """A number that processes may see differently, such as a time, as the first one sees it."""
+    """Returns process 0's value of a number that may differ between processes, such as a time."""
     if mesh is None:
         return value
-    # Through the connections of all devices together, which are there: others would have to be made, at one time.
+    # A gather over all devices reuses their connections; a broadcast would have to make others.
     return type(value)(np.asarray(gathered(shard(np.full(mesh.size, value), mesh)))[0])
 
 
 def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """The same function, each device on its share of the batch; every device has all results.
+    """Returns the function with the batch split over the devices; all devices get all results.
 
-    The function treats the samples of a batch as strangers, as `vmap` does: a batch that the mesh does not divide is
-    filled up with its first sample, whose results are dropped. Differentiable in forward mode; take reverse mode inside
-    of it.
+    The function must treat samples independently, as `vmap` does: a batch that the number of devices does not divide is
+    padded with its first sample, whose results are dropped. The result is differentiable in forward mode; take
+    reverse-mode derivatives inside the function.
     """
     if mesh is None:
         return function
@@ -137,43 +137,44 @@ def spread(function: OfBatch, mesh: Mesh | None) -> OfBatch:
 
 
 def summed(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """A function whose results are sums over the batch, each device on its share; every device has the whole sums.
+    """Returns the function, whose results are sums over the batch, with the batch split over the devices.
 
-    The mesh divides the batch. Take derivatives inside of it.
+    All devices get the whole sums. The number of devices must divide the batch. Take derivatives inside the function.
     """
     return on_devices(lambda shared, batch: total(function(shared, batch), mesh), mesh)
 
 
 def on_devices(function: OfBatch, mesh: Mesh | None) -> OfBatch:
-    """A function that each device works out on its share, and that gives the same on all by `total`, `mean` or `first`.
+    """Runs a function on every device's share; by `total`, `mean` or `first` it must return the same on all devices.
 
-    The mesh divides the batch. Where loops or branches bring anything together, their conditions must agree.
+    The number of devices must divide the batch. Loops and branches that contain collectives need conditions that are
+    equal on all devices.
     """
     if mesh is None:
         return function
-    # Loops of different length on each device have no types in common over the mesh: what varies is not checked.
+    # check_vma would reject loops whose length differs between devices.
     return jax.shard_map(
         _with_empty_arrays_made_inside(function), mesh=mesh, in_specs=(WHOLE, SPLIT), out_specs=WHOLE, check_vma=False
     )
 
 
 def total(tree: Any, mesh: Mesh | None) -> Any:
-    """Within a function of `on_devices`: the sum over devices."""
+    """Returns the sum over devices, within a function of `on_devices`."""
     return tree if mesh is None else lax.psum(tree, AXIS)
 
 
 def mean(tree: Any, mesh: Mesh | None) -> Any:
-    """Within a function of `on_devices`: the mean over devices."""
+    """Returns the mean over devices, within a function of `on_devices`."""
     return tree if mesh is None else lax.pmean(tree, AXIS)
 
 
 def first(tree: Any, mesh: Mesh | None) -> Any:
-    """Within a function of `on_devices`: what the first device has; others may have rounded otherwise."""
+    """Returns the first device's values, within a function of `on_devices`; other devices may round differently."""
     return tree if mesh is None else jax.tree.map(lambda leaf: lax.all_gather(leaf, AXIS)[0], tree)
 
 
 def share(array: jax.Array, mesh: Mesh | None, *, axis: int) -> jax.Array:
-    """Within a function of `on_devices`: this device's part of an array that is whole, along an axis."""
+    """Returns this device's part of a replicated array along an axis, within a function of `on_devices`."""
     if mesh is None:
         return array
     size = array.shape[axis] // mesh.size
@@ -186,17 +187,17 @@ def _gathering(mesh: Mesh) -> Callable[[jax.Array], jax.Array]:
 
 
 def _with_empty_arrays_made_inside(function: OfBatch) -> OfBatch:
-    """The same function, which reads no array without elements from outside: neither an argument nor a constant.
+    """Returns the function with its empty arguments and constants created inside.
 
-    XLA of jaxlib 0.11.2 removes such an input of a `shard_map` and crashes on those that are left (docs/scale.md).
+    XLA of jaxlib 0.11.2 removes empty inputs of a `shard_map` and crashes on the remaining ones (docs/scale.md).
     """
 
     def on_one(shared: Any, batch: Any) -> Any:
-        given = _made_if_empty((shared, batch))
-        # Tracing brings to light what the function has closed over, in its loops too.
-        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*given)
+        arguments = _made_if_empty((shared, batch))
+        # Tracing finds the constants that the function closes over, also in its loops.
+        traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         closed = core.ClosedJaxpr(traced.jaxpr, _made_if_empty(traced.consts))
-        return jax.tree.unflatten(jax.tree.structure(shapes), core.jaxpr_as_fun(closed)(*jax.tree.leaves(given)))
+        return jax.tree.unflatten(jax.tree.structure(shapes), core.jaxpr_as_fun(closed)(*jax.tree.leaves(arguments)))
 
     return on_one
 

@@ -1,4 +1,4 @@
-"""One program in several processes, which `jax.distributed` connects, watches and ends when one of them is lost."""
+"""One program in several processes: `jax.distributed` connects them, and ends them when one is lost."""
 
 import contextlib
 import os
@@ -13,22 +13,22 @@ from dln_jax.scale.meeting import Membership, address, meet
 from dln_jax.types import InputError
 
 HEARTBEAT = 10
-"""s without a heartbeat after which JAX takes a process for lost and ends the others."""
+"""Seconds without a heartbeat after which JAX treats a process as lost and ends the others."""
 SHUTDOWN = 300
-"""s for all processes to be done, of which the first may still write its figures."""
+"""Seconds that the processes may take to shut down; process 0 may still write its figures."""
 JOINING = 120
-"""s for all processes to be started."""
+"""Seconds within which all processes must have started."""
 _TASKS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
-"""Variables in which `srun` and `mpirun` state how many processes they have started."""
+"""Environment variables in which `srun` and `mpirun` state the number of their processes."""
 _OF_PEERS = re.compile(r"gloo|nccl|coordination|unavailable|deadline_exceeded", re.IGNORECASE)
 
 
 class ProcessLost(Exception):
-    """Another process of the program is gone, or this one has lost the connection to it."""
+    """Another process of the program ended, or the connection to it was lost."""
 
 
 def host_devices(count: int | None) -> None:
-    """Makes a processor so many devices, if a number is given and JAX has not yet been used.
+    """Splits the CPU into `count` JAX devices, unless it is None or JAX has already been used.
 
     Raises:
         InputError: the number is not positive.
@@ -37,28 +37,28 @@ def host_devices(count: int | None) -> None:
         return
     if count < 1:
         raise InputError(f"--devices is {count}; expected a positive whole number")
-    with contextlib.suppress(RuntimeError):  # it has been used: `batch_mesh` says how many there are
+    with contextlib.suppress(RuntimeError):  # already used; `batch_mesh` reports the number of devices
         jax.config.update("jax_num_cpu_devices", count)
 
 
 def process_key(key: Array) -> Array:
-    """A random key of this process's own, from one that all have."""
+    """Returns a random key for this process, from one that all processes share."""
     return jax.random.fold_in(key, jax.process_index())
 
 
 def membership(
     processes: int | None, coordinator: str | None, process: int | None, environ: Mapping[str, str] = os.environ
 ) -> Membership | None:
-    """How this process joins others, `None` if it is alone.
+    """Returns how this process joins others, or `None` for a single process.
 
     Args:
-        processes: how many; 1 is alone, also as one of a cluster's tasks.
+        processes: number of processes; 1 means a single process, also within a cluster's step.
         coordinator: host:port of process 0.
-        process: which one this is, from 0.
-        environ: where `srun` and `mpirun` state their tasks, which counts if nothing else is given.
+        process: index of this process, from 0.
+        environ: environment with the variables of `srun` or `mpirun`, read if all other arguments are None.
 
     Raises:
-        InputError: a part is missing, or out of range.
+        InputError: an argument is missing or out of range.
     """
     options = {"--processes": processes, "--coordinator": coordinator, "--process-id": process}
     absent = [option for option, value in options.items() if value is None]
@@ -80,21 +80,21 @@ def membership(
 
 
 def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINING) -> None:
-    """Makes this process part of the program; JAX must not have been used before.
+    """Connects this process to the others; JAX must not have been used before.
 
     Args:
-        member: which one it is.
-        options: those that decide the result, JSON values by name, which must be the same in all processes.
-        seconds: for all to be started.
+        member: how this process joins.
+        options: JSON values by name that decide the result; they must be equal in all processes.
+        seconds: time within which all processes must have started.
 
     Raises:
-        InputError: JAX has been used, the coordinator cannot be reached, a process does not come, or they differ.
+        InputError: JAX has been used, the coordinator is unreachable, a process is missing, or two differ.
     """
     require_unused()
     if member.coordinator is not None:
-        # JAX would abort, with a trace of C++, where a process does not come or a port is taken.
+        # Without this, JAX aborts with a C++ trace if a process is missing or the port is taken.
         meet(member, options, seconds)
-    # JAX's own handling of SIGTERM would keep a process alive that is told to end.
+    # JAX's handler of SIGTERM would keep a process alive that is asked to end.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
@@ -113,7 +113,7 @@ def join(member: Membership, options: Mapping[str, Any], *, seconds: int = JOINI
 
 
 def require_unused() -> None:
-    """Raises `InputError` if JAX has been used: it then refuses another number of devices."""
+    """Raises `InputError` if JAX has been used, which shows in its refusal of another number of devices."""
     devices = jax.config.values["jax_num_cpu_devices"]
     try:
         jax.config.update("jax_num_cpu_devices", devices + 1)
@@ -124,7 +124,7 @@ def require_unused() -> None:
 
 @contextlib.contextmanager
 def losses_named(remedy: str) -> Iterator[None]:
-    """Turns the error of a collective whose peer is gone into a `ProcessLost` that ends with a remedy."""
+    """Turns the error of a collective whose peer is lost into a `ProcessLost` that ends with a remedy."""
     try:
         yield
     except (RuntimeError, ValueError) as error:

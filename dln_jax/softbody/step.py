@@ -125,7 +125,7 @@ def make_step(
     if not isinstance(dt, Tracer):
         require_positive(dt=dt)
     free = scene.free
-    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], written_out=True), *element_energies(scene))
+    energies = (ElementEnergy(_inertia, np.arange(len(free))[:, None], unrolled=True), *element_energies(scene))
     at = pattern(energies, free.shape[0], free.shape[1], free)
     overlaps = count_overlaps(scene.mesh)
     rest, masses = scene.params.rest, scene.params.masses

@@ -2,14 +2,13 @@
 
     minimise f(x) subject to g(x) <= 0
 
-With multipliers mu >= 0 and a penalty rho, each round minimises
+With multipliers mu >= 0 and a penalty rho, a round minimises
 
     f(x) + sum over i of (max(0, mu_i + rho g_i(x))² - mu_i²) / (2 rho)
 
-without constraints, then takes mu <- max(0, mu + rho g) (Powell, Hestenes, Rockafellar; Nocedal and Wright 2006,
-"Numerical Optimization", section 17.4). The penalty grows where a round has not divided the violation by four. Inside
-a round it is L-BFGS (SciPy). What is returned may break a constraint by about `tolerance`: it is for the caller to
-check, who knows what a constraint is.
+without constraints by L-BFGS (SciPy), then sets mu <- max(0, mu + rho g) (Powell, Hestenes, Rockafellar; Nocedal and
+Wright 2006, "Numerical Optimization", section 17.4). The penalty grows after a round that has not divided the violation
+by four. The solution may violate a constraint by about `tolerance`, which the caller must check.
 """
 
 from collections.abc import Callable
@@ -29,18 +28,18 @@ Constrained = Callable[..., tuple[Array, Array]]
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended."""
+    """Result of a minimisation."""
 
     x: np.ndarray
     """[n]."""
     value: float
     """f."""
     violation: float
-    """Largest g, 0 if none is positive."""
+    """Largest positive g, or 0."""
     rounds: int
-    """Done."""
+    """Number of rounds."""
     converged: bool
-    """Whether no constraint is broken by more than the tolerance and the value has settled."""
+    """Whether all constraints hold within the tolerance and the value has settled."""
 
 
 def make_minimiser(
@@ -52,19 +51,19 @@ def make_minimiser(
     growth: float = 5.0,
     tolerance: float = 1e-3,
 ) -> Callable[..., Minimum]:
-    """(x0, *arguments) -> `Minimum`, compiled once for all starts and arguments of the same shapes.
+    """Returns a function (x0, *arguments) -> `Minimum`, compiled once for all starts and arguments of the same shapes.
 
     Args:
-        function: f and g.
-        rounds: at most; it ends earlier where x neither breaks a constraint by more than `tolerance`, nor has f fallen
-            by more than 1e-3 of its size.
-        iterations: of L-BFGS in a round, at most.
-        penalty: rho of the first round; f and g are best of order one.
-        growth: of rho.
-        tolerance: of g.
+        function: returns f and g.
+        rounds: largest number of rounds; the last is earlier if x satisfies the constraints within `tolerance` and f
+            has changed by at most 1e-3 of its size.
+        iterations: largest number of L-BFGS iterations in a round.
+        penalty: rho of the first round; f and g should be of order one.
+        growth: factor on rho.
+        tolerance: largest accepted g.
 
     Raises:
-        InputError: a setting that is not positive, and from the result a start at which f is not finite.
+        InputError: a setting is not positive; from the returned function, f is not finite at the start.
     """
     require_positive(rounds=rounds, iterations=iterations, penalty=penalty, growth=growth, tolerance=tolerance)
     require_double_precision("an augmented Lagrangian")
@@ -91,7 +90,7 @@ def make_minimiser(
             if done == 1 and not np.isfinite(objective(x)[0]):
                 raise InputError("the function to minimise is not finite at the start; choose another")
             x = minimize(objective, x, jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 20}).x
-            value, constraints = (np.asarray(each) for each in evaluate(x, multipliers, rho, *arguments)[0][1])
+            value, constraints = (np.asarray(number) for number in evaluate(x, multipliers, rho, *arguments)[0][1])
             violation = float(np.max(constraints, initial=0.0))
             settled = violation <= tolerance and abs(before - value) <= 1e-3 * max(1.0, abs(float(value)))
             if settled:

@@ -1,12 +1,12 @@
 """Many symmetric positive definite systems with narrow bands, side by side: A x = b by Cholesky, A = L Lᵀ.
 
-A few hundred operations per unknown are too few for a library call each. Here every number is a vector over the
-systems, the last axis, so that a loop over the columns is a loop over long vectors. Unknowns go in pairs:
+A few hundred operations per unknown are too few for one library call per system. Here every number is a vector over
+the systems, the last axis, so that a loop over the columns works on long vectors. Unknowns are taken in pairs:
 
     X_J = A_J - sum over P >= 1 of L_{J-P} (L_{J-P}'s pair at J)ᵀ,    L_JJ L_JJᵀ = X_JJ,    L_IJ = X_IJ L_JJ⁻ᵀ
 
-(left-looking; Golub and Van Loan 2013, sections 4.2 and 4.3). Right-hand sides are rows below the matrix: what the
-factorisation makes of them is L⁻¹ b.
+(left-looking; Golub and Van Loan 2013, sections 4.2 and 4.3). Right-hand sides are rows below the matrix, which the
+factorisation turns into L⁻¹ b.
 """
 
 import jax.numpy as jnp
@@ -15,18 +15,18 @@ from jax import lax
 from jaxtyping import Array, Float
 
 PAIR = 2
-"""Unknowns of a step of the loop: the fastest of 1 to 4, as measured on two cores with 4 to 64 systems."""
+"""Unknowns per step of the loop; the fastest of 1 to 4, measured on two cores with 4 to 64 systems."""
 
 Columns = Float[Array, "pairs rows 2 systems"]
 """Pairs of columns of the lower triangle: [J, r, c] is the entry (2 J + r, 2 J + c)."""
 
 
 def places(unknowns: int, band: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the entries [pairs, rows, 2] of `Columns`, which may lie beyond the matrix.
+    """Returns the rows and columns of the entries [pairs, rows, 2] of `Columns`, some of them beyond the matrix.
 
     Args:
         unknowns: n.
-        band: the largest i - j of an entry that is not zero.
+        band: largest i - j of a nonzero entry.
     """
     rows = PAIR * (1 + _pairs_below(band))
     first, row, column = np.ogrid[: _pairs(unknowns), :rows, :PAIR]
@@ -34,11 +34,11 @@ def places(unknowns: int, band: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_bands(lower: Columns, b: Float[Array, "unknowns k systems"]) -> Float[Array, "unknowns k systems"]:
-    """x with A x = b for each system; not finite where A is not positive definite.
+    """Returns x with A x = b for all systems; not finite for a matrix that is not positive definite.
 
     Args:
-        lower: of A, at `places`, where what is beyond the matrix is that of the unit matrix.
-        b: k right-hand sides of each.
+        lower: entries of A at `places`; those beyond the matrix equal the unit matrix.
+        b: k right-hand sides of every system.
     """
     count, rows, _, systems = lower.shape
     unknowns, k, _ = b.shape
@@ -65,18 +65,18 @@ def solve_bands(lower: Columns, b: Float[Array, "unknowns k systems"]) -> Float[
 
 
 def _eliminated(window: Float[Array, "pairs rows 2 systems"], rows: int) -> Float[Array, "rows 2 systems"]:
-    """The window's last pair of columns of L, the pairs before it being done; with 1 / L_jj on the diagonal."""
+    """Returns the window's last pair of columns of L from the pairs before it, with 1 / L_jj on the diagonal."""
     *before, own = window
     before = before[::-1]
 
     def without(start: int, stop: int, earlier: int) -> Array:
-        """Rows start:stop of the pair, less what the `earlier` pairs before it contribute."""
-        found = own[start:stop]
+        """Returns rows start:stop of the pair, minus the contributions of the `earlier` pairs before it."""
+        solution = own[start:stop]
         for distance, column in enumerate(before[:earlier], start=1):
             shift = PAIR * distance if stop <= rows else 0
             left, right = column[start + shift : stop + shift], column[PAIR * distance : PAIR * (distance + 1)]
-            found -= sum(left[:, None, i] * right[None, :, i] for i in range(PAIR))
-        return found
+            solution -= sum(left[:, None, i] * right[None, :, i] for i in range(PAIR))
+        return solution
 
     pairs = [without(row, row + PAIR, len(before) - row // PAIR) for row in range(0, rows, PAIR)]
     (first, _), (corner, second) = pairs[0]
@@ -93,7 +93,7 @@ def _eliminated(window: Float[Array, "pairs rows 2 systems"], rows: int) -> Floa
 def _substituted(
     column: Float[Array, "rows 2 systems"], known: Float[Array, "rows2 k systems"], rows: int
 ) -> Float[Array, "2 k systems"]:
-    """Two unknowns of Lᵀ x = y, those after them being known."""
+    """Returns two unknowns of Lᵀ x = y from the known ones after them."""
     panel = column[PAIR:rows]
     first, second = (column[rows:, i] - jnp.sum(panel[:, None, i] * known, axis=0) for i in range(PAIR))
     second *= column[1, 1]

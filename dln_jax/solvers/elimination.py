@@ -1,7 +1,7 @@
-"""Small linear systems, written out row by row: Gaussian elimination, and substitution with triangular matrices.
+"""Small linear systems, unrolled row by row: Gaussian elimination, and substitution with triangular matrices.
 
 The Hessians of learned energies need not be definite, so that Cholesky does not apply. The matrices of mechanics have a
-few rows and come in batches. Written out, they fuse with what surrounds them, which is faster than one library call per
+few rows and come in batches. Unrolled, they fuse with the surrounding code, which is faster than one library call per
 matrix up to a dozen rows.
 """
 
@@ -13,18 +13,18 @@ from jaxtyping import Array, Float
 
 from dln_jax.solvers import lapack
 
-# Beyond this size the library call is faster, and the written-out program slow to compile.
-_WRITTEN_OUT_ROWS = 16
+# For more rows the library call is faster, and the unrolled program slow to compile.
+_UNROLLED_ROWS = 16
 
 
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-    """x with A x = b, for b [n] or [n, k]. An exactly singular matrix gives non-finite values.
+    """Returns x with A x = b, for b [n] or [n, k]; not finite for an exactly singular matrix.
 
     Derivatives of every order are those of the solution (A dx = db - dA x), not of the elimination's steps.
     """
     if b.shape[0] == 1:
         return b / matrix[0]
-    if b.shape[0] > _WRITTEN_OUT_ROWS:
+    if b.shape[0] > _UNROLLED_ROWS:
         return lapack.solve(matrix, b)
     return jax.lax.custom_linear_solve(
         functools.partial(jnp.matmul, matrix),
@@ -56,8 +56,8 @@ def _eliminate(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Fl
 
 
 def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x [n] with L x = b, by forward substitution. A zero on the diagonal gives non-finite values."""
-    if b.shape[0] > _WRITTEN_OUT_ROWS:
+    """Returns x [n] with L x = b by forward substitution; not finite for a zero on the diagonal."""
+    if b.shape[0] > _UNROLLED_ROWS:
         lower = jnp.tril(factor)
         fixed = jax.lax.stop_gradient(lower)
         return jax.lax.custom_linear_solve(
@@ -76,6 +76,6 @@ def solve_lower(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Arr
 
 
 def solve_lower_transposed(factor: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x [n] with Lᵀ x = b, by back substitution. A zero on the diagonal gives non-finite values."""
+    """Returns x [n] with Lᵀ x = b by back substitution; not finite for a zero on the diagonal."""
     # Reversing both axes turns the upper triangle of Lᵀ into a lower one.
     return solve_lower(factor.T[::-1, ::-1], b[::-1])[::-1]

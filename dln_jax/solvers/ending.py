@@ -1,4 +1,4 @@
-"""Why an iteration ended: a number that can be traced, and the sentence that it stands for."""
+"""Reasons why an iteration ended: numbers that can be traced, and their sentences."""
 
 from enum import IntEnum
 from typing import Any
@@ -26,5 +26,5 @@ REASONS = {
 
 
 def reason(ending: Any) -> str:
-    """Returns the sentence for an `Ending`, given as such or as a computed array of one element."""
+    """Returns the sentence for an `Ending`, or for an array of one element that holds it."""
     return REASONS[Ending(int(np.asarray(ending)))]

@@ -1,9 +1,9 @@
-"""LAPACK's factorisations of one matrix, which under `vmap` take the matrices of a batch one after the other.
+"""LAPACK factorisations of one matrix, which under `vmap` on a CPU run one matrix after the other.
 
-On a processor, JAX hands a batch to a library call that splits it over the threads that also run the programs of other
-devices. Where those wait for each other, all wait for ever (seen with jaxlib 0.10.2: two devices of one process, or
-several batched calls in one program on two cores). Elsewhere, a batch is one call. Factors have no derivatives: callers
-know those of the solution.
+On a CPU, JAX passes a batch to a library call that splits it over the threads that also run the programs of other
+devices. If these programs wait for one another, all deadlock (seen with jaxlib 0.10.2: two devices of one process, or
+several batched calls in one program on two cores). On other platforms a batch is one call. Factors have no derivatives;
+callers supply the derivatives of the solution.
 """
 
 import functools
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function of arrays; under `vmap`, a processor loops over the batch."""
+    """Returns the function of arrays with a batching rule that loops over the batch on a CPU."""
 
     @jax.custom_batching.custom_vmap
     def of_one(*arguments: Array) -> Any:
@@ -29,15 +29,17 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     def of_many(_: int, batched: Sequence[bool], *arguments: Array) -> tuple[Any, Any]:
         def merged(call: Callable[..., Any], members: Sequence[Array]) -> Any:
             rest = iter(members)
-            return call(*(next(rest) if split else each for each, split in zip(arguments, batched, strict=True)))
+            return call(
+                *(next(rest) if split else argument for argument, split in zip(arguments, batched, strict=True))
+            )
 
         def in_turn(*members: Array) -> Any:
-            return lax.map(lambda each: merged(of_one, each), members)
+            return lax.map(lambda member: merged(of_one, member), members)
 
         def at_once(*members: Array) -> Any:
-            return jax.vmap(lambda *each: merged(function, each))(*members)
+            return jax.vmap(lambda *members: merged(function, members))(*members)
 
-        split = [each for each, split in zip(arguments, batched, strict=True) if split]
+        split = [argument for argument, split in zip(arguments, batched, strict=True) if split]
         results = lax.platform_dependent(*split, cpu=in_turn, default=at_once)
         return results, jax.tree.map(lambda _: True, results)
 
@@ -46,19 +48,19 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @one_by_one
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """L of A = L Lᵀ from the lower triangle of A; NaN where A is not positive definite."""
+    """Returns L with A = L Lᵀ from the lower triangle of A; NaN if A is not positive definite."""
     return batched_cholesky(matrix, symmetrize_input=False)
 
 
 @one_by_one
 def symmetric_eigen(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues, ascending, and eigenvectors (columns) of a symmetric matrix, from its lower triangle."""
+    """Returns the eigenvalues, ascending, and eigenvectors (columns) of a symmetric matrix, from its lower triangle."""
     vectors, values = eigh(matrix, lower=True, symmetrize_input=False)
     return values, vectors
 
 
 def solve(matrix: Float[Array, "n n"], b: Float[Array, "n *columns"]) -> Float[Array, "n *columns"]:
-    """x with A x = b, by LU factors of A; derivatives of every order are those of the solution."""
+    """Returns x with A x = b by LU factors of A; derivatives of every order are those of the solution."""
     factors = _lu_factors(lax.stop_gradient(matrix))
 
     def columns(one: Callable[..., Array], right: Array) -> Array:
@@ -94,7 +96,7 @@ def _solve_lu_transposed(factors: Array, permutation: Array, b: Array) -> Array:
 def substitute(
     factor: Float[Array, "n n"], b: Float[Array, "rows columns"], *, transposed: bool = False, right: bool = False
 ) -> Float[Array, "rows columns"]:
-    """x with L x = b, or Lᵀ x = b if `transposed`, for the lower triangle L of a matrix.
+    """Returns x with L x = b, or Lᵀ x = b if `transposed`, for the lower triangle L of a matrix.
 
     `right` puts the triangle on the right of x: x L = b, or x Lᵀ = b.
     """
@@ -110,9 +112,9 @@ def _substitution(transposed: bool, right: bool) -> Callable[[Array, Array], Arr
 def shared_or_batched(
     one: Callable[[Array, Array], Array], many: Callable[[Array, Array], Array], *, side: int = 1
 ) -> Callable[[Array, Array], Array]:
-    """The solve (matrix, b) -> x of `one`, which `many` does for a batch of both.
+    """Returns the solve (matrix, b) -> x of `one`, with a batching rule: `many` solves for a batch of matrices.
 
-    Where only b is a batch, it becomes columns (its axis `side`) of one b.
+    If only b is a batch, its members become columns (axis `side`) of one b.
     """
 
     @jax.custom_batching.custom_vmap

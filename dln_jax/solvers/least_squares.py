@@ -25,9 +25,9 @@ class Solution(NamedTuple):
     x: np.ndarray
     """[P]."""
     rank: int
-    """Singular values of the scaled columns that count; fewer than P: some combination of unknowns is undetermined."""
+    """Number of singular values above the tolerance; if below P, a combination of unknowns is undetermined."""
     condition: float
-    """Largest over smallest of them; infinite where none counts."""
+    """Ratio of the largest to the smallest of these singular values; infinite if there are none."""
     residual: float
     """|A x - b|."""
 
@@ -40,19 +40,19 @@ def solve(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> Solution:
-    """The x of least |A x - b|² + ridge |D x|², shortest in |D x| where several are.
+    """Returns the x that minimises |A x - b|² + ridge |D x|²; of several, the one with the smallest |D x|.
 
     Args:
-        A: coefficients; a column of zeros gets x = 0.
+        A: coefficients; a column of zeros has x = 0.
         b: right-hand side.
-        ridge: dimensionless; with orthogonal columns it divides each unknown by 1 + ridge.
+        ridge: dimensionless; with orthogonal columns it divides the unknowns by 1 + ridge.
         rank_tolerance: singular values below it, relative to the largest, count as zero; by default the rounding of
             the decomposition, 2.2e-16 max(N, P).
-        negligible: columns with norms up to it, relative to the largest, are zeros: what terms that cancel leave of
-            each other is rounding, and would count as much as any column once it is scaled.
+        negligible: columns with a norm up to this fraction of the largest count as zero: rounding that cancelling
+            terms leave would otherwise be scaled up to the size of the other columns.
 
     Raises:
-        InputError: numbers that are not finite, a negative ridge, a tolerance outside [0, 1).
+        InputError: numbers are not finite, the ridge is negative, or a tolerance is outside [0, 1).
     """
     A, b = np.asarray(A, np.float64), np.asarray(b, np.float64)
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
@@ -63,9 +63,9 @@ def solve(
         raise InputError(f"ridge is {ridge}; expected a number >= 0")
     if rank_tolerance is None:
         rank_tolerance = float(np.finfo(np.float64).eps * max(A.shape))
-    for name, given in (("rank_tolerance", rank_tolerance), ("negligible", negligible)):
-        if not 0 <= given < 1:
-            raise InputError(f"{name} is {given}; expected a number in [0, 1)")
+    for name, value in (("rank_tolerance", rank_tolerance), ("negligible", negligible)):
+        if not 0 <= value < 1:
+            raise InputError(f"{name} is {value}; expected a number in [0, 1)")
 
     norms = np.linalg.norm(A, axis=0)
     seen = norms > negligible * norms.max(initial=0.0)
@@ -93,9 +93,9 @@ def solve_chunks(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> Solution:
-    """`solve` for equations (A, b) that come in chunks of rows, of which only one is held at a time.
+    """Solves equations (A, b) that come in chunks of rows, holding one chunk at a time; arguments as for `solve`.
 
-    Each chunk is folded into one triangle, [triangle; A b] = Q R, which has the same solutions and residual.
+    The chunks are folded into one triangle, [triangle; A b] = Q R, which has the same solutions and residual.
     """
     triangle, rows = None, 0
     for A, b in chunks:
@@ -111,5 +111,5 @@ def solve_chunks(
 
 
 def triangular_factor(A: Float[np.ndarray, "N P"], b: Float[np.ndarray, " N"]) -> Float[np.ndarray, "K P_and_1"]:
-    """R [min(N, P + 1), P + 1] of the augmented matrix [A b] = Q R: |A x - b| = |R (x, -1)| for every x."""
+    """Returns R [min(N, P + 1), P + 1] of [A b] = Q R, for which |A x - b| = |R (x, -1)| for every x."""
     return np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))

@@ -18,8 +18,8 @@ Normal equations square the condition number of J. They are solved by Cholesky w
 working precision, else by eigenvalues (`normal_equations.factorise`), which the state counts as a fallback. All
 functions are pure; the caller compiles them.
 
-Devices of a mesh share the samples: each sums J Jᵀ, J r, J w and |r|² over its own, and all solve the same equations.
-The sums are brought together once in an iteration, P² / 2 numbers, and three times in a trial, P + 2.
+Devices of a mesh share the samples: a device sums J Jᵀ, J r, J w and |r|² over its samples, and all solve the same
+equations. The sums are reduced over devices once in an iteration (P² / 2 numbers) and three times in a trial (P + 2).
 """
 
 import enum
@@ -37,39 +37,39 @@ from dln_jax.solvers import normal_equations as equations
 from dln_jax.solvers.normal_equations import Chunks, SampleResidual
 
 Arrays = tuple[Any, ...]
-"""Samples on axis 0; `None` is handed on as it is."""
+"""Arrays with samples on axis 0; `None` is passed through."""
 FIRST_DAMPING = 1e-3
-"""Relative to the largest diagonal entry of the first A."""
-LEAST_DAMPING = 1e-16
-MOST_ACCELERATION = 0.75
-"""The largest |a| / |v| that is used; 0 leaves acceleration out."""
+"""Initial damping, relative to the largest diagonal entry of the first A."""
+LOWER_DAMPING = 1e-16
+UPPER_ACCELERATION = 0.75
+"""Largest |a| / |v| at which the acceleration is used; 0 disables it."""
 PROBE = 0.5
-"""h."""
+"""Step h of the difference that gives the second derivative along v."""
 CHUNK = 256
-"""Samples whose Jacobian is evaluated at once."""
+"""Number of samples whose Jacobian is evaluated at once."""
 KEPT_BYTES = 2**30
-"""A Jacobian that takes no more is kept through an iteration; else its product for the acceleration is evaluated by
-reverse mode. `normal_equations.jacobian_bytes` states the memory."""
+"""Largest Jacobian that is kept through an iteration; for a larger one, reverse mode gives its product for the
+acceleration. `normal_equations.jacobian_bytes` states the memory."""
 TRIALS = 16
 """Steps tried before an iteration gives up."""
 
 
 class Status(enum.IntEnum):
-    """Why an optimisation ended, or that it has not."""
+    """Whether an optimisation is running, or why it ended."""
 
     RUNNING = 0
     FLAT = 1
     """The gradient is zero."""
     IMPROVEMENT = 2
-    """An iteration improved as little as asked."""
+    """The relative improvement of an iteration fell to the requested limit."""
     STALLED = 3
-    """No damping lowers the loss any more: it is at its floor in this precision, or the derivatives are wrong."""
+    """No damping lowers the loss: it has reached the limit of the precision, or the derivatives are wrong."""
     NON_FINITE = 4
-    """The loss is not finite where an iteration starts, or in its last trial; the parameters are as they were."""
+    """The loss is not finite at the start or in the last trial of an iteration; the parameters are unchanged."""
 
 
-class State(NamedTuple):
-    """All that the next iteration depends on: arrays only, with a leading axis of seeds where there are several."""
+class LevenbergMarquardtState(NamedTuple):
+    """Everything that the next iteration depends on: arrays, with a leading axis for several seeds."""
 
     parameters: Any
     """Tree of float64 arrays."""
@@ -88,18 +88,18 @@ class State(NamedTuple):
     trials: Array
     """Steps tried so far."""
     fallbacks: Array
-    """Factorisations so far that Cholesky could not do."""
+    """Factorisations so far for which Cholesky failed."""
 
 
-def init(parameters: Any) -> State:
-    """The state before the first iteration; its arrays are copies, so that a caller may donate them.
+def init(parameters: Any) -> LevenbergMarquardtState:
+    """Returns the state before the first iteration; its arrays are copies, so that a caller may donate them.
 
     Raises:
-        InputError: parameters that are not float64.
+        InputError: the parameters are not float64.
     """
     equations.check_precision(parameters, "parameters")
     none = jnp.zeros((), int)
-    return State(
+    return LevenbergMarquardtState(
         parameters=jax.tree.map(jnp.array, parameters),
         iteration=none,
         status=jnp.full((), int(Status.RUNNING), int),
@@ -113,43 +113,48 @@ def init(parameters: Any) -> State:
 
 
 def run(
-    sample_residual: SampleResidual, state: State, arrays: Arrays, iterations: Any, *, improvement: float = 0.0
-) -> State:
-    """So many iterations, fewer where the status says so, or an iteration lowers F by no more than `improvement` F.
+    sample_residual: SampleResidual,
+    state: LevenbergMarquardtState,
+    arrays: Arrays,
+    iterations: Any,
+    *,
+    improvement: float = 0.0,
+) -> LevenbergMarquardtState:
+    """Runs `iterations` iterations, fewer if the status changes or one lowers F by no more than `improvement` F.
 
-    States with a leading axis of seeds are taken one after the other instead of all in lockstep: no seed repeats
-    another's failed trials, memory is that of one, and LAPACK is never called for a batch (see `solvers.lapack`).
+    States with a leading axis of seeds run one after the other and not in lockstep: no seed repeats the failed trials
+    of another, memory is that of one seed, and LAPACK is never called for a batch (see `solvers.lapack`).
 
     Raises:
-        InputError: parameters or residuals that are not float64, or arrays of different length.
+        InputError: parameters or residuals are not float64, or arrays differ in length.
     """
     chunks, samples = in_chunks(arrays), len(arrays[0])
     return run_on_chunks(sample_residual, state, chunks, iterations, samples=samples, improvement=improvement)
 
 
 def in_chunks(arrays: Arrays, mesh: Mesh | None = None) -> Chunks:
-    """Samples as `run_on_chunks` takes them, which `scale.mesh.shard` splits over the devices of the mesh.
+    """Returns the samples as chunks for `run_on_chunks`, which `scale.mesh.shard` splits over the devices.
 
     Raises:
-        InputError: arrays of different length.
+        InputError: arrays differ in length.
     """
     return equations.split(arrays, CHUNK, devices=1 if mesh is None else mesh.size)
 
 
 def run_on_chunks(
     sample_residual: SampleResidual,
-    state: State,
+    state: LevenbergMarquardtState,
     chunks: Chunks,
     iterations: Any,
     *,
     samples: int,
     improvement: float = 0.0,
     mesh: Mesh | None = None,
-) -> State:
-    """What `run` does for so many samples, by the devices of a mesh together, each with its chunks of them."""
+) -> LevenbergMarquardtState:
+    """Runs iterations as `run` does, with the chunks of samples shared by the devices of a mesh."""
 
     @jax.custom_batching.sequential_vmap
-    def run_one(state: State, chunks: Chunks, iterations: Array) -> State:
+    def run_one(state: LevenbergMarquardtState, chunks: Chunks, iterations: Array) -> LevenbergMarquardtState:
         end = state.iteration + iterations
         return lax.while_loop(
             lambda state: (state.status == Status.RUNNING) & (state.iteration < end),
@@ -157,10 +162,10 @@ def run_on_chunks(
             state,
         )
 
-    def on_one(shared: tuple[State, Array], chunks: Chunks) -> State:
+    def on_one(shared: tuple[LevenbergMarquardtState, Array], chunks: Chunks) -> LevenbergMarquardtState:
         state, iterations = shared
         over_seeds = jax.vmap(run_one, in_axes=(0, None, None)) if state.iteration.ndim else run_one
-        # Devices of other makes round the solution of the equations otherwise: all go on from the first one's.
+        # Different devices may round the solution differently, so all continue from the first device's.
         return first(over_seeds(state, chunks, iterations), mesh)
 
     return on_devices(on_one, mesh)((state, jnp.asarray(iterations)), chunks)
@@ -168,14 +173,14 @@ def run_on_chunks(
 
 def _iterate(
     sample_residual: SampleResidual,
-    state: State,
+    state: LevenbergMarquardtState,
     chunks: Chunks,
     samples: int,
     *,
     improvement: float,
     mesh: Mesh | None,
-) -> State:
-    """One iteration of one seed, whatever its status. Loops and branches depend on sums over all devices alone."""
+) -> LevenbergMarquardtState:
+    """Runs one iteration of one seed, whatever its status; loops and branches depend only on sums over all devices."""
     at = _linearise(sample_residual, state.parameters, chunks, samples, mesh)
     largest = jnp.where(state.iteration == 0, jnp.max(jnp.diagonal(at.matrix)), state.scale)
     finite = jnp.isfinite(at.loss) & jnp.all(jnp.isfinite(at.gradient))
@@ -184,7 +189,7 @@ def _iterate(
     start = _Trial(jnp.zeros_like(at.x), at.loss, no, state.damping, state.growth, none, none)
     last = lax.while_loop(
         lambda trial: finite & ~flat & ~trial.accepted & (trial.tried < TRIALS),
-        # Where no parameter has an effect the scale is zero: any positive number will do, for the step is zero.
+        # If no parameter has an effect, the scale is zero; any positive number serves, because the step is zero.
         lambda trial: _try(sample_residual, at, jnp.where(largest > 0, largest, 1.0), trial, mesh),
         start,
     )
@@ -194,7 +199,7 @@ def _iterate(
         [int(Status.NON_FINITE), int(Status.FLAT), stalled, int(Status.IMPROVEMENT)],
         int(Status.RUNNING),
     )
-    return State(
+    return LevenbergMarquardtState(
         parameters=at.unravel(jnp.where(last.accepted, at.x + last.step, at.x)),
         iteration=state.iteration + (finite & ~flat),
         status=status.astype(state.status.dtype),  # no longer weakly typed: that would be another program
@@ -208,22 +213,22 @@ def _iterate(
 
 
 class _Linearised(NamedTuple):
-    """The problem at the parameters where an iteration starts."""
+    """The linearised problem at the start of an iteration."""
 
     parameters: Any
     x: Array
-    """The same as a vector [P]."""
+    """The parameters as a vector [P]."""
     unravel: Callable[[Array], Any]
     chunks: Chunks
     samples: int
-    """Of all devices."""
+    """Number of samples on all devices."""
     matrix: Array
     """A [P, P]."""
     gradient: Array
     """g [P]."""
     loss: Array
     jacobian: Array | None
-    """Of all samples, where it is small enough to be kept."""
+    """Jacobian of all samples, if small enough to be kept."""
 
 
 def _linearise(
@@ -240,32 +245,32 @@ def _linearise(
 
 
 class _Trial(NamedTuple):
-    """One damping, and what came of it."""
+    """Outcome of the step with one damping."""
 
     step: Array
     loss: Array
     accepted: Array
     damping: Array
-    """For the next trial."""
+    """Damping of the next trial."""
     growth: Array
     tried: Array
     fallbacks: Array
 
 
 def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: _Trial, mesh: Mesh | None) -> _Trial:
-    """The step with the damping of the last trial, whether it lowers the loss, and the next damping."""
+    """Tries the step with the current damping: whether it lowers the loss, and the next damping."""
     damped = trial.damping * scale
     factor, fell_back = equations.factorise(at.matrix + damped * jnp.eye(at.x.size))
     velocity = -equations.solve(factor, at.gradient)
 
     def accelerated(probed: Array) -> Array:
-        """v + a, by the residuals at x + h v."""
+        """Returns v + a from the residuals at x + h v."""
         product = equations.pull_back(sample_residual, at.parameters, at.chunks, at.jacobian, probed, mesh=mesh)
         slope = product / at.samples
         # Finite or NaN; the selection keeps the rounding of the division, which a fused multiply-add would skip.
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.nan)
         bend = -equations.solve(factor, slope - (1 - PROBE) * at.gradient + PROBE * damped * velocity) / PROBE**2
-        bounded = bend @ bend <= MOST_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
+        bounded = bend @ bend <= UPPER_ACCELERATION**2 * (velocity @ velocity)  # False for NaN
         return jnp.where(bounded, velocity + bend, velocity)
 
     def evaluate(phase: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -285,7 +290,7 @@ def _try(sample_residual: SampleResidual, at: _Linearised, scale: Array, trial: 
         step=step,
         loss=loss,
         accepted=accepted,
-        damping=jnp.maximum(trial.damping * factor_on_damping, LEAST_DAMPING),
+        damping=jnp.maximum(trial.damping * factor_on_damping, LOWER_DAMPING),
         growth=jnp.where(accepted, 2.0, 2 * trial.growth),
         tried=trial.tried + 1,
         fallbacks=trial.fallbacks + fell_back,

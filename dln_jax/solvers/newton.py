@@ -24,7 +24,7 @@ _ROUNDING_UNITS = 16
 
 
 class Info(NamedTuple):
-    """How a search for a root or a minimum ended."""
+    """Outcome of a search for a root or a minimum."""
 
     residual: Float[Array, ""]
     """Largest |f| at the last point judged: of the equations, or of the gradient in units of its scale."""
@@ -39,7 +39,7 @@ class Info(NamedTuple):
     """Change of the energy at a minimum that rounding hides, in the unit of the energy; `None` for a root."""
 
 
-class _State(NamedTuple):
+class _RootIterate(NamedTuple):
     x: Root
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -50,16 +50,16 @@ class _State(NamedTuple):
 def find_root(
     function: Callable[..., Array], start: Root, *arguments: Any, tolerance: float = 0.0, iterations: int = 30
 ) -> tuple[Root, Info]:
-    """x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
+    """Returns x [n] with function(x, *arguments) = 0, for up to about twenty equations and a start near the root.
 
-    There is no line search: a start that is too far off may diverge, which `Info.converged` reports; what is
-    returned is then the last iterate. Derivatives are those of the root, with respect to the arguments and to
+    There is no line search: from a start too far from the root the iteration may diverge, which `Info.converged`
+    reports; x is then the last iterate. Derivatives are those of the root, with respect to the arguments and to
     arrays that the function closes over; the start has none.
 
     Args:
         function: (x [n], *arguments) -> f [n].
         start: first iterate [n].
-        arguments: pytrees handed to the function.
+        arguments: pytrees passed to the function.
         tolerance: largest |f_i| that counts as zero, in the unit of f; rounding, 16 eps |J| |x|, always does. The
             point that passes is improved by one more step, which about squares its error.
         iterations: Newton steps after which the search gives up.
@@ -92,7 +92,7 @@ def _newton(
         value = function(x)
         return value, value
 
-    def iterate(state: _State) -> _State:
+    def iterate(state: _RootIterate) -> _RootIterate:
         # One evaluation per turn both judges the point and improves it, so that the function is compiled once.
         jacobian, value = jax.jacfwd(twice, has_aux=True)(state.x)
         step = solve(jacobian, value)
@@ -100,7 +100,7 @@ def _newton(
         floor = rounding * jnp.max(jnp.abs(jacobian) @ jnp.abs(state.x))
         converged = residual <= jnp.maximum(tolerance, floor)
         count = state.iterations + 1
-        return _State(
+        return _RootIterate(
             x=jnp.where(jnp.isfinite(step).all(), state.x - step, state.x),
             residual=residual,
             iterations=count,
@@ -109,8 +109,8 @@ def _newton(
         )
 
     unknown = jnp.asarray(jnp.inf, start.dtype)
-    first = _State(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
+    first = _RootIterate(start, unknown, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
     last = jax.lax.while_loop(lambda state: state.running, iterate, first)
-    # `custom_root` takes real numbers only beside the root.
+    # `custom_root` accepts only real numbers as auxiliary output.
     real = start.dtype
     return last.x, (last.residual, last.iterations.astype(real), last.converged.astype(real))

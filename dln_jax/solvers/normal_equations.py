@@ -22,17 +22,17 @@ from dln_jax.scale.mesh import total
 from dln_jax.types import InputError
 
 SampleResidual = Callable[..., Array]
-"""(parameters, *sample) -> residuals of one sample, [r] or any other shape."""
+"""(parameters, *sample) -> residuals of one sample, [r] or another shape."""
 
 # J Jᵀ is symmetric: this many rows of blocks, each as wide as the lower triangle needs, save up to half the products.
 _ROWS_PER_BLOCK = 200
 
 
 class Chunks(NamedTuple):
-    """Samples in `k` equal chunks of `c`; the last one is filled up with samples of weight 0."""
+    """Samples in `k` equal chunks of `c`; the last chunk is padded with samples of weight 0."""
 
     arrays: tuple[Any, ...]
-    """Each [k, c, ...], or None."""
+    """Arrays [k, c, ...], or None."""
     weights: Array
     """1 for a sample, 0 for a filler, [k, c]."""
 
@@ -47,7 +47,7 @@ class NormalEquations(NamedTuple):
     squares: Array
     """Sum of r²."""
     jacobian: Array | None
-    """J as [k, blocks, P, rows of a block], or None where it was not to be kept."""
+    """J as [k, blocks, P, rows of a block], or None if it is not kept."""
 
 
 class Factor(NamedTuple):
@@ -60,14 +60,14 @@ class Factor(NamedTuple):
 
 
 def count(parameters: Any) -> int:
-    """P, the number of scalars in a tree of parameters."""
+    """Returns P, the number of scalars in a tree of parameters."""
     return sum(int(np.prod(np.shape(leaf))) for leaf in jax.tree.leaves(parameters))
 
 
 def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size: int, keep: bool) -> int:
-    """Bytes in float64 of what grows with the problem: 8 (4 P² + P chunk_size b + [P N r if kept]).
+    """Returns the bytes of the arrays that grow with the problem: 8 (4 P² + P chunk_size b + [P N r if kept]).
 
-    P parameters, N samples of r residuals each. 4 P² is the matrix, its damped copy, its factor and one spare;
+    There are P parameters and N samples with r residuals. 4 P² is the matrix, its damped copy, its factor and a spare;
     a piece of the Jacobian has b = 1 residual per sample by reverse mode (r < P), and b = r by forward mode.
     The intermediate values of the residual function itself, for `chunk_size` samples, come on top.
     """
@@ -77,20 +77,20 @@ def jacobian_bytes(parameters: Any, samples: int, residuals: int, *, chunk_size:
 
 
 def check_precision(tree: Any, what: str) -> None:
-    """Raises InputError where a leaf is not float64."""
-    found = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
-    if found:
+    """Raises InputError if a leaf is not float64."""
+    others = {str(jnp.result_type(getattr(leaf, "dtype", leaf))) for leaf in jax.tree.leaves(tree)} - {"float64"}
+    if others:
         raise InputError(
-            f"{what} are {', '.join(sorted(found))}; Gauss-Newton needs float64, for normal equations square the "
+            f"{what} are {', '.join(sorted(others))}; Gauss-Newton needs float64, for normal equations square the "
             "condition number: set jax_enable_x64 (--precision f64) before arrays are made"
         )
 
 
 def residual_count(sample_residual: SampleResidual, parameters: Any, chunks: Chunks) -> int:
-    """Residuals of a sample.
+    """Returns the number of residuals of a sample.
 
     Raises:
-        InputError: parameters or residuals that are not float64.
+        InputError: parameters or residuals are not float64.
     """
     check_precision(parameters, "parameters")
     one = jax.tree.map(lambda array: array[0, 0], chunks.arrays)
@@ -100,11 +100,12 @@ def residual_count(sample_residual: SampleResidual, parameters: Any, chunks: Chu
 
 
 def split(arrays: tuple[Any, ...], chunk_size: int, *, devices: int = 1) -> Chunks:
-    """The samples in as few equal chunks of at most `chunk_size` as hold them, the same number for each device;
-    fillers are the first sample.
+    """Splits samples into the smallest number of equal chunks of at most `chunk_size`, equally many per device.
+
+    The first sample serves as padding.
 
     Raises:
-        InputError: arrays of different length, or of none.
+        InputError: arrays differ in length, or are empty.
     """
     lengths = [array.shape[0] if array.ndim else 0 for array in jax.tree.leaves(arrays)]
     if len(set(lengths)) != 1 or lengths[0] == 0:
@@ -124,20 +125,20 @@ def split(arrays: tuple[Any, ...], chunk_size: int, *, devices: int = 1) -> Chun
 def normal_equations(
     sample_residual: SampleResidual, parameters: Any, chunks: Chunks, *, keep: bool, mesh: Mesh | None = None
 ) -> NormalEquations:
-    """J Jᵀ, J r and the sum of squares at `parameters`; the Jacobian too if it is to be kept.
+    """Returns J Jᵀ, J r and the sum of squares at `parameters`, and the Jacobian with `keep`.
 
-    With a mesh this is a part of a function of `scale.mesh.on_devices`: chunks and Jacobian are this device's, the sums
-    those of all.
+    With a mesh, call it in a function of `scale.mesh.on_devices`: chunks and Jacobian belong to this device, the sums
+    to all devices.
 
-    Rows come by reverse mode, all samples of a chunk at once and one residual of each after the other, or by forward
-    mode where there are no more parameters than residuals in a sample.
+    Reverse mode gives the rows, one residual at a time for all samples of a chunk; forward mode does if a sample has
+    at least as many residuals as there are parameters.
     """
     point, unravel = ravel_pytree(parameters)
     size = point.shape[0]
     edges = np.linspace(0, size, -(-size // _ROWS_PER_BLOCK) + 1).astype(int)
 
     def one(*sample):
-        return jax.vjp(lambda each: jnp.ravel(sample_residual(each, *sample)), parameters)
+        return jax.vjp(lambda tree: jnp.ravel(sample_residual(tree, *sample)), parameters)
 
     def forward(samples: tuple[Any, ...]) -> Array:
         def along(direction: Array) -> Array:
@@ -180,12 +181,12 @@ def normal_equations(
 
 
 def residuals_of(sample_residual: SampleResidual, parameters: Any, samples: tuple[Any, ...]) -> Float[Array, "r c"]:
-    """Residuals of c samples, one row per residual of a sample."""
+    """Returns the residuals of c samples, one row per residual of a sample."""
     return jax.vmap(lambda *sample: jnp.ravel(sample_residual(parameters, *sample)))(*samples).T
 
 
 def residuals(sample_residual: SampleResidual, parameters: Any, chunks: Chunks) -> Float[Array, "k r c"]:
-    """Residuals at `parameters`, those of fillers 0."""
+    """Returns the residuals at `parameters`, 0 for padding."""
     return lax.map(lambda chunk: residuals_of(sample_residual, parameters, chunk[0]) * chunk[1], chunks)
 
 
@@ -198,14 +199,14 @@ def pull_back(
     *,
     mesh: Mesh | None = None,
 ) -> Float[Array, "P"]:
-    """J w [P] for a vector w over the residuals: from the Jacobian if it was kept, by reverse mode if not.
+    """Returns J w [P] for a vector w over the residuals: from the Jacobian if it was kept, else by reverse mode.
 
-    With a mesh chunks, Jacobian and w are this device's, and the product that of all, as in `normal_equations`.
+    With a mesh, chunks, Jacobian and w belong to this device, and the product to all devices (`normal_equations`).
     """
 
     def reverse(product: Array, piece) -> tuple[Array, None]:
         samples, vector = piece
-        _, pull = jax.vjp(lambda each: residuals_of(sample_residual, each, samples), parameters)
+        _, pull = jax.vjp(lambda tree: residuals_of(sample_residual, tree, samples), parameters)
         return product + ravel_pytree(pull(vector)[0])[0], None
 
     zero = jnp.zeros(count(parameters))
@@ -220,7 +221,7 @@ def pull_back(
 
 
 def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:
-    """Factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
+    """Returns a factor of a symmetric matrix (lower triangle), and whether the fallback was needed.
 
     Scaled to unit diagonal, a matrix whose Cholesky factor exists and has all L_ii² > P eps is solved as it is. Else
     it is singular to working precision: eigenvalues below P eps times the largest are raised to that, and L comes
@@ -241,7 +242,7 @@ def factorise(matrix: Float[Array, "P P"]) -> tuple[Factor, Array]:
 
 
 def solve(factor: Factor, b: Float[Array, "P"]) -> Float[Array, "P"]:
-    """x [P] with A x = b."""
+    """Returns x [P] with A x = b."""
     forward = solve_triangular(factor.lower, factor.scaling * b, lower=True)
     return factor.scaling * solve_triangular(factor.lower, forward, lower=True, trans="T")
 

@@ -1,4 +1,4 @@
-"""Separable least squares: few nonlinear unknowns, and many that enter linearly and are solved for at every step.
+"""Separable least squares: a few nonlinear unknowns, and many linear ones that are eliminated at every step.
 
     minimise over (x, n) |A(n) x - b(n)|²   =   minimise over n |(1 - U Uᵀ) b|²,   A = U S Vᵀ
 
@@ -7,8 +7,8 @@ variable projection method for solving separable nonlinear least squares problem
 
     J = (1 - U Uᵀ) (dA/dn x - db/dn)
 
-which leaves out a term of the order of r, and of which only products with the solution x enter. Columns of A are scaled
-and its small singular values left out, as in `solvers.least_squares`; normal equations are never formed.
+which omits a term of the order of r and needs only products of dA/dn with the solution x. Columns of A are scaled and
+its small singular values omitted, as in `solvers.least_squares`; normal equations are never formed.
 """
 
 import functools
@@ -22,8 +22,8 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.types import InputError, require_positive
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_TRIALS = 1e-3, 1e-12, 30
-"""Of the scaled columns of J; and steps tried before an iteration gives up."""
+FIRST_DAMPING, LOWER_DAMPING, TRIALS = 1e-3, 1e-12, 30
+"""Damping of the scaled columns of J, first and lower bound; steps tried before an iteration gives up."""
 
 
 class SeparableSolution(NamedTuple):
@@ -34,15 +34,15 @@ class SeparableSolution(NamedTuple):
     residuals: Float[np.ndarray, " N"]
     """A x - b."""
     rank: int
-    """Of the scaled columns of A."""
+    """Rank of the scaled columns of A."""
     condition: float
-    """Of those that count."""
+    """Condition number of these columns, on their rank."""
     covariance: Float[np.ndarray, "K K"]
-    """Of (linear, nonlinear), K = P + n, on what the equations determine: s² (GᵀG)⁺, G = [A, dA/dn x - db/dn] and
-    s² = |A x - b|² / (N - rank - n); it counts what the two kinds share."""
+    """Covariance of (linear, nonlinear), K = P + n, on the determined combinations: s² (GᵀG)⁺ with
+    G = [A, dA/dn x - db/dn] and s² = |A x - b|² / (N - rank - n); it includes correlations of both kinds."""
     iterations: int
     converged: bool
-    """The last iteration improved as little as asked, or none could."""
+    """Whether the last iteration improved by no more than the limit, or not at all."""
 
 
 class _Projected(NamedTuple):
@@ -64,20 +64,20 @@ def solve_separable(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> SeparableSolution:
-    """The best unknowns near a start, in float64.
+    """Returns the unknowns of a local minimum near the start, in float64.
 
     Args:
-        design: (n, *arguments) -> A [N, P] and b [N], in JAX; a sample that counts less has rows of less weight. The
-            same function is compiled once.
-        start: n [n], away from where A and b stop depending on it; quantities that are positive go as logarithms.
+        design: (n, *arguments) -> A [N, P] and b [N], in JAX; weights of samples multiply their rows. A function is
+            compiled once.
+        start: n [n], where A and b depend on it; pass positive quantities as logarithms.
         arguments: arrays, such as the data.
-        iterations: at most.
-        improvement: stop where an iteration lowers the sum of squares by less than this part of it.
-        longest_step: of any nonlinear unknown in an iteration; damping shortens what is longer.
-        rank_tolerance, negligible: of A, as in `least_squares.solve`.
+        iterations: largest number of iterations.
+        improvement: stop if an iteration lowers the sum of squares by no more than this fraction.
+        longest_step: largest step of a nonlinear unknown in an iteration; damping shortens longer ones.
+        rank_tolerance, negligible: for A, as in `least_squares.solve`.
 
     Raises:
-        InputError: a start that is no vector, or gives numbers that are not finite.
+        InputError: the start is not a vector, or gives numbers that are not finite.
     """
     require_positive(iterations=iterations, longest_step=longest_step)
     with jax.enable_x64(True):
@@ -116,7 +116,7 @@ def solve_separable(
 
 @functools.lru_cache(maxsize=8)
 def _compiled(design: Callable[..., tuple[Any, Any]]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """(n, *arguments) -> A and b; (n, x, *arguments) -> dA/dn x - db/dn [N, n]."""
+    """Returns (n, *arguments) -> A and b, and (n, x, *arguments) -> dA/dn x - db/dn [N, n], both compiled."""
 
     def slopes(n, x, *arguments):
         def residual(n):
@@ -137,17 +137,17 @@ def _descend(
     damping: float,
     longest_step: float,
 ) -> tuple[np.ndarray, _Projected, float]:
-    """The first step that lowers the sum of squares, and the next damping; the same point where none does."""
+    """Takes the first step that lowers the sum of squares, if any; returns the point and the next damping."""
     left, sizes, right, scale = _svd(J)
     slope = left.T @ at.residual
-    for _ in range(MOST_TRIALS if len(sizes) else 0):
+    for _ in range(TRIALS if len(sizes) else 0):
         step = -(right.T @ (sizes / (sizes**2 + damping) * slope)) / scale
         if np.abs(step).max() > longest_step:
             damping *= 5
             continue
         trial = project(n + step)
         if trial.residual @ trial.residual < at.residual @ at.residual:  # False for NaN
-            return n + step, trial, max(damping / 9, LEAST_DAMPING)
+            return n + step, trial, max(damping / 9, LOWER_DAMPING)
         damping *= 5
     return n, at, damping
 
@@ -165,14 +165,14 @@ def _projected(A: np.ndarray, b: np.ndarray, rank_tolerance: float | None, negli
 def _svd(
     A: np.ndarray, rank_tolerance: float | None = None, negligible: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """U, S, Vᵀ of the columns of A scaled to norm 1, without what is rounding; and their norms."""
+    """Returns U, S, Vᵀ of the columns of A scaled to norm 1, without singular values of rounding, and the norms."""
     norms = np.linalg.norm(A, axis=0)
     seen = norms > negligible * norms.max(initial=0.0)
     scale = np.where(seen, norms, 1.0)
     orthogonal, triangle = np.linalg.qr(np.where(seen, A, 0.0) / scale)
     left, sizes, right = np.linalg.svd(triangle, full_matrices=False)
-    least = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance
-    counts = sizes > least * sizes.max(initial=0.0)
+    lower = np.finfo(float).eps * max(A.shape) if rank_tolerance is None else rank_tolerance
+    counts = sizes > lower * sizes.max(initial=0.0)
     return orthogonal @ left[:, counts], sizes[counts], right[counts], scale
 
 

@@ -64,7 +64,7 @@ def test_numpy_in_and_out():
             function(x, A, 0.0)
     with pytest.raises(InputError, match=r"^argument 3 has shape \(2,\); expected \(\)"):
         function(np.zeros(2), A, np.zeros(2))
-    with pytest.raises(InputError, match="2 arguments were given; expected 3"):
+    with pytest.raises(InputError, match="got 2 arguments; expected 3"):
         function(np.zeros(2), A)
 
 

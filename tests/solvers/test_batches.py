@@ -163,9 +163,9 @@ CHAIN = (
     ElementEnergy(
         lambda x, data: 0.5 * data[0] * (jnp.sqrt(sum((b - a) ** 2 for a, b in zip(*x, strict=True))) - data[1]) ** 2,
         np.stack([np.arange(COUNT - 1), np.arange(1, COUNT)], axis=1),
-        written_out=True,
+        unrolled=True,
     ),
-    ElementEnergy(lambda x, weight: weight * x[0][1], np.arange(COUNT)[:, None], written_out=True),
+    ElementEnergy(lambda x, weight: weight * x[0][1], np.arange(COUNT)[:, None], unrolled=True),
 )
 FREE = np.ones((COUNT, 2), bool)
 FREE[0] = FREE[-1] = False

@@ -149,7 +149,7 @@ def test_linear_least_squares_in_few_iterations():
 def test_a_linear_problem_has_no_acceleration(constants):
     data = linear_problem(60, 7)
     accelerated = solve(linear, jnp.zeros(7), data, 1).parameters
-    constants(MOST_ACCELERATION=0.0)
+    constants(UPPER_ACCELERATION=0.0)
     np.testing.assert_allclose(accelerated, solve(linear, jnp.zeros(7), data, 1).parameters, rtol=1e-12)
 
 
@@ -173,7 +173,7 @@ def test_ill_conditioned_problem(constants):
     """Monomials to degree 9 on [0, 1]: their condition number is 1e7, that of the normal equations 1e14."""
     t = np.linspace(0, 1, 50)
     rows, y = np.vander(t, 10), np.sin(5 * t)
-    constants(LEAST_DAMPING=1e-18)
+    constants(LOWER_DAMPING=1e-18)
     found = solve(linear, jnp.zeros(10), (rows, y), 60)
     floor = np.mean((rows @ np.linalg.lstsq(rows, y)[0] - y) ** 2)
     assert 1e-15 < floor < 1e-11
@@ -262,7 +262,7 @@ def test_acceleration_follows_a_curved_valley(constants):
     data = (NETWORK_DATA[0], jax.vmap(lambda x: network(teacher, x, 0.0))(NETWORK_DATA[0]))
     taken = []
     for acceleration in (0.75, 0.0):
-        constants(MOST_ACCELERATION=acceleration)
+        constants(UPPER_ACCELERATION=acceleration)
         state = init(network_parameters(0))
         while state.loss > 1e-8 and state.iteration < 400:
             state = run(network, state, data, 2)

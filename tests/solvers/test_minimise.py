@@ -36,8 +36,8 @@ def spring(x, data):
 
 
 ENERGIES = (
-    ElementEnergy(spring, LINKS, written_out=True),
-    ElementEnergy(lambda x, weight: weight * x[0][1], np.arange(CHAIN)[:, None], written_out=True),
+    ElementEnergy(spring, LINKS, unrolled=True),
+    ElementEnergy(lambda x, weight: weight * x[0][1], np.arange(CHAIN)[:, None], unrolled=True),
 )
 FREE = np.ones((CHAIN, 2), bool)
 FREE[0] = FREE[-1] = False

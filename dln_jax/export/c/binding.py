@@ -1,7 +1,7 @@
-"""Exported C as functions of Python: a source that is compiled with the export, and what makes functions of it.
+"""A generated C source that makes exported functions callable from Python.
 
-A call through ctypes takes longer than the dynamics of a small arm. The source declares those few functions of Python's
-stable interface (PEP 384; buffers are in it from 3.11 on) that it calls, so that Python's own headers are not needed.
+It replaces ctypes, whose calls take longer than the dynamics of a small arm. It declares the few functions of Python's
+stable interface (PEP 384, which includes buffers from 3.11 on) that it calls, so that no Python headers are needed.
 """
 
 import collections
@@ -46,7 +46,7 @@ typedef struct {
     int flags;
     const char *text;
 } PyMethodDef;
-enum { CONTIGUOUS_WITH_FORMAT = 0x3C, WRITABLE = 1, FAST_WITH_KEYWORDS = 0x82, MOST = $most };
+enum { CONTIGUOUS_WITH_FORMAT = 0x3C, WRITABLE = 1, FAST_WITH_KEYWORDS = 0x82, MAXIMUM = $maximum };
 
 extern PyObject PyFloat_Type;
 int PyObject_GetBuffer(PyObject *, Py_buffer *, int);
@@ -76,14 +76,14 @@ typedef struct {
 typedef struct {
     int arguments, results;
     PyObject *(*run)(void **); /* the number that is returned, or NULL where results are arrays */
-    leaf leaves[MOST];
+    leaf leaves[MAXIMUM];
 } function;
 
-/* Whether an object is an array of this type and shape; its buffer is to be released then */
-static int fits(PyObject *given, Py_buffer *buffer, const leaf *expected, int flags)
+/* Whether an object is an array of this type and shape; if so, the caller releases its buffer */
+static int fits(PyObject *item, Py_buffer *buffer, const leaf *expected, int flags)
 {
     int axis = 0;
-    if (PyObject_GetBuffer(given, buffer, flags)) {
+    if (PyObject_GetBuffer(item, buffer, flags)) {
         PyErr_Clear();
         return 0;
     }
@@ -95,23 +95,23 @@ static int fits(PyObject *given, Py_buffer *buffer, const leaf *expected, int fl
     return 0;
 }
 
-/* Results of arguments; NULL without an error where an argument does not fit */
-static PyObject *results_of(const function *f, PyObject *self, PyObject *const *given)
+/* Results for arguments; NULL without an error if an argument does not fit */
+static PyObject *results_of(const function *f, PyObject *self, PyObject *const *arguments)
 {
-    Py_buffer buffers[MOST];
-    void *memory[MOST];
-    real numbers[MOST];
+    Py_buffer buffers[MAXIMUM];
+    void *memory[MAXIMUM];
+    real numbers[MAXIMUM];
     PyObject *results = PyTuple_New(f->results), *result = NULL;
-    int held[MOST], k = 0;
+    int held[MAXIMUM], k = 0;
     for (; results && k < f->arguments + f->results; ++k) {
         const leaf *expected = &f->leaves[k];
         const int place = k - f->arguments;
-        PyObject *each = place < 0 ? given[k] : PyObject_CallObject(PyTuple_GetItem(self, place + 2), NULL);
-        if (!each) break;
-        if (place >= 0) (void)PyTuple_SetItem(results, place, each);
-        held[k] = expected->axes || expected->format != '$format' || !PyObject_IsInstance(each, &PyFloat_Type);
-        if (held[k] && !fits(each, &buffers[k], expected, CONTIGUOUS_WITH_FORMAT | (place < 0 ? 0 : WRITABLE))) break;
-        if (!held[k]) numbers[k] = (real)PyFloat_AsDouble(each);
+        PyObject *item = place < 0 ? arguments[k] : PyObject_CallObject(PyTuple_GetItem(self, place + 2), NULL);
+        if (!item) break;
+        if (place >= 0) (void)PyTuple_SetItem(results, place, item);
+        held[k] = expected->axes || expected->format != '$format' || !PyObject_IsInstance(item, &PyFloat_Type);
+        if (held[k] && !fits(item, &buffers[k], expected, CONTIGUOUS_WITH_FORMAT | (place < 0 ? 0 : WRITABLE))) break;
+        if (!held[k]) numbers[k] = (real)PyFloat_AsDouble(item);
         memory[k] = held[k] ? buffers[k].buf : &numbers[k];
     }
     if (k == f->arguments + f->results) {
@@ -125,20 +125,21 @@ static PyObject *results_of(const function *f, PyObject *self, PyObject *const *
     return result;
 }
 
-/* A call; `self` has what converts arguments, what makes several results one, and what makes an array for each */
-static PyObject *called(const function *f, PyObject *self, PyObject *const *given, Py_ssize_t count, PyObject *names)
+/* A call; `self` holds the function that converts arguments, the class of results, and makers of result arrays */
+static PyObject *called(
+    const function *f, PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
 {
-    PyObject *result = names || count != f->arguments ? NULL : results_of(f, self, given), *all, *converted = NULL;
+    PyObject *result = names || count != f->arguments ? NULL : results_of(f, self, arguments), *all, *converted = NULL;
     if (result || PyErr_Occurred()) return result;
     if (names) count += PyTuple_Size(names);
     all = PyTuple_New(count);
     for (Py_ssize_t k = 0; all && k < count; ++k) {
-        Py_IncRef(given[k]);
-        (void)PyTuple_SetItem(all, k, given[k]);
+        Py_IncRef(arguments[k]);
+        (void)PyTuple_SetItem(all, k, arguments[k]);
     }
     if (all) converted = PyObject_CallFunctionObjArgs(PyTuple_GetItem(self, 0), all, names, NULL);
     if (converted) {
-        PyObject *fitting[MOST];
+        PyObject *fitting[MAXIMUM];
         for (int k = 0; k < f->arguments; ++k) fitting[k] = PyTuple_GetItem(converted, k);
         result = results_of(f, self, fitting);
         Py_DecRef(converted);
@@ -150,20 +151,20 @@ static PyObject *called(const function *f, PyObject *self, PyObject *const *give
 
 
 def binding(name: str, functions: Mapping[str, Signature], precision: str) -> str:
-    """Text of the source, to be compiled together with that of the export."""
-    leaves = [leaf for each in functions.values() for leaf in (*each.arguments, *each.results)]
+    """Returns the source of the binding, to be compiled together with the export."""
+    leaves = [leaf for function in functions.values() for leaf in (*function.arguments, *function.results)]
     text = _START.substitute(
         name=name,
         real=PRECISIONS[precision][1],
         format=_format("real", precision),
         axes=max([1, *(len(leaf.shape) for leaf in leaves)]),
-        most=max(1, *(len(each.arguments) + len(each.results) for each in functions.values())),
+        maximum=max(1, *(len(function.arguments) + len(function.results) for function in functions.values())),
     )
-    for number, (key, each) in enumerate(functions.items()):
-        text += _function(number, f"{name}_{key}", each, precision)
+    for number, (key, signature) in enumerate(functions.items()):
+        text += _function(number, f"{name}_{key}", signature, precision)
     methods = "".join(
-        f'    {{"{key}", call_{number}, FAST_WITH_KEYWORDS, "{_described(key, each)}"}},\n'
-        for number, (key, each) in enumerate(functions.items())
+        f'    {{"{key}", call_{number}, FAST_WITH_KEYWORDS, "{_described(key, signature)}"}},\n'
+        for number, (key, signature) in enumerate(functions.items())
     )
     made = f"PyObject *{name}_python(int k, PyObject *self)"
     returned = "return PyCMethod_New(&methods[k], self, NULL, NULL);"
@@ -171,14 +172,18 @@ def binding(name: str, functions: Mapping[str, Signature], precision: str) -> st
 
 
 def bound(library: ctypes.PyDLL, name: str, functions: Mapping[str, Signature], precision: str) -> Any:
-    """A named tuple of the functions of a library that was built with the binding."""
+    """Returns a named tuple of the functions of a library that was built with the binding."""
     make = library[f"{name}_python"]
     make.argtypes, make.restype = (ctypes.c_int, ctypes.py_object), ctypes.py_object
     made = {}
-    for number, (key, each) in enumerate(functions.items()):
-        group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in each.results])
-        results = () if each.returns else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in each.results]
-        convert = functools.partial(_converted, key, each.arguments, precision)
+    for number, (key, signature) in enumerate(functions.items()):
+        group = collections.namedtuple(f"{key}_results", [leaf.name for leaf in signature.results])
+        results = (
+            ()
+            if signature.returns
+            else [np.zeros(leaf.shape, _type(leaf.kind, precision)) for leaf in signature.results]
+        )
+        convert = functools.partial(_converted, key, signature.arguments, precision)
         made[key] = make(number, (convert, group, *(array.copy for array in results)))
     return collections.namedtuple("Functions", made)(**made)
 
@@ -188,12 +193,12 @@ def _type(kind: str, precision: str) -> Any:
 
 
 def _format(kind: str, precision: str) -> str:
-    """Of the buffer of an array."""
+    """Returns the format character of the buffer of an array."""
     return np.zeros(1, _type(kind, precision)).data.format
 
 
 def _function(number: int, name: str, signature: Signature, precision: str) -> str:
-    """What calls one function with pointers, and what Python calls."""
+    """Returns a C function that passes pointers to an exported function, and one that Python calls."""
     passed = [
         f"memory[{k}]" if leaf.shape else f"*(const {_C[leaf.kind]} *)memory[{k}]"
         for k, leaf in enumerate(signature.arguments)
@@ -219,10 +224,10 @@ static PyObject *run_{number}(void **memory)
     {call}
 }}
 
-static PyObject *call_{number}(PyObject *self, PyObject *const *given, Py_ssize_t count, PyObject *names)
+static PyObject *call_{number}(PyObject *self, PyObject *const *arguments, Py_ssize_t count, PyObject *names)
 {{
     static const function f = {about};
-    return called(&f, self, given, count, names);
+    return called(&f, self, arguments, count, names);
 }}
 """
 
@@ -236,19 +241,21 @@ def _described(key: str, signature: Signature) -> str:
 
 
 def _converted(
-    name: str, leaves: tuple[Leaf, ...], precision: str, given: tuple[Any, ...], names: tuple[str, ...] = ()
+    name: str, leaves: tuple[Leaf, ...], precision: str, arguments: tuple[Any, ...], names: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, ...]:
-    """Arguments in order, as arrays of their types; InputError where they are none."""
+    """Converts positional and keyword arguments to arrays in order, and raises InputError if that fails."""
     expected = [leaf.name for leaf in leaves]
-    placed = dict(zip([*expected[: len(given) - len(names)], *names], given, strict=False))
-    if len(placed) < len(given) or set(placed) != set(expected):
-        others = len(given) - len(set(placed) & set(expected))
-        raise InputError(f"{name} takes {', '.join(expected)}; got {len(given)} of them{' and others' * bool(others)}")
+    placed = dict(zip([*expected[: len(arguments) - len(names)], *names], arguments, strict=False))
+    if len(placed) < len(arguments) or set(placed) != set(expected):
+        others = len(arguments) - len(set(placed) & set(expected))
+        raise InputError(
+            f"{name} takes {', '.join(expected)}; got {len(arguments)} of them{' and others' * bool(others)}"
+        )
     return tuple(_array(leaf, placed[leaf.name], precision) for leaf in leaves)
 
 
-def _array(leaf: Leaf, given: Any, precision: str) -> np.ndarray:
+def _array(leaf: Leaf, argument: Any, precision: str) -> np.ndarray:
     if leaf.kind == "bool":
-        given = np.asarray(given)
-        given = given.astype(np.int32) if given.dtype == bool else given
-    return np.array(as_shaped(leaf.name, given, leaf.shape), _type(leaf.kind, precision), order="C")
+        argument = np.asarray(argument)
+        argument = argument.astype(np.int32) if argument.dtype == bool else argument
+    return np.array(as_shaped(leaf.name, argument, leaf.shape), _type(leaf.kind, precision), order="C")

@@ -1,17 +1,17 @@
-"""JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
+"""Exports JAX functions with exact derivatives as C for CasADi's `external`, and so for acados.
 
-CasADi (3.6 and later) looks beside a function f for these, and takes what they give for its derivatives:
+CasADi (3.6 and later) takes the derivatives of a function f from these functions of the same library:
 
 | symbol | inputs | outputs |
 |---|---|---|
 | `f` | x | y |
-| `jac_f` | x, y | dy_j/dx_i, of all i for each j in turn |
+| `jac_f` | x, y | dy_j/dx_i for all i, then the next j |
 | `fwd1_f` | x, y, seeds of x | (dy/dx) seeds |
 | `adj1_f` | x, y, seeds of y | (dy/dx)ᵀ seeds |
 | `jac_adj1_f` | x, y, seeds of y, outputs of `adj1_f` | derivatives of these outputs with respect to all inputs |
 
-Outputs among the inputs are declared without elements, and so are derivatives with respect to them. Everything else is
-dense and column-major, vectors are n x 1, and pointers may be null: an input of zeros, an output that nobody wants.
+Outputs among the inputs are declared without elements, and so are derivatives with respect to them. All other matrices
+are dense and column-major, vectors are n x 1. A null pointer stands for an input of zeros or an unwanted output.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ import numpy as np
 
 from dln_jax.export.c import sensitivities
 from dln_jax.export.c.body import Body, Source
-from dln_jax.export.c.emit import region, written
+from dln_jax.export.c.emit import region, result_writers
 from dln_jax.export.c.interface import Leaf, argument_leaves, result_leaves
 from dln_jax.export.c.jaxprs import traced
 from dln_jax.export.c.lowering import program_of
@@ -82,7 +82,7 @@ endif()
 
 
 class Block(NamedTuple):
-    """An input or output: a matrix with all elements, or none."""
+    """An input or output: a dense matrix, or one declared without elements."""
 
     name: str
     rows: int
@@ -98,20 +98,18 @@ class Block(NamedTuple):
 def external_functions(
     name: str, functions: Mapping[str, Any], *, libm: bool, stack: int, leave_out: bool = False
 ) -> tuple[Source, str, list[str]]:
-    """The source with the tables that `casadi_NAME_F` and its derivatives read for each function F, and their C text.
-
-    Third is why functions are left out, if they may be.
+    """Returns the source of tables, the C text of `casadi_NAME_F` and its derivatives for every F, and refusals.
 
     Args:
-        name: of the export.
-        functions: as `export_c` takes them.
+        name: name of the export.
+        functions: as for `export_c`.
         libm: call the C library's elementary functions.
-        stack: bytes that a function may take.
-        leave_out: functions that would be refused.
+        stack: bytes of stack that a function may use.
+        leave_out: omit functions that CasADi cannot take, and return the reasons.
 
     Raises:
-        InputError: what CasADi cannot take: numbers that are not real, more than two axes, some names; or a function
-            without arguments, without derivatives, or that takes more stack.
+        InputError: CasADi cannot take a function: its arrays are not real or have more than two axes, a name is
+            reserved, or it has no arguments or no derivatives, or needs more stack.
     """
     source, texts, largest, left_out = Source("f64", libm), [], 1, []
     for key, (function, examples) in functions.items():
@@ -131,35 +129,35 @@ def external_functions(
 def _with_derivatives(
     source: Source, symbol: str, function: Callable[..., Any], examples: Sequence[Any], stack: int
 ) -> tuple[Source, str, int]:
-    """The source, the text of a function and its derivatives, and the elements of the largest input."""
+    """Returns the source, the text of a function and its derivatives, and the size of the largest input."""
     try:
         inputs, outputs, flat = _flat(function, examples)
         _check_names(symbol, [*inputs, *outputs])
     except InputError as error:
         raise InputError(f"{symbol}: {error}") from error
     texts, largest = "", 1
-    for prefix, given, results, ways in _derivatives(inputs, outputs, flat):
-        largest = max(largest, *(each.size for each in given))
-        source, text = _function(source, prefix + symbol, given, results, ways, stack)
+    for prefix, blocks, results, ways in _derivatives(inputs, outputs, flat):
+        largest = max(largest, *(block.size for block in blocks))
+        source, text = _function(source, prefix + symbol, blocks, results, ways, stack)
         texts += text
     return source, texts, largest
 
 
 def _flat(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[list[Block], list[Block], Any]:
-    """Inputs, outputs, and the function from all inputs, column-major and end to end, to all outputs likewise."""
+    """Returns inputs, outputs, and the function between the vectors of all inputs and of all outputs, column-major."""
     leaves, tree = jax.tree.flatten(tuple(examples))
     arguments = argument_leaves(function, examples)
     inputs, shapes = [_block(leaf) for leaf in arguments], [np.shape(leaf) for leaf in leaves]
     if not inputs:
         raise InputError("there are no arguments to differentiate with respect to; export it without casadi")
     outputs = [_block(leaf) for leaf in result_leaves(jax.eval_shape(function, *examples), arguments)]
-    cuts = np.cumsum([each.size for each in inputs])[:-1]
+    cuts = np.cumsum([block.size for block in inputs])[:-1]
 
     def flat(x: jax.Array) -> jax.Array:
-        # A matrix that is read in column-major order is its transpose.
-        given = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
-        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
-        return jnp.concatenate([jnp.ravel(jnp.asarray(each).T).astype(x.dtype) for each in results])
+        # Column-major order of a matrix is row-major order of its transpose.
+        arguments = [part.reshape(shape[::-1]).T for part, shape in zip(jnp.split(x, cuts), shapes, strict=True)]
+        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, arguments)))
+        return jnp.concatenate([jnp.ravel(jnp.asarray(result).T).astype(x.dtype) for result in results])
 
     return inputs, outputs, flat
 
@@ -175,20 +173,25 @@ def _block(leaf: Leaf) -> Block:
 
 
 def _check_names(symbol: str, blocks: list[Block]) -> None:
-    names = [prefix + each.name for prefix in ("", "out_", "adj_", "fwd_") for each in blocks]
-    for each in (symbol, *names):
-        if "__" in each or each.endswith("_") or each in ("null", "jac", "hess") or names.count(each) > 1:
-            raise InputError(f"CasADi has no such name as {each}, or derivatives have it too; choose another")
+    names = [prefix + block.name for prefix in ("", "out_", "adj_", "fwd_") for block in blocks]
+    for candidate in (symbol, *names):
+        if (
+            "__" in candidate
+            or candidate.endswith("_")
+            or candidate in ("null", "jac", "hess")
+            or names.count(candidate) > 1
+        ):
+            raise InputError(f"CasADi has no such name as {candidate}, or derivatives have it too; choose another")
 
 
 def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Prefix, inputs and outputs of each function, and ways to compute it from inputs and seeds, the best first."""
+    """Yields prefix, inputs and outputs of all derivatives, and functions that compute them, the cheapest first."""
     x_parts, y_parts = (
-        [slice(*ends) for ends in pairwise([0, *accumulate(each.size for each in blocks)])]
+        [slice(*ends) for ends in pairwise([0, *accumulate(block.size for block in blocks)])]
         for blocks in (inputs, outputs)
     )
 
-    # Rows of a transposed Jacobian are a block's columns.
+    # Rows of the transposed Jacobian are columns of the Jacobian, which CasADi stores one after the other.
     def slopes(way: Any, x: jax.Array, _: Any) -> jax.Array:
         transposed = way(flat, x)
         return jnp.concatenate([transposed[i, j].ravel() for j in y_parts for i in x_parts])
@@ -199,45 +202,45 @@ def _derivatives(inputs: list[Block], outputs: list[Block], flat: Any) -> Iterab
         return jnp.concatenate([block.ravel() for row in blocks for block in row])
 
     def of(prefix: str, blocks: list[Block]) -> list[Block]:
-        return [each._replace(name=f"{prefix}_{each.name}", dense=prefix != "out") for each in blocks]
+        return [block._replace(name=f"{prefix}_{block.name}", dense=prefix != "out") for block in blocks]
 
-    def jacobians(results: list[Block], given: list[Block]) -> list[Block]:
+    def jacobians(results: list[Block], variables: list[Block]) -> list[Block]:
         return [
-            Block(f"jac_{result.name}_{each.name}", result.size, each.rows * each.columns, each.dense)
+            Block(f"jac_{result.name}_{variable.name}", result.size, variable.rows * variable.columns, variable.dense)
             for result in results
-            for each in given
+            for variable in variables
         ]
 
     both, adjoints = [*inputs, *of("out", outputs)], of("adj", inputs)
     seeded, pulls = [*both, *of("adj", outputs)], (sensitivities.pull, sensitivities.pull_forward)
-    more_inputs = sum(each.size for each in inputs) > sum(each.size for each in outputs)
+    more_inputs = sum(block.size for block in inputs) > sum(block.size for block in outputs)
     directions = (sensitivities.forward, sensitivities.reverse)[:: -1 if more_inputs else 1]
     yield "", inputs, outputs, [lambda x, _: flat(x)]
     yield "jac_", both, jacobians(outputs, inputs), [partial(slopes, way) for way in directions]
     yield "fwd1_", [*both, *of("fwd", inputs)], of("fwd", outputs), [partial(sensitivities.push, flat)]
     yield "adj1_", seeded, adjoints, [partial(pull, flat) for pull in pulls]
-    given = [*seeded, *of("out", adjoints)]
-    yield "jac_adj1_", given, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
+    with_adjoints = [*seeded, *of("out", adjoints)]
+    yield "jac_adj1_", with_adjoints, jacobians(adjoints, seeded), [partial(curvature, pull) for pull in pulls]
 
 
 def _function(
     source: Source, symbol: str, inputs: list[Block], outputs: list[Block], ways: Sequence[Any], stack: int
 ) -> tuple[Source, str]:
-    """The source and the C text of the first way that can be compiled."""
+    """Returns the source and the C text by the first method that can be compiled."""
     failure: Exception | None = None
     for way in ways:
         try:
             body = _body(source.copy(), inputs, outputs, way)
-        except (TypeError, ValueError, NotImplementedError) as error:  # what JAX cannot differentiate, or has no C
+        except (TypeError, ValueError, NotImplementedError) as error:  # JAX cannot differentiate it, or it has no C
             failure = error
             continue
         if body.bytes <= stack:
             blocks = [*inputs, *outputs]
             return body.source, _TEXT.format(
                 symbol=symbol,
-                names=", ".join(f'"{each.name}"' for each in blocks),
-                length=3 + max(0 if each.dense else each.columns for each in blocks),
-                sparsities=", ".join(f"{{{each.rows}, {each.columns}, {int(each.dense)}}}" for each in blocks),
+                names=", ".join(f'"{block.name}"' for block in blocks),
+                length=3 + max(0 if block.dense else block.columns for block in blocks),
+                sparsities=", ".join(f"{{{block.rows}, {block.columns}, {int(block.dense)}}}" for block in blocks),
                 operations=body.operations, bytes=body.bytes, inputs=len(inputs), outputs=len(outputs),
                 lines="\n".join(body.lines),
             )  # fmt: skip
@@ -248,9 +251,9 @@ def _function(
 
 
 def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callable[..., jax.Array]) -> Body:
-    cuts = np.cumsum([each.size for each in outputs if each.dense])[:-1]
-    dense = [k for k, each in enumerate(inputs) if each.dense]
-    n = sum(each.size for each in takewhile(lambda each: each.dense, inputs))
+    cuts = np.cumsum([output.size for output in outputs if output.dense])[:-1]
+    dense = [k for k, block in enumerate(inputs) if block.dense]
+    n = sum(block.size for block in takewhile(lambda block: block.dense, inputs))
 
     def evaluate(*columns: jax.Array) -> list[jax.Array]:
         x, seeds = jnp.split(jnp.concatenate(columns), [n])
@@ -265,8 +268,8 @@ def _body(source: Source, inputs: list[Block], outputs: list[Block], way: Callab
             body.line(f"const casadi_real *in_{k} = arg[{k}] ? arg[{k}] : zeros;")
     body.line("(void)arg; (void)integers; (void)reals; (void)memory;")
     region(body, ())
-    writers = written(body, results, apart=False)
-    for j, write in zip((j for j, each in enumerate(outputs) if each.dense), writers, strict=True):
+    writers = result_writers(body, results, apart=False)
+    for j, write in zip((j for j, output in enumerate(outputs) if output.dense), writers, strict=True):
         body.opened(f"if (res[{j}])")
         write(f"res[{j}]")
         body.closed()

@@ -1,4 +1,4 @@
-"""A small C program that calls an export, prints what it gives and times it; and a CMake file that builds both."""
+"""A small C program that calls an export, prints the results and measures the time, and a CMake file for both."""
 
 from collections.abc import Mapping
 from math import prod
@@ -36,9 +36,9 @@ _TIMED = """        if (calls_ > 0) {{
 
 
 def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
-    """Text of NAME_demo.c: prints each function at one state, and with an argument N times N calls of each.
+    """Returns NAME_demo.c, which prints every function at one state and, with an argument N, times N calls.
 
-    Numbers are drawn, but a time step `dt` is a millisecond.
+    Real arguments are random, but a time step `dt` is a millisecond.
     """
     real = PRECISIONS[precision][1]
     kinds = {**KINDS, "real": real}
@@ -47,34 +47,34 @@ def demo(name: str, functions: Mapping[str, Signature], precision: str) -> str:
         f"cc -std=c99 -O3 -march=native {name}.c {name}_demo.c -lm -o {name}_demo\n"
         f"./{name}_demo 1000000    also times a million calls of each",
     ) + _START.format(name=name, real=real)
-    for key, each in functions.items():
-        leaves = [*each.arguments, *each.results]
+    for key, function in functions.items():
+        leaves = [*function.arguments, *function.results]
         names = [leaf.name if leaf.shape else f"{leaf.name}[0]" for leaf in leaves]
-        call = f"{name}_{key}({', '.join(names[: len(names) - each.returns])})"
-        call = f"{names[-1]} = {call}" if each.returns else call
+        call = f"{name}_{key}({', '.join(names[: len(names) - function.returns])})"
+        call = f"{names[-1]} = {call}" if function.returns else call
         text += "    {\n" + "".join(
             f"        static {kinds[leaf.kind]} {leaf.name}[{max(prod(leaf.shape), 1)}];\n" for leaf in leaves
         )
-        for leaf in each.arguments:
+        for leaf in function.arguments:
             value = "uniform_()" if leaf.kind == "real" else "0"
-            value = f"({real})1e-3" if leaf.name == "dt" else value  # the steps of this library have one
+            value = f"({real})1e-3" if leaf.name == "dt" else value  # discrete-time steps have this argument
             text += f"        for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) {leaf.name}[i_] = {value};\n"
         text += f"        {call};\n"
-        for leaf in each.results:
+        for leaf in function.results:
             text += f'        printf("{key} {leaf.name}:");\n'
             text += (
                 f'        for (int i_ = 0; i_ < {prod(leaf.shape)}; ++i_) printf(" %.9g", (double){leaf.name}[i_]);\n'
             )
             text += '        printf("\\n");\n'
-        # Each call's state is another, so that none is left out.
-        first = next((leaf.name for leaf in each.arguments if leaf.kind == "real"), None)
+        # The state changes between calls, so that the compiler cannot remove any.
+        first = next((leaf.name for leaf in function.arguments if leaf.kind == "real"), None)
         moved = f"{first}[0] += ({real})1e-6; " if first else ""
         text += _TIMED.format(moved=moved, call=call, function=f"{name}_{key}") + "    }\n"
     return text + "    return 0;\n}\n"
 
 
 def cmake(name: str) -> str:
-    """Text of CMakeLists.txt: the model as a library, and the demo."""
+    """Returns CMakeLists.txt, which builds the model as a library, and the demo."""
     return f"""# Builds the model as a library and its demo: cmake -B build && cmake --build build
 cmake_minimum_required(VERSION 3.10)
 project({name} C)

@@ -1,4 +1,4 @@
-"""Elementary functions of exported C: plain C99 without branches or tables, which compilers turn into vector code.
+"""Elementary functions in exported C: plain C99 without branches or tables, which compilers vectorise.
 
 Each is right to two units in the last place over its range, with the usual values at zeros, infinities and NaN; only
 `exp` rounds to zero what is below the smallest normal number. The ideas are standard (Cody and Waite, Software Manual
@@ -241,7 +241,7 @@ def _function(name: str, precision: str, ending: str = "") -> str:
 
 
 def _values(precision: str) -> dict[str, str]:
-    """What the texts leave open."""
+    """Returns the values of the placeholders in the C text."""
     numpy_type = PRECISIONS[precision][0]
     mantissa, bias = np.finfo(numpy_type).nmant, np.finfo(numpy_type).maxexp - 1
     word, suffix = {"f64": ("uint64_t", "ULL"), "f32": ("uint32_t", "U")}[precision]

@@ -1,4 +1,4 @@
-"""C of elementwise operations, small products and short sums: element by element, or in loops over arrays."""
+"""C of elementwise operations, small products and short sums: unrolled, or in loops over arrays."""
 
 import numpy as np
 
@@ -7,8 +7,7 @@ from dln_jax.export.c.body import Body
 from dln_jax.export.c.kinds import C_TYPES, NUMPY_TYPES
 from dln_jax.export.c.moves import merged
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.operations import OPERATIONS, VECTORISED
-from dln_jax.export.c.operations import written as written_c
+from dln_jax.export.c.operations import OPERATIONS, VECTORISED, expression
 from dln_jax.export.c.plan import strides
 
 _CHOICES = {
@@ -16,11 +15,11 @@ _CHOICES = {
     "max": "elementary_choice(({0} > {1}) | ({0} != {0}), {0}, {1})",
     "min": "elementary_choice(({0} < {1}) | ({0} != {0}), {0}, {1})",
 }
-"""In loops without a branch, which would keep them from being vectorised."""
+"""C without a branch, for loops, since a branch would prevent vectorisation."""
 
 
-def written_out(body: Body, node: Node) -> None:
-    """The elements of a node that something reads, one by one."""
+def unrolled(body: Body, node: Node) -> None:
+    """Writes the elements of a node that something reads, one statement for every element."""
     dtype = C_TYPES[node.dtype]
     name = body.kept(node) if node in body.plan.arrays else body.name(node)
     for k in np.flatnonzero(body.plan.needed[node]):
@@ -33,26 +32,26 @@ def written_out(body: Body, node: Node) -> None:
 
 
 def _element(body: Body, node: Node, k: int) -> str:
-    if node.op == "contract":
+    if node.op == "dot_general":
         a, b = node.args
         (_, m, count), n = a.shape, b.shape[2]
         batch, row, column = np.unravel_index(k, node.shape)
-        first = [body.read(a, np.array((batch * m + row) * count + each)) for each in range(count)]
-        second = [body.read(b, np.array((batch * count + each) * n + column)) for each in range(count)]
+        first = [body.read(a, np.array((batch * m + row) * count + term)) for term in range(count)]
+        second = [body.read(b, np.array((batch * count + term) * n + column)) for term in range(count)]
         body.spend((2 * count - 1) * (node.dtype == "real"))
         return products.chain(list(zip(first, second, strict=True)), node.dtype)
     if node.op.startswith("reduce_"):
         (a,) = node.args
         count = a.shape[1]
-        terms = [body.read(a, np.array(k * count + each)) for each in range(count)]
+        terms = [body.read(a, np.array(k * count + term)) for term in range(count)]
         return kernels.combined(body, node, k, terms)
     if node.op == "take":
         return f"{body.name(node.args[0])}[{body.read(node.args[1], np.array(k))}]"
-    return _expression(body, node, [body.read(each, np.array(k if each.size > 1 else 0)) for each in node.args])
+    return _expression(body, node, [body.read(arg, np.array(k if arg.size > 1 else 0)) for arg in node.args])
 
 
 def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False) -> str:
-    """C of an elementwise operation."""
+    """Returns the C of an elementwise operation on expressions."""
     operation = OPERATIONS[node.op]
     body.spend(operation.cost * (node.dtype == "real" or node.args[0].dtype == "real"))
     if operation.function in VECTORISED and not body.source.libm:
@@ -66,12 +65,12 @@ def _expression(body: Body, node: Node, args: list[str], *, looped: bool = False
     if name := _checked(node):
         body.source.integers.add(name)
         return f"elementary_{name}({', '.join(args)})"
-    # What is compared has a kind of its own.
-    return written_c(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
+    # The kind of the operands decides: that of a comparison's result is bool.
+    return expression(node.op, node.args[-1].dtype, *args, suffix=body.source.suffix)
 
 
 def _checked(node: Node) -> str | None:
-    """The function of whole numbers that an operation needs, so that it cannot trap."""
+    """Returns the name of the integer function that keeps an operation from trapping, or None if none is needed."""
     if node.op.startswith("shift_"):
         return f"{node.op}_{node.dtype}"
     if node.op in ("integer_div", "integer_rem"):
@@ -85,14 +84,14 @@ def _checked(node: Node) -> str | None:
 
 
 def looped(body: Body, node: Node) -> None:
-    """A loop of elementwise operations that ends in a node."""
+    """Writes a loop of fused elementwise operations that ends in a node."""
     inside = sorted(
-        {node, *(each for each, root in body.plan.root.items() if root is node)}, key=lambda each: each.number
+        {node, *(member for member, root in body.plan.root.items() if root is node)}, key=lambda member: member.number
     )
     where: dict[Node, np.ndarray] = {}
     index = np.arange(node.size).reshape(node.shape)
-    for each in inside:
-        for arg in each.args[1:] if each.op == "take" else each.args:
+    for member in inside:
+        for arg in member.args[1:] if member.op == "take" else member.args:
             if arg not in inside:
                 where[arg] = index if arg.size == node.size else np.zeros_like(index)
     name = body.kept(node)
@@ -105,25 +104,25 @@ def looped(body: Body, node: Node) -> None:
 
     def statements(names: list[str]) -> None:
         text = {arg: body.read(arg, positions.reshape(shape), names) for arg, positions in where.items()}
-        for each in inside:
-            if each.op == "take":
-                written = f"{body.name(each.args[0])}[{text[each.args[1]]}]"
+        for member in inside:
+            if member.op == "take":
+                written = f"{body.name(member.args[0])}[{text[member.args[1]]}]"
             else:
-                written = _expression(body, each, [text[arg] for arg in each.args], looped=True)
-            text[each] = f"v{each.number}"
-            if each is node:
+                written = _expression(body, member, [text[arg] for arg in member.args], looped=True)
+            text[member] = f"v{member.number}"
+            if member is node:
                 body.line(f"{name}[{body.index(index.reshape(shape), names)}] = {written};")
-            elif each.dtype == "bool":
-                text[each] = written
+            elif member.dtype == "bool":
+                text[member] = written
             else:
-                body.line(f"const {C_TYPES[each.dtype]} v{each.number} = {written};")
+                body.line(f"const {C_TYPES[member.dtype]} v{member.number} = {written};")
 
     body.looped(shape, statements)
 
 
 def _steps(body: Body, node: Node, positions: np.ndarray) -> tuple[int, ...] | None:
-    """How far a reading moves along each axis; None where it is a table."""
-    if node.op == "arrange" and node not in body.plan.arrays:
+    """Returns the strides of a reading, or None if it needs a table."""
+    if node.op == "gather" and node not in body.plan.arrays:
         positions = np.asarray(np.asarray(node.value).ravel()[positions])
-    found = strides(positions)
-    return None if found is None else found[1]
+    linear = strides(positions)
+    return None if linear is None else linear[1]

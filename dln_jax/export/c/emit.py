@@ -1,4 +1,4 @@
-"""A planned program as the body of a C function: its regions, elements, loops and control flow."""
+"""Writes a planned program as the body of a C function, region by region."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -12,32 +12,33 @@ from dln_jax.export.c.kinds import C_TYPES
 from dln_jax.export.c.moves import copied
 from dln_jax.export.c.nodes import Loop, Node
 from dln_jax.export.c.operations import OPERATIONS
-from dln_jax.export.c.plan import WRITTEN_OUT, plan_of
+from dln_jax.export.c.plan import UNROLL_LIMIT, plan_of
 from dln_jax.export.c.program import Program
 
 
 def body_of(
     source: Source, program: Program, results: Sequence[Node], inputs, targets: Sequence[str | None], *, apart=False
 ) -> Body:
-    """The body of a function that writes each result to a target, or returns the one without.
+    """Returns the body of a function that writes its results to targets; for [None], that returns its only result.
 
-    Results may overlap arguments, unless they are known to be `apart`.
+    Results may overlap arguments unless `apart` is set.
     """
     body = Body(source, program, plan_of(program, results), inputs)
     region(body, ())
     if targets == [None]:
         body.line(f"return {body.read(results[0], np.array(0))};")
     else:
-        for target, write in zip(targets, written(body, results, apart=apart), strict=True):
+        for target, write in zip(targets, result_writers(body, results, apart=apart), strict=True):
             write(str(target))
     body.bytes += max((source.parts[key].bytes for key in body.calls), default=0)
     return body
 
 
-def written(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callable[[str], None]]:
-    """What writes each result to a target.
+def result_writers(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callable[[str], None]]:
+    """Returns functions that write the results to targets.
 
-    Where these may overlap arguments, elements that are only moved from an argument are read here already.
+    Targets that may overlap arguments must not be written before all arguments are read: results that only move
+    elements of arguments are therefore copied to arrays first.
     """
     writers = []
     for k, node in enumerate(results):
@@ -51,13 +52,13 @@ def written(body: Body, results: Sequence[Node], *, apart: bool) -> list[Callabl
 
 
 def _moved_from_argument(body: Body, node: Node) -> bool:
-    if node.op == "arrange" and node not in body.plan.arrays:
-        return any(_moved_from_argument(body, each) for each in node.args)
+    if node.op == "gather" and node not in body.plan.arrays:
+        return any(_moved_from_argument(body, arg) for arg in node.args)
     return node.op == "input" and not body.inputs[node.attribute][1]
 
 
 def _from_array(body: Body, source: str, size: int, target: str) -> None:
-    if size <= WRITTEN_OUT:
+    if size <= UNROLL_LIMIT:
         for k in range(size):
             body.line(f"{target}[{k}] = {source}[{k}];")
     else:
@@ -65,7 +66,7 @@ def _from_array(body: Body, source: str, size: int, target: str) -> None:
 
 
 def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, only: set[Node] | None = None) -> None:
-    """What is computed in a region and not done yet: all of it, or some nodes."""
+    """Writes the nodes of a region that are not done yet; with `only`, those of them in this set."""
     done = set() if done is None else done
     for node in body.plan.order.get(region, []):
         if node not in done and (only is None or node in only):
@@ -75,36 +76,36 @@ def region(body: Body, region: tuple[int, ...], done: set[Node] | None = None, o
 
 
 def ancestors(body: Body, nodes: Sequence[Node]) -> set[Node]:
-    """These nodes and all that they need, with the loops that compute it."""
-    found, waiting = set(), list(nodes)
+    """Returns these nodes, all nodes that they need, and the loops that compute them."""
+    needed, waiting = set(), list(nodes)
     while waiting:
         node = waiting.pop()
-        if node not in found:
-            found.add(node)
+        if node not in needed:
+            needed.add(node)
             waiting += [*node.args, *([body.plan.root[node]] if node in body.plan.root else [])]
-    return found
+    return needed
 
 
 def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -> None:
     plan = body.plan
     if node.op in ("input", "const", "carry", "counter", "project"):
         return
-    if node.op == "arrange":
+    if node.op == "gather":
         if node in plan.arrays:
             copied(body, node, body.kept(node), own=True)
-    elif node in plan.written_out:
-        elements.written_out(body, node)
-    elif node.op == "contract":
+    elif node in plan.unrolled:
+        elements.unrolled(body, node)
+    elif node.op == "dot_general":
         members = [
-            each for each in plan.order[node.region]
-            if each.op == "contract" and each not in done and each not in plan.written_out
-            and (only is None or each in only)
-            and each.args[1] is node.args[1] and plan.levels[each] == plan.levels[node]
+            other for other in plan.order[node.region]
+            if other.op == "dot_general" and other not in done and other not in plan.unrolled
+            and (only is None or other in only)
+            and other.args[1] is node.args[1] and plan.levels[other] == plan.levels[node]
         ]  # fmt: skip
         done.update(members)
-        products.contracted(body, [node, *members])
-        for each in members:
-            body.finished(each)
+        products.dot_general(body, [node, *members])
+        for member in members:
+            body.finished(member)
     elif node.op in OPERATIONS or node.op == "take":
         elements.looped(body, node)
     else:
@@ -112,19 +113,19 @@ def _computed(body: Body, node: Node, done: set[Node], only: set[Node] | None) -
 
 
 def part(caller: Body, key: Any) -> Called:
-    """A function that is called, written where it was not yet."""
+    """Returns the C function for a called program, written on first use."""
     source = caller.source
     if key not in source.parts:
         program, results = caller.program.parts[key]
-        inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda each: each.attribute)
-        named = {each.attribute: (f"a{each.attribute}_", False) for each in inputs}
+        inputs = sorted((node for node in program.nodes if node.op == "input"), key=lambda argument: argument.attribute)
+        named = {argument.attribute: (f"a{argument.attribute}_", False) for argument in inputs}
         targets = [f"r{k}_" for k in range(len(results))]
         body = body_of(source, program, results, named, targets, apart=True)
-        parameters = [f"const {C_TYPES[each.dtype]} *RESTRICT a{each.attribute}_" for each in inputs]
+        parameters = [f"const {C_TYPES[argument.dtype]} *RESTRICT a{argument.attribute}_" for argument in inputs]
         parameters += [
-            f"{C_TYPES[each.dtype]} *RESTRICT {target}" for each, target in zip(results, targets, strict=True)
+            f"{C_TYPES[result.dtype]} *RESTRICT {target}" for result, target in zip(results, targets, strict=True)
         ]
-        unused = [f"    (void)a{each.attribute}_;" for each in inputs if not body.uses(each)]
+        unused = [f"    (void)a{argument.attribute}_;" for argument in inputs if not body.uses(argument)]
         lines = "\n".join([*unused, *body.lines])
         text = f"({', '.join(parameters)})\n{{\n{lines}\n}}\n"
         name = source.names.setdefault(text, f"part_{len(source.names)}")
@@ -145,19 +146,19 @@ def _call(body: Body, node: Node) -> None:
 
 
 def _stored(body: Body, node: Node, handed_on: list[Node], turns: list[int] | None = None) -> list[str]:
-    """Declares what control flow hands on, and each of its turns leaves, whether it is read or not."""
+    """Declares the arrays of carries and stacked outputs of control flow, read or not, and returns their names."""
     number = np.ravel(node.attribute)[0]
     read = body.projected(node)
     names = [f"c{number}_{index}" for index in range(len(handed_on))]
-    for name, each, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
-        body.declared(name, each.dtype, max(each.size * count, 1))
+    for name, result, count in zip(names, handed_on, turns or [1] * len(names), strict=True):
+        body.declared(name, result.dtype, max(result.size * count, 1))
     for name in (name for index, name in enumerate(names) if index not in read):
         body.line(f"(void){name};")
     return names
 
 
 def _handed_on(body: Body, loop: Loop, names: list[str], number: int) -> None:
-    """New carries from the results of a turn, which may be old carries."""
+    """Writes the new carries, through temporaries: results of an iteration may be the old carries in another order."""
     moved = loop.results[: len(names)]
     temporary = [f"n{number}_{index}" for index in range(len(moved))]
     for name, node in zip(temporary, moved, strict=True):
@@ -190,19 +191,19 @@ def _repeat(body: Body, node: Node) -> None:
     for name, start in zip(names, node.args, strict=True):
         copied(body, start, name)
     read = body.projected(node)
-    stacked = {carried + k: each for k, each in enumerate(loop.results[carried:]) if carried + k in read}
+    stacked = {carried + k: result for k, result in enumerate(loop.results[carried:]) if carried + k in read}
     turn = f"{length - 1} - t{number}" if loop.reverse else f"t{number}"
     body.opened(f"for (int t{number} = 0; t{number} < {length}; ++t{number})", max(length, 1))
-    counters = (each for each in body.plan.needed if each.op == "counter" and each.attribute == number)
+    counters = (counter for counter in body.plan.needed if counter.op == "counter" and counter.attribute == number)
     if stacked or any(map(body.uses, counters)):
         body.line(f"const long long i_{number} = {turn};")
     region(body, (*node.region, number))
-    for index, each in stacked.items():
+    for index, result in stacked.items():
         body.opened("")
-        body.declared(f"n{number}_{index}", each.dtype, max(each.size, 1))
-        copied(body, each, f"n{number}_{index}")
-        target = f"c{number}_{index}[i_{number} * {each.size} + k_]"
-        body.line(f"for (int k_ = 0; k_ < {each.size}; ++k_) {target} = n{number}_{index}[k_];")
+        body.declared(f"n{number}_{index}", result.dtype, max(result.size, 1))
+        copied(body, result, f"n{number}_{index}")
+        target = f"c{number}_{index}[i_{number} * {result.size} + k_]"
+        body.line(f"for (int k_ = 0; k_ < {result.size}; ++k_) {target} = n{number}_{index}[k_];")
         body.closed()
     _handed_on(body, loop, names, number)
     body.closed(max(length, 1))

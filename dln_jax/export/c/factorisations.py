@@ -1,6 +1,6 @@
-"""Factorisations of small dense matrices in C, and triangular solves."""
+"""C of factorisations of small dense matrices, and of triangular solves."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from textwrap import dedent
 
 from dln_jax.export.c.body import Body
@@ -8,7 +8,7 @@ from dln_jax.export.c.moves import copied
 from dln_jax.export.c.nodes import Node
 
 _SWEEPS = 7
-"""Sweeps of Jacobi's rotations that are counted; random matrices of six rows need 5 to 7, of forty 8 to 10."""
+"""Jacobi sweeps that the operation count assumes; random matrices of 6 rows need 5 to 7, of 40 rows 8 to 10."""
 
 FUNCTIONS = {
     "cholesky": """
@@ -182,33 +182,33 @@ FUNCTIONS = {
     }
     """,
 }
-"""C functions that are put into a source that needs them."""
+"""C functions by the name of their node; a source contains those that it calls."""
 
 
 def definitions(names: Collection[str], suffix: str) -> str:
-    """C text of these functions."""
+    """Returns the C text of the named functions."""
     text = "".join("\n" + dedent(FUNCTIONS[name]).strip() + "\n" for name in FUNCTIONS if name in names)
     return text.replace("SQRT(", f"sqrt{suffix}(").replace("FABS(", f"fabs{suffix}(")
 
 
+def _call(body: Body, node: Node, sizes: Sequence[int], operations: int = 0) -> None:
+    """Writes a call of the node's C function with sizes, pointers to the arguments, and the array for the result."""
+    body.source.kernels.add(node.op)
+    target = body.kept(node)
+    prefix = "" if node.op in ("cholesky", "triangular_solve") else "elementary_"
+    arguments = [*map(str, sizes), *map(body.pointer, node.args), target]
+    body.line(f"{prefix}{node.op}({', '.join(arguments)});")
+    body.spend(operations)
+
+
 def _cholesky(body: Body, node: Node) -> None:
-    (a,) = node.args
-    n = a.shape[0]
-    body.source.kernels.add("cholesky")
-    body.kept(node)
-    body.line(f"cholesky({n}, {body.pointer(a)}, {body.pointer(node)});")
-    body.spend(n * (n + 1) * (n + 2) // 3)
+    n, _ = node.shape
+    _call(body, node, [n], n * (n + 1) * (n + 2) // 3)
 
 
 def _triangular_solve(body: Body, node: Node) -> None:
-    a, b = node.args
-    n, columns = b.shape
-    lower, unit = map(int, node.attribute)
-    body.source.kernels.add("triangular_solve")
-    body.kept(node)
-    sizes = f"{n}, {columns}, {lower}, {unit}"
-    body.line(f"triangular_solve({sizes}, {body.pointer(a)}, {body.pointer(b)}, {body.pointer(node)});")
-    body.spend(n * n * columns)
+    n, columns = node.shape
+    _call(body, node, [n, columns, *map(int, node.attribute)], n * n * columns)
 
 
 def _lu(body: Body, node: Node) -> None:
@@ -223,30 +223,17 @@ def _lu(body: Body, node: Node) -> None:
 
 
 def _permutation(body: Body, node: Node) -> None:
-    (pivots,) = node.args
-    body.source.kernels.add("permutation")
-    target = body.kept(node)
-    body.line(f"elementary_permutation({node.size}, {pivots.size}, {body.pointer(pivots)}, {target});")
+    _call(body, node, [node.size, node.args[0].size])
 
 
 def _geqrf(body: Body, node: Node) -> None:
-    (a,) = node.args
-    m, n = a.shape
-    body.source.kernels.add("geqrf")
-    target = body.kept(node)
-    body.line(f"elementary_geqrf({m}, {n}, {body.pointer(a)}, {target});")
-    body.spend(2 * m * n * min(m, n))
+    m, n = node.args[0].shape
+    _call(body, node, [m, n], 2 * m * n * min(m, n))
 
 
 def _householder_product(body: Body, node: Node) -> None:
-    a, tau = node.args
-    m, n = a.shape
-    body.source.kernels.add("householder_product")
-    target = body.kept(node)
-    body.line(
-        f"elementary_householder_product({m}, {n}, {tau.size}, {body.pointer(a)}, {body.pointer(tau)}, {target});"
-    )
-    body.spend(2 * m * n * tau.size)
+    (m, n), k = node.shape, node.args[1].size
+    _call(body, node, [m, n, k], 2 * m * n * k)
 
 
 def _eigh(body: Body, node: Node) -> None:
@@ -269,4 +256,4 @@ WRITERS = {
     "householder_product": _householder_product,
     "eigh": _eigh,
 }
-"""By the name of the node."""
+"""Functions that write a node, by its operation."""

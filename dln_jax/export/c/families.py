@@ -1,6 +1,6 @@
-"""What is exported of a run or of a system: pure functions of one state with examples of their arguments, by name.
+"""The functions that are exported from a run or a system: pure functions of one state, with example arguments.
 
-In coordinates and velocities, x = (q, qd), of every system on which forces act:
+For a system with forces, in coordinates and velocities, x = (q, qd):
 
 | name | arguments | results |
 |---|---|---|
@@ -12,13 +12,14 @@ In coordinates and velocities, x = (q, qd), of every system on which forces act:
 | `torque_std`, `outside` | q, qd, qdd | tau_std; outside |
 | `step_rk4`, `step_implicit_midpoint` | x, u, dt | x_next |
 
-In a phase space, of rates and of Hamiltonians, without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p;
-`phase_step_rk4`, `phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. Of a differential network `value`,
-`value_and_jacobian`, `value_jacobian_hessian` (y, jacobian, hessian) of x. Of pictures those of their latent phase, and
-`encode` (q, p) of two frames, and `decode` (frames) of q, p.
+For a phase space without forces: `rates` (qd, pd) and `hamiltonian` (H) of q, p, and `phase_step_rk4`,
+`phase_step_implicit_midpoint` (q_next, p_next) of q, p, dt. For a differential network: `value`, `value_and_jacobian`,
+`value_jacobian_hessian` (y, jacobian, hessian) of x. For a model of images: the functions of its latent phase space,
+`encode` (q, p) of two images, and `decode` (frames) of q, p.
 
-NAME_jacobian has the derivative of each result by each argument, as tau_q [d, d], with the argument's axes last; for a
-step of x also x_next, and A and B; of a scalar it is NAME_gradient. What a system lacks is not there.
+NAME_jacobian returns the derivatives of all results with respect to all arguments, such as tau_q [d, d], with the
+argument's axes last; for a step of x it returns x_next, A and B; for a scalar it is called NAME_gradient. A function
+that a system lacks is missing.
 """
 
 import functools
@@ -56,32 +57,32 @@ from dln_jax.zoo.pictures import PictureModel
 from dln_jax.zoo.run import Run
 
 Function = Callable[..., Mapping[str, Array]]
-"""Arrays, by the names of its parameters -> arrays by name."""
+"""A function of arrays that returns arrays by name."""
 Functions = dict[str, tuple[Function, tuple[np.ndarray, ...]]]
-"""By name, a function and one example of each argument, of its shape and type."""
+"""name -> (function, one example per argument, with its shape and dtype)."""
 Named = dict[str, Function]
 DERIVATIVES = ("_jacobian", "_gradient", "_hessian")
-"""How names of functions end that are derivatives of others."""
+"""Endings of the names of derivatives."""
 LARGEST_FACTOR = 250_000
-"""Numbers of a covariance's factor that go into C, where they take some 24 bytes each; a larger one stays in Python."""
+"""Largest number of entries of a covariance factor that is exported, at some 24 bytes of C per entry."""
 SCALARS = ("energy", "hamiltonian")
-"""Functions with one number as their result, whose derivative is a gradient."""
+"""Functions with a scalar result, whose derivative is a gradient."""
 
 
 def functions_of_run(
     run: Run, *, precision: str, names: Iterable[str] | None = None, iterations: int = ITERATIONS
 ) -> Functions:
-    """The functions of a trained model.
+    """Returns the functions of a trained model.
 
     Args:
-        run: loaded.
+        run: the loaded run.
         precision: f32 or f64, to which the parameters are converted.
-        names: of those wanted; all by default.
+        names: names of the functions to return; default: all.
         iterations: as for `functions_of_system`.
 
     Raises:
-        InputError: a name that the model has no function of, parameters that the precision cannot hold, or a model of
-            one's own in another precision than its training's, or without needs.
+        InputError: the model has no function of a name, the precision cannot hold a parameter, or a user-defined model
+            is exported without needs or in another precision than that of its training.
     """
     functions = _of_run(run, precision, iterations)
     chosen = list(functions) if names is None else list(names)
@@ -100,17 +101,17 @@ def functions_of_system(
     actuation: Actuation = None,
     iterations: int = ITERATIONS,
 ) -> Functions:
-    """The functions of a system, known or learned.
+    """Returns the functions of a known or learned system.
 
     Args:
-        system: a record of energies, or of what is known in their place: for a scene its `closed_form`.
+        system: a record of energies or of closed-form dynamics, such as the `closed_form` of a scene.
         degrees_of_freedom: d.
-        dtype: of the arguments.
-        actuation: matrix [d, u] of the steps, tau = actuation u; by default u is tau.
+        dtype: dtype of the arguments.
+        actuation: matrix [d, u] with tau = actuation u, for the steps; default: u is tau.
         iterations: Newton steps of the implicit midpoint rule, as for `mechanics.discrete.implicit_midpoint`.
     """
     d = degrees_of_freedom
-    # Networks take long to trace: each once, and not for every function that it occurs in.
+    # Networks take long to trace: jitted, they are traced once and not for every function that contains them.
     traced = _traced_once(system)
     functions: Named = {}
     if not isinstance(system, PhaseRates):
@@ -122,15 +123,15 @@ def functions_of_system(
 
 
 def _traced_once(system: Any) -> Any:
-    """Its functions jitted."""
-    fields = {name: jax.jit(each) for name, each in system._asdict().items() if callable(each)}
+    """Returns the system with jitted functions."""
+    fields = {name: jax.jit(field) for name, field in system._asdict().items() if callable(field)}
     if isinstance(system, LoadedSystem):
         fields["link"] = _traced_once(system.link)
     return system._replace(**fields)
 
 
 def _link(system: System) -> Any:
-    """Of a system behind transmissions, that without them."""
+    """Returns the system without its transmissions."""
     return system.link if isinstance(system, LoadedSystem) else system
 
 
@@ -168,11 +169,14 @@ def _converted(dtype: Any, leaf: Array) -> Array:
 
 
 def _with_examples(functions: Named, dtype: DTypeLike, size: int, **shapes: tuple[int, ...]) -> Functions:
-    """Every argument is a vector of this size, but for those of other shapes."""
+    """Pairs functions with examples: vectors of this size, except the arguments with other shapes."""
     shapes["dt"] = ()
     return {
-        name: (each, tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(each).parameters))
-        for name, each in functions.items()
+        name: (
+            function,
+            tuple(np.zeros(shapes.get(key, (size,)), dtype) for key in inspect.signature(function).parameters),
+        )
+        for name, function in functions.items()
     }
 
 
@@ -180,7 +184,8 @@ def _of_dynamics(system: Driven, d: int, actuation: Actuation, iterations: int) 
     motion = dynamics(system, degrees_of_freedom=d)
     forward, with_jacobians = jacobians.differentiable_forward_dynamics(system, degrees_of_freedom=d)
     inverse_jacobians, coriolis_jacobians = (
-        functools.partial(each, system) for each in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
+        functools.partial(jacobian, system)
+        for jacobian in (jacobians.inverse_dynamics_jacobians, jacobians.coriolis_jacobians)
     )
     link = _link(system)
     natural = isinstance(link, Natural)
@@ -243,7 +248,7 @@ def _of_layers(layers: Layers, activation: Activation) -> Named:
     def mean(derivatives: Callable[..., Any]) -> Function:
         def function(x: Array) -> Any:
             every = [derivatives(tuple(member), x, activation=activation) for member in members]
-            return jax.tree.map(lambda *each: sum(each) / len(members), *every)
+            return jax.tree.map(lambda *results: sum(results) / len(members), *every)
 
         return function
 
@@ -255,11 +260,11 @@ def _of_layers(layers: Layers, activation: Activation) -> Named:
 
 
 def _named(function: Callable[..., Any], *results: str) -> Function:
-    """The same with its results by name, and the same parameters."""
+    """Returns the function with named results and unchanged parameters."""
 
     @functools.wraps(function)
     def call(*state: Array) -> dict[str, Array]:
-        # Of this sort, since JAX sorts the names of others.
+        # JAX sorts the keys of a plain dictionary, and keeps the order of this one.
         return OrderedDict(zip(results, jax.tree.leaves(function(*state)), strict=True))
 
     return call
@@ -273,19 +278,19 @@ def _linearised(name: str, step: Callable[..., Any], results: Sequence[str], slo
 
 
 def _with_derivatives(name: str, function: Function) -> Named:
-    """The function, and the derivatives of its results by its arguments."""
+    """Returns the function, and a function of the derivatives of its results with respect to its arguments."""
     arguments = list(inspect.signature(function).parameters)
     places = range(len(arguments))
 
     @functools.wraps(function)
     def derivatives(*state: Array) -> Mapping[str, Array]:
-        rows = sum(each.size for each in jax.tree.leaves(jax.eval_shape(function, *state)))
-        if rows < sum(each.size for each in state):
+        rows = sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(function, *state)))
+        if rows < sum(array.size for array in state):
             slopes = jax.jacrev(function, argnums=tuple(places))(*state)
         else:
-            # By each apart: what does not depend on it passes nothing.
-            each = [jax.jacfwd(function, argnums=place)(*state) for place in places]
-            slopes = {result: [slope[result] for slope in each] for result in each[0]}
+            # One argument at a time: results that do not depend on it need no derivatives.
+            columns = [jax.jacfwd(function, argnums=place)(*state) for place in places]
+            slopes = {result: [slope[result] for slope in columns] for result in columns[0]}
         return OrderedDict((f"{result}_{arguments[k]}", by[k]) for result, by in slopes.items() for k in places)
 
     return {name: function, f"{name}_{'gradient' if name in SCALARS else 'jacobian'}": derivatives}

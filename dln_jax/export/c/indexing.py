@@ -1,4 +1,4 @@
-"""Gather, scatter and dynamic slices as flat positions, which are numbers where the indices are known beforehand."""
+"""Rules for gather, scatter, dynamic slices and sort, by flat positions, which are constants if the indices are."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ _ELEMENTWISE = {f"put_{name}": name for name in ("add", "sub", "mul", "min", "ma
 _UPDATES = {"scatter": "put_set", **{f"scatter-{name}": op for op, name in _ELEMENTWISE.items()}}
 
 
-def gather(program: Program, parameters: dict[str, Any], operand: Node, indices: Node) -> Node:
-    """`lax.gather`; windows that reach out of the operand are moved inside, or filled."""
+def _gather(program: Program, parameters: dict[str, Any], operand: Node, indices: Node) -> Node:
+    """Applies `lax.gather`; windows that reach outside the operand are moved inside, or filled."""
     numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     window = [size for axis, size in enumerate(sizes) if axis not in dropped]
@@ -33,28 +33,28 @@ def gather(program: Program, parameters: dict[str, Any], operand: Node, indices:
     def placed(array: np.ndarray) -> np.ndarray:
         return np.broadcast_to(array, (*batch, *window)).transpose(order)
 
-    each = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
+    windows = np.arange(int(np.prod(batch, dtype=int))).reshape((*batch, *[1] * len(window)))
     positions = program.elementwise(
-        "add", program.arrange([start], placed(each)), program.constant(placed(offsets), "index")
+        "add", program.gather([start], placed(windows)), program.constant(placed(offsets), "index")
     )
     taken = take(program, operand, positions)
     if inside is None:
         return taken
     fill = parameters["fill_value"]
     fill = _filled(operand.dtype) if fill is None else fill
-    return program.select(program.arrange([inside], placed(each)), program.constant(fill, operand.dtype), taken)
+    return program.select(program.gather([inside], placed(windows)), program.constant(fill, operand.dtype), taken)
 
 
 def _filled(kind: str) -> Any:
-    """What JAX fills places outside with, where nothing is said."""
+    """Returns JAX's default fill value for positions outside the operand."""
     if kind in ("real", "bool"):
         return np.nan if kind == "real" else True
     limits = np.iinfo(NUMPY_TYPES[kind])
     return limits.max if kind in UNSIGNED else limits.min
 
 
-def scatter(name: str):
-    """The rule of `lax.scatter` and its kin."""
+def _scatter(name: str):
+    """Returns the rule of `lax.scatter`, or of its variant that combines updates."""
 
     def rule(program: Program, parameters: dict[str, Any], operand: Node, indices: Node, updates: Node) -> Node:
         numbers = parameters["dimension_numbers"]
@@ -69,62 +69,62 @@ def scatter(name: str):
             tuple(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True)),
         )  # fmt: skip
         outer = [axis for axis in range(len(updates.shape)) if axis not in numbers.update_window_dims]
-        arranged = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
-        each = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
-        shape = arranged.shape
+        order = np.arange(updates.size).reshape(updates.shape).transpose([*outer, *numbers.update_window_dims])
+        windows = np.arange(start.size).reshape((*start.shape, *[1] * len(window)))
+        shape = order.shape
         offsets = program.constant(np.broadcast_to(_offsets(operand.shape, kept, window), shape), "index")
-        targets = program.elementwise("add", program.arrange([start], np.broadcast_to(each, shape)), offsets)
+        targets = program.elementwise("add", program.gather([start], np.broadcast_to(windows, shape)), offsets)
         if inside is not None:
             minus = program.constant(-1, "index")
-            targets = program.select(program.arrange([inside], np.broadcast_to(each, shape)), minus, targets)
-        return put(program, _UPDATES[name], operand, targets, program.arrange([updates], arranged))
+            targets = program.select(program.gather([inside], np.broadcast_to(windows, shape)), minus, targets)
+        return _put(program, _UPDATES[name], operand, targets, program.gather([updates], order))
 
     return rule
 
 
 def take(program: Program, operand: Node, positions: Node) -> Node:
-    """Flat elements of the operand at positions, which are inside."""
+    """Returns the elements of the flat operand at positions, which must be inside."""
     if is_constant(positions):
-        return program.arrange([operand], values(positions))
+        return program.gather([operand], values(positions))
     return program.make("take", positions.shape, operand.dtype, [operand, positions])
 
 
-def put(program: Program, op: str, operand: Node, targets: Node, updates: Node) -> Node:
-    """The operand with updates at flat targets; negative targets are dropped."""
+def _put(program: Program, op: str, operand: Node, targets: Node, updates: Node) -> Node:
+    """Returns the operand with updates at flat targets; negative targets are dropped."""
     if not is_constant(targets):
         return program.make(op, operand.shape, operand.dtype, [operand, targets, updates])
     flat, index = values(targets).ravel(), np.arange(operand.size)
     if op == "put_set":
         index[flat[flat >= 0]] = operand.size + np.flatnonzero(flat >= 0)
-        return program.arrange([operand, updates], index.reshape(operand.shape))
+        return program.gather([operand, updates], index.reshape(operand.shape))
     left = np.flatnonzero(flat >= 0)
-    while left.size:  # one pass for each time that a target repeats
+    while left.size:  # a pass handles one update of every target
         _, first = np.unique(flat[left], return_index=True)
         now = left[first]
         combined = program.elementwise(
-            _ELEMENTWISE[op], program.arrange([operand], flat[now]), program.arrange([updates], now)
+            _ELEMENTWISE[op], program.gather([operand], flat[now]), program.gather([updates], now)
         )
         index = np.arange(operand.size)
         index[flat[now]] = operand.size + np.arange(now.size)
-        operand = program.arrange([operand, combined], index.reshape(operand.shape))
+        operand = program.gather([operand, combined], index.reshape(operand.shape))
         left = np.delete(left, first)
     return operand
 
 
-def dynamic_slice(program: Program, parameters: dict[str, Any], operand: Node, *starts: Node) -> Node:
-    """`lax.dynamic_slice`."""
+def _dynamic_slice(program: Program, parameters: dict[str, Any], operand: Node, *starts: Node) -> Node:
+    """Applies `lax.dynamic_slice`."""
     sizes = parameters["slice_sizes"]
     positions = _window(program, operand.shape, sizes, starts[: len(sizes)])
     return take(program, operand, positions)
 
 
-def dynamic_update_slice(program: Program, _, operand: Node, update: Node, *starts: Node) -> Node:
-    """`lax.dynamic_update_slice`."""
-    return put(program, "put_set", operand, _window(program, operand.shape, update.shape, starts), update)
+def _dynamic_update_slice(program: Program, _, operand: Node, update: Node, *starts: Node) -> Node:
+    """Applies `lax.dynamic_update_slice`."""
+    return _put(program, "put_set", operand, _window(program, operand.shape, update.shape, starts), update)
 
 
-def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
-    """`lax.sort` along an axis by the first `num_keys` arrays: stable, and NaN comes last."""
+def _sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Node]:
+    """Applies `lax.sort` along an axis by the first `num_keys` arrays: stable, NaN last."""
     axis, shape = parameters["dimension"], nodes[0].shape
     if shape[axis] < 2 or nodes[0].size == 0:
         return list(nodes)
@@ -132,11 +132,11 @@ def sort(program: Program, parameters: dict[str, Any], *nodes: Node) -> list[Nod
     order = program.make("order", rows[0].shape, "index", rows[: parameters["num_keys"]])
     last = np.moveaxis(np.empty(shape), axis, -1).shape
     back = np.moveaxis(np.arange(nodes[0].size).reshape(last), -1, axis)
-    return [program.arrange([take(program, each, order)], back) for each in rows]
+    return [program.gather([take(program, row, order)], back) for row in rows]
 
 
 def _window(program: Program, shape, sizes, starts) -> Node:
-    """Flat positions of a window whose corner is clamped into the operand."""
+    """Returns the flat positions of a window whose corner is clamped into the operand."""
     flat = program.constant(0, "index")
     for axis, start in enumerate(starts):
         flat = _plus(program, flat, _clamped(program, start, shape[axis] - sizes[axis]), _stride(shape, axis))
@@ -145,17 +145,19 @@ def _window(program: Program, shape, sizes, starts) -> Node:
 
 
 def _starts(program: Program, indices: Node, shape, sizes, axes, mode, batched) -> tuple[Node, Node | None]:
-    """Flat position of each window's corner, and whether the windows are inside where those outside are dropped."""
+    """Returns the flat positions of the windows' corners; if windows outside are dropped, also which are inside."""
     batch = indices.shape[:-1]
     index = np.arange(indices.size).reshape(indices.shape)
     flat = program.constant(np.zeros(batch, np.int64), "index")
     for axis, of_indices in batched:
-        counted = np.arange(batch[of_indices]).reshape([-1 if each == of_indices else 1 for each in range(len(batch))])
+        counted = np.arange(batch[of_indices]).reshape(
+            [-1 if dimension == of_indices else 1 for dimension in range(len(batch))]
+        )
         corner = np.broadcast_to(counted, batch) * _stride(shape, axis)
         flat = program.elementwise("add", flat, program.constant(corner, "index"))
     fills, inside = "FILL" in str(mode).upper(), None
     for component, axis in enumerate(axes):
-        start, last = program.arrange([indices], index[..., component]), shape[axis] - sizes[axis]
+        start, last = program.gather([indices], index[..., component]), shape[axis] - sizes[axis]
         if fills:
             start = _index(program, start, last + 1)
             within = program.elementwise(
@@ -175,10 +177,10 @@ def _clamped(program: Program, start: Node, last: int) -> Node:
     return program.elementwise("min", program.elementwise("max", _index(program, start, last), low), high)
 
 
-def _index(program: Program, start: Node, most: int) -> Node:
-    """As an index, which does not hold all unsigned numbers of 64 bits: those are bounded before."""
+def _index(program: Program, start: Node, upper: int) -> Node:
+    """Returns an index, clamped before the conversion if it is unsigned with 64 bits, which an index cannot hold."""
     if start.dtype == "unsigned_long":
-        start = program.elementwise("min", start, program.constant(max(most, 0), start.dtype))
+        start = program.elementwise("min", start, program.constant(max(upper, 0), start.dtype))
     return convert(program, start, "index")
 
 
@@ -191,19 +193,19 @@ def _stride(shape, axis: int | np.integer) -> int:
 
 
 def _offsets(shape, axes, sizes) -> np.ndarray:
-    """Flat offsets [sizes] of a window that spans the given axes."""
+    """Returns the flat offsets [sizes] of a window along these axes."""
     offsets = np.zeros([1] * len(sizes), np.int64)
     for place, (axis, size) in enumerate(zip(axes, sizes, strict=True)):
         steps = np.arange(size) * _stride(shape, axis)
-        offsets = offsets + steps.reshape([-1 if each == place else 1 for each in range(len(sizes))])
+        offsets = offsets + steps.reshape([-1 if other == place else 1 for other in range(len(sizes))])
     return offsets
 
 
 RULES = {
-    "gather": gather,
-    "dynamic_slice": dynamic_slice,
-    "dynamic_update_slice": dynamic_update_slice,
-    "sort": sort,
-    **{name: scatter(name) for name in _UPDATES},
+    "gather": _gather,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "sort": _sort,
+    **{name: _scatter(name) for name in _UPDATES},
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""

@@ -1,4 +1,4 @@
-"""What an exported source declares: functions, their arguments and results, and the description that states them."""
+"""Interface of an exported source: signatures of its functions, their C declarations, and the JSON description."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -14,14 +14,14 @@ from dln_jax.export.exports import AGAIN, read_export
 from dln_jax.types import InputError
 
 FORMAT = 4
-"""Version of the names and signatures in exported sources, and of their description."""
+"""Version of the names and signatures in exported sources and of the JSON description."""
 LARGEST = 1 << 22
-"""Numbers of an argument or result."""
+"""Largest number of elements of an argument or result."""
 KINDS = {kind: c for kind, c in C_TYPES.items() if kind != "index"}
 
 
 class Leaf(NamedTuple):
-    """An argument or a result."""
+    """An array among the arguments or results of a C function."""
 
     name: str
     kind: str
@@ -29,7 +29,7 @@ class Leaf(NamedTuple):
 
 
 class Signature(NamedTuple):
-    """Of one function."""
+    """Arguments, results and cost of a C function."""
 
     arguments: tuple[Leaf, ...]
     results: tuple[Leaf, ...]
@@ -38,23 +38,23 @@ class Signature(NamedTuple):
 
     @property
     def returns(self) -> bool:
-        """Whether it returns its one number, in place of writing to an array."""
+        """Whether the function returns its only result, a scalar, instead of writing to an array."""
         return len(self.results) == 1 and self.results[0].shape == ()
 
 
 def argument_leaves(function: Callable[..., Any], examples: Sequence[Any]) -> list[Leaf]:
-    """Arguments by the names of the function's parameters; a tree's leaves by their path too."""
+    """Returns the argument arrays, named after the function's parameters and, in a tree, the path of the leaf."""
     try:
         names = list(inspect.signature(function).parameters)
     except (ValueError, TypeError):
         names = []
     names += [f"argument_{k}" for k in range(len(names), len(examples))]
-    leaves = [leaf for name, each in zip(names, examples, strict=False) for leaf in _leaves(name, each)]
+    leaves = [leaf for name, example in zip(names, examples, strict=False) for leaf in _leaves(name, example)]
     return _checked(leaves, "argument")
 
 
 def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
-    """Results by their keys, `result` where there are none."""
+    """Returns the result arrays, named after their keys, or `result` if there are none."""
     leaves = _leaves("", shapes) if jax.tree.structure(shapes) != jax.tree.structure(0) else _leaves("result", shapes)
     used = {leaf.name for leaf in taken}
     leaves = [leaf._replace(name=f"{leaf.name}_result") if leaf.name in used else leaf for leaf in leaves]
@@ -62,14 +62,14 @@ def result_leaves(shapes: Any, taken: Sequence[Leaf]) -> list[Leaf]:
 
 
 def _leaves(name: str, tree: Any) -> list[Leaf]:
-    found = []
+    leaves = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         parts = [str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", "")))) for key in path]
         whole = "_".join(part for part in (name, *parts) if part)
         whole = f"result_{whole}" if whole[:1].isdigit() else whole
         array = leaf if hasattr(leaf, "dtype") else np.asarray(leaf)
-        found.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
-    return found
+        leaves.append(Leaf(whole, kind_of(jax.dtypes.canonicalize_dtype(array.dtype)), tuple(map(int, array.shape))))
+    return leaves
 
 
 def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
@@ -83,44 +83,44 @@ def _checked(leaves: list[Leaf], what: str) -> list[Leaf]:
 
 
 def declaration(name: str, function: str, signature: Signature, real: str) -> str:
-    """The prototype of a function, without its semicolon."""
+    """Returns the prototype of a function, without the semicolon."""
     kinds = {**KINDS, "real": real}
     parameters = [
-        f"{kinds[kind]} {each}" if shape == () else f"const {kinds[kind]} {each}[{_length(shape)}]"
-        for each, kind, shape in signature.arguments
+        f"{kinds[kind]} {argument}" if shape == () else f"const {kinds[kind]} {argument}[{_length(shape)}]"
+        for argument, kind, shape in signature.arguments
     ]
     result = "void"
     if signature.returns:
         result = str(kinds[signature.results[0].kind])
     else:
-        parameters += [f"{kinds[kind]} {each}[{_length(shape)}]" for each, kind, shape in signature.results]
+        parameters += [f"{kinds[kind]} {result}[{_length(shape)}]" for result, kind, shape in signature.results]
     return f"{result} {name}_{function}({', '.join(parameters) or 'void'})"
 
 
 def _length(shape: tuple[int, ...]) -> int:
-    """Of an array in C, which has no empty ones."""
+    """Returns the length of an array in C, at least 1, because C has no empty arrays."""
     return max(int(np.prod(shape)), 1)
 
 
 def description(name: str, precision: str, version: str, functions: Mapping[str, Signature]) -> dict[str, Any]:
-    """JSON values that state an export."""
+    """Returns the JSON description of an export, without digests."""
     stated = {
         key: {
-            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.arguments],
-            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in each.results],
-            "stack_bytes": each.stack_bytes,
-            "operations": each.operations,
+            "arguments": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.arguments],
+            "results": [[leaf.name, leaf.kind, list(leaf.shape)] for leaf in function.results],
+            "stack_bytes": function.stack_bytes,
+            "operations": function.operations,
         }
-        for key, each in functions.items()
+        for key, function in functions.items()
     }
     return {"format": FORMAT, "version": version, "name": name, "precision": precision, "functions": stated}
 
 
 def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature], dict[str, bytes]]:
-    """Precision and signatures of an export, nothing merely believed, with its header and source.
+    """Returns the precision and the signatures of an export, checked against its header, and its files.
 
     Raises:
-        InputError: a file is missing or altered, the format is another, or what is stated contradicts the header.
+        InputError: a file is missing or altered, the format differs, or the description contradicts the header.
     """
     path = directory / f"{name}.json"
     stated, files = read_export(path, (f"{name}.h", f"{name}.c"))
@@ -130,9 +130,9 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
     try:
         if stated.get("name") != name or precision not in PRECISIONS:
             raise InputError(f"name is {stated.get('name')!r:.60} and precision {precision!r:.60}")
-        functions = {str(key): _signature(each) for key, each in dict(stated["functions"]).items()}
-        for key, each in functions.items():
-            if f"{declaration(name, check_name(key), each, PRECISIONS[precision][1])};" not in header:
+        functions = {str(key): _signature(value) for key, value in dict(stated["functions"]).items()}
+        for key, function in functions.items():
+            if f"{declaration(name, check_name(key), function, PRECISIONS[precision][1])};" not in header:
                 raise InputError(f"{key} is not declared so in {name}.h")
     except (InputError, TypeError, ValueError, KeyError) as error:
         raise InputError(f"{path}: contradicts itself ({error!s:.200}); {AGAIN}") from error
@@ -141,11 +141,11 @@ def read_interface(directory: Path, name: str) -> tuple[str, dict[str, Signature
 
 def _signature(stated: Any) -> Signature:
     def leaves(key: str) -> tuple[Leaf, ...]:
-        found = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
-        for leaf in found:
+        known = tuple(Leaf(check_name(name), kind, tuple(shape)) for name, kind, shape in stated[key])
+        for leaf in known:
             counts = all(type(size) is int and size >= 0 for size in leaf.shape)
             if leaf.kind not in KINDS or not counts or np.prod(leaf.shape, dtype=float) > LARGEST:
                 raise InputError(f"{leaf.name} is {leaf}")
-        return found
+        return known
 
     return Signature(leaves("arguments"), leaves("results"))

@@ -1,4 +1,4 @@
-"""What jaxprs say about themselves: how they are made, what they call, and where each equation comes from."""
+"""Jaxprs: how to make them, which calls they repeat, and which line of Python an equation comes from."""
 
 import hashlib
 from collections import Counter
@@ -12,14 +12,14 @@ from jax.extend import core
 from dln_jax.types import InputError
 
 _LARGE_CALL = 600
-"""Equations from which on a jitted function that is called several times is a C function of its own."""
+"""Smallest number of equations at which a jitted function that is called several times becomes a C function."""
 
 
 def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, Any]:
-    """The closed jaxpr of a function, and the tree of its results.
+    """Returns the closed jaxpr of a function, and the tree of its results.
 
     Raises:
-        InputError: side effects, or whole numbers beyond 64 bits.
+        InputError: the function has side effects, or integers beyond 64 bits.
     """
     try:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
@@ -31,28 +31,30 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Jaxprs, by `id`, of jitted functions that are large and that these closed ones seem to call several times.
+    """Returns the `id`s of the large jaxprs that these closed jaxprs seem to call several times.
 
-    Calls that look alike here become one function only if their programs are identical, see `Program.identity`.
+    Calls that look alike here become one function only if their programs are identical (`Program.identity`).
     """
     known: dict[int, tuple[int, bytes]] = {}
     counts: Counter[bytes] = Counter()
 
     def visit(jaxpr: Any, consts: Sequence[Any]) -> tuple[int, bytes]:
-        """Number of equations, those of calls included, and a digest of primitives, types and constants."""
+        """Returns the number of equations, calls included, and a digest of primitives, types and constants."""
         size, digest = 0, hashlib.sha256()
-        for each in consts:
-            digest.update(np.asarray(each).tobytes())
+        for const in consts:
+            digest.update(np.asarray(const).tobytes())
         for equation in jaxpr.eqns:
             within = 0
             literals = [variable.val for variable in equation.invars if hasattr(variable, "val")]
             types = [
-                (each.aval.shape, str(each.aval.dtype)) for each in equation.outvars if hasattr(each.aval, "dtype")
+                (variable.aval.shape, str(variable.aval.dtype))
+                for variable in equation.outvars
+                if hasattr(variable.aval, "dtype")
             ]
             digest.update(repr((equation.primitive.name, types)).encode())
-            digest.update(b"".join(np.asarray(each).tobytes() for each in literals))
+            digest.update(b"".join(np.asarray(literal).tobytes() for literal in literals))
             values = equation.params.values() if _of_jax(equation.primitive) else ()
-            for inner in (each for value in values for each in _jaxprs(value)):
+            for inner in (nested for value in values for nested in _jaxprs(value)):
                 inside, likeness = called(inner)
                 within += inside
                 digest.update(likeness)
@@ -70,30 +72,31 @@ def repeated_calls(every: Sequence[Any]) -> set[int]:
 
     for closed in every:
         visit(closed.jaxpr, closed.consts)
-    return {each for each, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
+    return {identity for identity, (size, likeness) in known.items() if size >= _LARGE_CALL and counts[likeness] > 1}
 
 
 def _jaxprs(value: Any) -> list[Any]:
     if isinstance(value, list | tuple):
-        return [each for one in value for each in _jaxprs(one)]
+        return [jaxpr for item in value for jaxpr in _jaxprs(item)]
     return [value] if hasattr(value, "eqns") or hasattr(value, "jaxpr") else []
 
 
 def expanded(primitive: Any) -> Any:
-    """What JAX 0.11 keeps of a function with derivatives of its own, such as `custom_root`, in other primitives."""
+    """Returns the jaxpr of a high-level primitive of JAX 0.11, such as `custom_root`, in ordinary primitives."""
 
     def expand(*leaves: Any) -> list[Any]:
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
 
-    examples = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in primitive.in_avals_flat]
+    examples = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in primitive.in_avals_flat]
     return jax.make_jaxpr(expand)(*examples)
 
 
 def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
-    """What a primitive of another library, such as Equinox, is in JAX's own: its `impl`; None for one of JAX's own.
+    """Returns the jaxpr of the `impl` of a primitive of another library, such as Equinox; None for JAX's primitives.
 
     Args:
-        known: the numbers of each argument that is constant, None for others; only those are arguments of the jaxpr.
+        equation: that applies the primitive.
+        known: values of the constant arguments, None for the others, which become the arguments of the jaxpr.
     """
     primitive = equation.primitive
     if _of_jax(primitive):
@@ -101,20 +104,20 @@ def implementation(equation: Any, known: Sequence[Any]) -> Any | None:
 
     def run(*unknown: Any) -> list[Any]:
         left = iter(unknown)
-        args = [next(left) if each is None else each for each in known]
+        args = [next(left) if value is None else value for value in known]
         return jax.tree.leaves(primitive.impl(*args, **equation.params))
 
-    avals = [variable.aval for variable, each in zip(equation.invars, known, strict=True) if each is None]
-    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(each.shape, each.dtype) for each in avals))
+    avals = [variable.aval for variable, value in zip(equation.invars, known, strict=True) if value is None]
+    return jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals))
 
 
 def _of_jax(primitive: Any) -> bool:
-    """Whether a primitive is one of JAX's own."""
+    """Returns whether JAX itself defines a primitive."""
     return getattr(primitive.impl, "func", primitive.impl).__module__.partition(".")[0] == "jax"
 
 
 def is_error_of_equinox(equation: Any) -> bool:
-    """Whether an equation is the callback that raises the error of `equinox.error_if`."""
+    """Returns whether an equation is the callback that raises the error of `equinox.error_if`."""
     if equation.primitive.name != "pure_callback":
         return False
     callback = equation.params["callback"]
@@ -122,12 +125,12 @@ def is_error_of_equinox(equation: Any) -> bool:
 
 
 def closed_jaxpr(jaxpr: Any) -> Any:
-    """With its constants, which an open one has not."""
+    """Returns a jaxpr as a closed one; an open jaxpr has no constants."""
     return jaxpr if hasattr(jaxpr, "consts") else core.ClosedJaxpr(jaxpr, ())
 
 
 def made_at(equation: Any) -> str:
-    """File and line of the user's code that made an equation, nothing where the call around it knows."""
+    """Returns " (made at FILE:LINE)" for the user's code that made an equation, or "" if JAX kept no traceback."""
     traceback = equation.source_info.traceback
     frames = [] if traceback is None else list(traceback.frames)
     users = [frame for frame in frames if "/jax/" not in frame.file_name and "/dln_jax/export/" not in frame.file_name]
@@ -135,9 +138,9 @@ def made_at(equation: Any) -> str:
 
 
 def scanned(equation: Any) -> dict[str, int]:
-    """How many arguments of a scan are the same in each turn, and carried: releases of JAX state it differently.
+    """Returns how many arguments of a scan are constant ("fixed") and how many are carried.
 
-    What is stacked has another shape outside than inside.
+    Releases of JAX store these numbers differently, so they are counted: stacked arguments differ in shape inside.
     """
     inner = closed_jaxpr(equation.params["jaxpr"]).jaxpr
 

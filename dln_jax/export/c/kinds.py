@@ -1,4 +1,4 @@
-"""Kinds of numbers in a program: what each is in C and in NumPy."""
+"""The number types of a program, and their names in C and in NumPy."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ C_TYPES: Mapping[str, str] = {
     "unsigned_long": "uint64_t",
     "index": "long long",
 }
-"""An `index` counts elements of arrays: it is computed by the program itself and cannot overflow."""
+"""C type of each kind. An `index` counts array elements; only the program computes it, so it cannot overflow."""
 NUMPY_TYPES: Mapping[str, Any] = {
     "bool": np.bool_,
     "int": np.int32,
@@ -26,18 +26,18 @@ NUMPY_TYPES: Mapping[str, Any] = {
     "unsigned_long": np.uint64,
     "index": np.int64,
 }
-"""Real numbers have the precision of the export."""
+"""NumPy type of each kind but `real`, which has the precision of the export."""
 SIGNED = ("int", "long")
-"""Whole numbers that overflow without a definition in C."""
+"""Integer kinds whose overflow C leaves undefined."""
 UNSIGNED = ("unsigned", "unsigned_long")
 _KINDS = {"float32": "real", "float64": "real", "bool": "bool", "int32": "int"}
-# The type of what has no derivative: nothing is computed with it.
+# JAX gives tangents of integers this type; no program computes with them.
 _KINDS |= {str(jax.dtypes.float0): "bool"}
 _KINDS |= {"int64": "long", "uint32": "unsigned", "uint64": "unsigned_long"}
 
 
 def kind_of(dtype: Any) -> str:
-    """The kind of a JAX type; InputError for a type that has no C."""
+    """Returns the kind of a JAX dtype, and raises InputError if C has none."""
     if str(dtype) not in _KINDS:
         hint = "random numbers are drawn outside" if str(dtype).startswith("key<") else "cast it to 32 or 64 bits"
         raise InputError(f"an array has type {dtype}, which generated C does not have; {hint}")

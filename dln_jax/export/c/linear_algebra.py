@@ -1,4 +1,4 @@
-"""Factorisations and triangular solves, which become loops of their own in C."""
+"""Rules for factorisations and triangular solves, which C computes in functions of its own."""
 
 from math import prod
 from typing import Any
@@ -11,18 +11,18 @@ from dln_jax.types import InputError
 
 
 def _matrices(program: Program, node: Node) -> list[Node]:
-    """Each [rows, columns] of a batch."""
+    """Returns the matrices of a batch."""
     index = np.arange(node.size).reshape(-1, *node.shape[-2:])
-    return [program.arrange([node], each) for each in index]
+    return [program.gather([node], positions) for positions in index]
 
 
 def _stacked(program: Program, nodes: list[Node], shape: Any) -> Node:
-    return program.arrange(nodes, np.arange(sum(node.size for node in nodes)).reshape(shape))
+    return program.gather(nodes, np.arange(sum(node.size for node in nodes)).reshape(shape))
 
 
 def _cholesky(program: Program, _, a: Node) -> Node:
-    each = [program.make("cholesky", one.shape, "real", [one]) for one in _matrices(program, a)]
-    return _stacked(program, each, a.shape)
+    factors = [program.make("cholesky", one.shape, "real", [one]) for one in _matrices(program, a)]
+    return _stacked(program, factors, a.shape)
 
 
 def _triangular_solve(program: Program, parameters: dict[str, Any], a: Node, b: Node) -> Node:
@@ -58,31 +58,31 @@ def _lu(program: Program, _, a: Node) -> list[Node]:
 def _permutation(program: Program, parameters: dict[str, Any], pivots: Node) -> Node:
     size = parameters["permutation_size"]
     index = np.arange(pivots.size).reshape(-1, pivots.shape[-1])
-    each = [program.make("permutation", (size,), "int", [program.arrange([pivots], row)]) for row in index]
-    return _stacked(program, each, (*pivots.shape[:-1], size))
+    orders = [program.make("permutation", (size,), "int", [program.gather([pivots], row)]) for row in index]
+    return _stacked(program, orders, (*pivots.shape[:-1], size))
 
 
 def _parts(program: Program, nodes: list[Node], first: int, shape: tuple[int, ...], batch: list[int]) -> Node:
-    """An array of that shape from each flat node, read from element `first` on."""
+    """Returns a batch of arrays of this shape, read from flat nodes starting at element `first`."""
     index = first + np.arange(prod(shape))
-    return _stacked(program, [program.arrange([each], index) for each in nodes], (*batch, *shape))
+    return _stacked(program, [program.gather([node], index) for node in nodes], (*batch, *shape))
 
 
 def _geqrf(program: Program, _, a: Node) -> list[Node]:
     (*batch, m, n), k = a.shape, min(a.shape[-2:])
-    nodes = [program.make("geqrf", (m * n + k,), "real", [each]) for each in _matrices(program, a)]
+    nodes = [program.make("geqrf", (m * n + k,), "real", [matrix]) for matrix in _matrices(program, a)]
     return [_parts(program, nodes, 0, (m, n), batch), _parts(program, nodes, m * n, (k,), batch)]
 
 
 def _householder_product(program: Program, _, a: Node, tau: Node) -> Node:
     rows = program.reshape(tau, (-1, tau.shape[-1]))
-    factors = [program.arrange([rows], row) for row in np.arange(rows.size).reshape(rows.shape)]
+    factors = [program.gather([rows], row) for row in np.arange(rows.size).reshape(rows.shape)]
     pairs = zip(_matrices(program, a), factors, strict=True)
     return _stacked(program, [program.make("householder_product", x.shape, "real", [x, t]) for x, t in pairs], a.shape)
 
 
 def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
-    """Composed of the two rules above as in JAX."""
+    """Applies `qr` by the two rules above, as JAX does."""
     (*batch, m, n), full = a.shape, parameters["full_matrices"]
     if parameters["pivoting"]:
         raise InputError("the primitive 'qr' has C without pivoting; got pivoting=True")
@@ -92,19 +92,19 @@ def _qr(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
     zero, rows, columns = program.constant(0.0, "real"), m if full else min(m, n), m if full or m < n else n
     index = np.arange(a.size).reshape(a.shape)
     wide = np.pad(index, [(0, 0)] * (len(batch) + 1) + [(0, max(columns - n, 0))], constant_values=a.size)
-    q = _householder_product(program, {}, program.arrange([packed, zero], wide[..., :columns]), tau)
+    q = _householder_product(program, {}, program.gather([packed, zero], wide[..., :columns]), tau)
     upper = np.where(np.arange(rows)[:, None] <= np.arange(n), index[..., :rows, :], a.size)
-    return [q, program.arrange([packed, zero], upper)]
+    return [q, program.gather([packed, zero], upper)]
 
 
 def _eigh(program: Program, parameters: dict[str, Any], a: Node) -> list[Node]:
-    """Reads the lower or upper triangle alone; the signs of eigenvectors may differ from LAPACK's."""
+    """Applies `eigh` to the lower or upper triangle; the signs of eigenvectors may differ from LAPACK's."""
     *batch, n, _ = a.shape
     if parameters["subset_by_index"] not in (None, (0, n)):
         raise InputError("the primitive 'eigh' has C for all eigenvalues; got subset_by_index")
     row, column = np.sort(np.indices((n, n)), axis=0)[:: -1 if parameters["lower"] else 1]
-    matrices = [program.arrange([each], row * n + column) for each in _matrices(program, a)]
-    nodes = [program.make("eigh", (n * n + n,), "real", [each]) for each in matrices]
+    matrices = [program.gather([matrix], row * n + column) for matrix in _matrices(program, a)]
+    nodes = [program.make("eigh", (n * n + n,), "real", [matrix]) for matrix in matrices]
     return [_parts(program, nodes, 0, (n, n), batch), _parts(program, nodes, n * n, (n,), batch)]
 
 
@@ -118,4 +118,4 @@ RULES = {
     "lu": _lu,
     "lu_pivots_to_permutation": _permutation,
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""

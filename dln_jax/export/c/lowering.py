@@ -1,4 +1,4 @@
-"""A JAX function as a program: its jaxpr with calls inlined and control flow kept."""
+"""Lowers a jaxpr to a program: inlines calls, keeps control flow, and applies a rule for every primitive."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -23,7 +23,7 @@ _CALLS = {
 _REFUSED = {
     "random": "random numbers; draw them outside and pass them as arguments",
     "threefry": "random numbers; draw them outside and pass them as arguments",
-    "callback": "a callback into Python, which a robot has not",
+    "callback": "a callback into Python, which C cannot call",
     "debug_print": "printing, a side effect",
 }
 _RULES = {**primitives.RULES, **reductions.RULES, **indexing.RULES, **linear_algebra.RULES}
@@ -33,16 +33,16 @@ _TYPED_RULES = {**primitives.TYPED_RULES, **reductions.TYPED_RULES}
 def program_of(
     closed: Any, repeated: Collection[int] = (), *, precision: str = "f64"
 ) -> tuple[Program, list[Node], list[Node]]:
-    """The program of a closed jaxpr, its inputs and its results.
+    """Returns the program of a closed jaxpr, its inputs and its results.
 
     Args:
-        closed: as `jaxprs.traced`.
-        repeated: calls of these jaxprs, by `id`, are calls in the program too.
-        precision: of real numbers.
+        closed: the jaxpr, as `jaxprs.traced` returns it.
+        repeated: `id`s of jaxprs whose calls stay calls in the program.
+        precision: f32 or f64.
 
     Raises:
-        InputError: what has no C: an unsupported primitive, with the line that made it, random numbers, another type of
-            number, a shape that is not known.
+        InputError: the jaxpr has no C: an unsupported primitive (the message names the line that made it), random
+            numbers, an unsupported dtype, or a shape that is unknown at compile time.
     """
     program = Program(real=PRECISIONS[precision][0], repeated=repeated)
     inputs = [
@@ -53,7 +53,7 @@ def program_of(
 
 
 def _inline(program: Program, closed: Any, args: Sequence[Node]) -> list[Node]:
-    """Results of a closed jaxpr."""
+    """Returns the results of a closed jaxpr."""
     jaxpr = closed.jaxpr
     known: dict[Any, Node] = {}
 
@@ -109,25 +109,23 @@ def _apply(program: Program, equation: Any, args: list[Node]) -> list[Node]:
         return [_TYPED_RULES[name](program, parameters, *args, dtype=dtype)]
     if name not in _RULES:
         why = next((reason for part, reason in _REFUSED.items() if part in name), None)
-        inner = (
-            None if why else implementation(equation, [values(each) if is_constant(each) else None for each in args])
-        )
+        inner = None if why else implementation(equation, [values(arg) if is_constant(arg) else None for arg in args])
         if inner is not None:
-            return _inline(program, inner, [each for each in args if not is_constant(each)])
+            return _inline(program, inner, [arg for arg in args if not is_constant(arg)])
         raise InputError(f"'{name}' is {why}" if why else f"the primitive '{name}' has no C")
     results = _RULES[name](program, parameters, *args)
     return list(results) if isinstance(results, list | tuple) else [results]
 
 
 def _failed(program: Program, aval: Any) -> Node:
-    """What stands for an error that C cannot raise: NaN, the largest whole number, or true, as by EQX_ON_ERROR=nan."""
+    """Returns the value for an error that C cannot raise: NaN, the largest integer or true (EQX_ON_ERROR=nan)."""
     kind = kind_of(aval.dtype)
     value = np.nan if kind == "real" else kind == "bool" or np.iinfo(NUMPY_TYPES[kind]).max
     return program.broadcast(program.constant(value, kind), aval.shape)
 
 
 def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
-    """A call of a function of its own, which has the constants among its arguments inside."""
+    """Returns the results of a call; constant arguments become part of the called function."""
     fixed = {k: arg for k, arg in enumerate(args) if is_constant(arg)}
     call = id(closed), tuple((k, values(arg).tobytes()) for k, arg in fixed.items())
     if call not in program.lowered:
@@ -135,17 +133,16 @@ def _call(program: Program, closed: Any, args: list[Node]) -> list[Node]:
         inside = [
             part.constant(values(arg), arg.dtype)
             if k in fixed
-            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(each < k for each in fixed))
+            else part.make("input", arg.shape, arg.dtype, attribute=k - sum(place < k for place in fixed))
             for k, arg in enumerate(args)
         ]
         results = _inline(part, closed, inside)
         program.lowered[call] = part.identity(results)
         program.parts.setdefault(program.lowered[call], Part(part, results))
     key = program.lowered[call]
-    shapes = [(each.shape, each.dtype) for each in program.parts[key].results]
+    shapes = [(result.shape, result.dtype) for result in program.parts[key].results]
     passed = [arg for k, arg in enumerate(args) if k not in fixed]
-    node = program.make("call", (), "int", passed, attribute=key)
-    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
+    return _projections(program, program.make("call", (), "int", passed, attribute=key), shapes)
 
 
 def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -156,7 +153,7 @@ def _custom_linear_solve(program: Program, parameters: dict[str, Any], args: lis
 
 
 def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], int]:
-    """Where a loop over these nodes is, and its number."""
+    """Returns the region of a loop over these nodes, and its number."""
     number = len(program.loops)
     program.loops[number] = Loop([], [], [])
     return max((program.floor, *(node.region for node in nodes)), key=len), number
@@ -165,16 +162,13 @@ def _region(program: Program, nodes: Sequence[Node]) -> tuple[tuple[int, ...], i
 def _carries(program: Program, number: int, outer: tuple[int, ...], start: Sequence[Node]) -> list[Node]:
     region = (*outer, number)
     return [
-        program.make("carry", each.shape, each.dtype, attribute=(number, index), region=region)
-        for index, each in enumerate(start)
+        program.make("carry", carry.shape, carry.dtype, attribute=(number, index), region=region)
+        for index, carry in enumerate(start)
     ]
 
 
-def _projections(program: Program, op: str, number: int, outer, start, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
-    loop = program.make(op, (), "int", start, attribute=number, region=outer)
-    return [
-        program.make("project", shape, dtype, [loop], attribute=index) for index, (shape, dtype) in enumerate(shapes)
-    ]
+def _projections(program: Program, node: Node, shapes: Sequence[tuple[Any, str]]) -> list[Node]:
+    return [program.make("project", shape, dtype, [node], k) for k, (shape, dtype) in enumerate(shapes)]
 
 
 def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -185,7 +179,8 @@ def _while(program: Program, parameters: dict[str, Any], args: list[Node]) -> li
     (condition,) = _inline(program, parameters["cond_jaxpr"], [*of_condition, *carries])
     results = _inline(program, parameters["body_jaxpr"], [*of_body, *carries])
     program.loops[number] = Loop(carries, [condition], results)
-    return _projections(program, "while", number, outer, start, [(each.shape, each.dtype) for each in start])
+    loop = program.make("while", (), "int", start, attribute=number, region=outer)
+    return _projections(program, loop, [(carry.shape, carry.dtype) for carry in start])
 
 
 def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -194,21 +189,21 @@ def _scan(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     length, reverse = parameters["length"], parameters["reverse"]
     if length == 0:
         left = parameters["jaxpr"].out_avals[count:]
-        return [*start, *(program.constant(np.zeros((0, *each.shape)), kind_of(each.dtype)) for each in left)]
+        return [*start, *(program.constant(np.zeros((0, *aval.shape)), kind_of(aval.dtype)) for aval in left)]
     outer, number = _region(program, args)
     carries = _carries(program, number, outer, start)
     turn = program.make("counter", (), "index", attribute=number, region=(*outer, number))
     slices = []
-    for each in stacked:
-        size = each.size // max(length, 1)
-        offsets = program.constant(np.arange(size).reshape(each.shape[1:]), "index")
+    for array in stacked:
+        size = array.size // max(length, 1)
+        offsets = program.constant(np.arange(size).reshape(array.shape[1:]), "index")
         first = program.elementwise("mul", turn, program.constant(size, "index"))
-        slices.append(indexing.take(program, each, program.elementwise("add", first, offsets)))
+        slices.append(indexing.take(program, array, program.elementwise("add", first, offsets)))
     results = _inline(program, parameters["jaxpr"], [*fixed, *carries, *slices])
     program.loops[number] = Loop(carries, [], results, length, reverse)
-    shapes = [(each.shape, each.dtype) for each in start]
-    shapes += [((length, *each.shape), each.dtype) for each in results[count:]]
-    return _projections(program, "repeat", number, outer, start, shapes)
+    shapes = [(carry.shape, carry.dtype) for carry in start]
+    shapes += [((length, *result.shape), result.dtype) for result in results[count:]]
+    return _projections(program, program.make("repeat", (), "int", start, attribute=number, region=outer), shapes)
 
 
 def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> list[Node]:
@@ -226,15 +221,15 @@ def _cond(program: Program, parameters: dict[str, Any], args: list[Node]) -> lis
     program.floor = floor
     for inside, results in every:
         program.loops[inside] = Loop([], [], results)
-    shapes = [(each.shape, each.dtype) for each in every[0][1]]
+    shapes = [(result.shape, result.dtype) for result in every[0][1]]
     numbers = tuple(inside for inside, _ in every)
     branch = program.make("branch", (), "int", [which], attribute=numbers, region=outer)
-    return [program.make("project", shape, dtype, [branch], attribute=k) for k, (shape, dtype) in enumerate(shapes)]
+    return _projections(program, branch, shapes)
 
 
 def _platform(program: Program, parameters: dict[str, Any], _) -> list[Node]:
-    """Which branch is that of a processor: the one for all others, where none is its own."""
-    places = [k for k, each in enumerate(parameters["platforms"]) if each is None or "cpu" in each]
+    """Returns the index of the branch for the CPU: its own, or the default."""
+    places = [k for k, parameter in enumerate(parameters["platforms"]) if parameter is None or "cpu" in parameter]
     return [program.constant(np.int32(places[0]), "int")]
 
 

@@ -1,4 +1,4 @@
-"""Copies of what moves elements: boxes of them that a loop can follow, each from one source."""
+"""C that copies the elements of gathers, split into boxes that one loop nest can read from one source."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -6,22 +6,22 @@ from itertools import pairwise
 import numpy as np
 
 from dln_jax.export.c.body import Body
-from dln_jax.export.c.nodes import Node
-from dln_jax.export.c.plan import WRITTEN_OUT, strides
+from dln_jax.export.c.nodes import Node, owners, read_source
+from dln_jax.export.c.plan import UNROLL_LIMIT, strides
 
 _BOXES = 6
-"""Up to which each is a loop; positions are read from tables where there were more."""
+"""Largest number of boxes that become loops of their own; more are read through tables of positions."""
 
 
 def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[int]:
-    """The shape with neighbouring axes as one where all readings allow it; never without an axis."""
+    """Returns the shape with neighbouring axes merged where all readings allow it; at least one axis remains."""
     result: list[int] = []
     kept: list[int] = []
     for axis, extent in enumerate(shape):
         if extent == 1 and len(shape) > 1 and (result or axis + 1 < len(shape)):
             continue
         before = kept[-1] if kept else None
-        joined = before is not None and all(each is not None and each[before] == each[axis] * extent for each in steps)
+        joined = before is not None and all(step is not None and step[before] == step[axis] * extent for step in steps)
         if joined:
             result[-1] *= extent
             kept[-1] = axis
@@ -32,10 +32,10 @@ def merged(shape: Sequence[int], steps: list[tuple[int, ...] | None]) -> list[in
 
 
 def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
-    """Copies all elements of a node to an array; to its own, from where they come."""
+    """Writes a copy of a node to an array; with `own`, the array that is to hold a gather."""
     index = np.arange(node.size).reshape(node.shape)
     stored = node in body.plan.arrays and not own
-    if node.size <= WRITTEN_OUT and not stored:
+    if node.size <= UNROLL_LIMIT and not stored:
         for k in range(node.size):
             body.line(f"{target}[{k}] = {_moved(body, node, np.array(k), own)};")
         return
@@ -51,21 +51,15 @@ def copied(body: Body, node: Node, target: str, *, own: bool = False) -> None:
 
 
 def _moved(body: Body, node: Node, positions: np.ndarray, own: bool, names: Sequence[str] = ()) -> str:
-    """Reading, through an arrange that is itself kept where it is its own copy."""
-    if not (own and node.op == "arrange"):
-        return body.read(node, positions, names)
-    starts = np.cumsum([0, *(each.size for each in node.args)])
-    inside = np.asarray(np.asarray(node.value).ravel()[positions])
-    first = int(np.searchsorted(starts, inside.flat[0], side="right")) - 1
-    return body.read(node.args[first], np.asarray(inside - starts[first]), names)
+    """Returns the C expression of elements; with `own`, of the sources of a gather that an array will hold."""
+    return body.read(*(read_source(node, positions) if own and node.op == "gather" else (node, positions)), names)
 
 
 def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Boxes of elements that a loop can follow, each from one source."""
-    if node.op != "arrange" or node.value is None:
+    """Splits the elements into boxes, such that one loop nest reads a box from one source."""
+    if node.op != "gather" or node.value is None:
         return [index]
-    starts = np.cumsum([0, *(each.size for each in node.args)])
-    owner = (np.searchsorted(starts, node.value, side="right") - 1).ravel()
+    owner = owners(node.args, node.value)[0].ravel()
     flat = node.value.ravel()
 
     def split(box: np.ndarray) -> list[np.ndarray]:
@@ -73,9 +67,11 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
         if strides(at) is not None and (of == of.flat[0]).all():
             return [box]
         cuts = {axis: _runs(np.moveaxis(at, axis, 0), np.moveaxis(of, axis, 0)) for axis in range(at.ndim)}
-        axis = min((each for each in cuts if len(cuts[each]) > 2), key=lambda each: len(cuts[each]), default=None)
+        axis = min(
+            (choice for choice in cuts if len(cuts[choice]) > 2), key=lambda choice: len(cuts[choice]), default=None
+        )
         if axis is None:
-            axis = next(each for each in range(at.ndim) if at.shape[each] > 1)
+            axis = next(choice for choice in range(at.ndim) if at.shape[choice] > 1)
             cuts[axis] = list(range(at.shape[axis] + 1))
         return [
             part
@@ -87,19 +83,18 @@ def _boxes(node: Node, index: np.ndarray) -> list[np.ndarray]:
 
 
 def _by_source(node: Node, index: np.ndarray) -> list[np.ndarray]:
-    """Elements of each source, [leading axes along which the source is the same, its elements of the others]."""
-    starts = np.cumsum([0, *(each.size for each in node.args)])
-    owner = np.searchsorted(starts, np.asarray(node.value), side="right") - 1
+    """Returns the elements of every source, as [axes along which the source does not change, the rest as one axis]."""
+    owner, _ = owners(node.args, np.asarray(node.value))
     leading = []
     while len(leading) < index.ndim - 1 and (owner == owner[:1]).all():
         leading.append(index.shape[len(leading)])
         owner = owner[0]
     rows = index.reshape(*leading, -1)
-    return [rows[..., owner.ravel() == each] for each in np.unique(owner)]
+    return [rows[..., owner.ravel() == source] for source in np.unique(owner)]
 
 
 def _runs(at: np.ndarray, owner: np.ndarray) -> list[int]:
-    """Where runs of rows from the same sources with equal steps begin, and the end."""
+    """Returns the starts, and the end, of the runs of rows with the same sources and equal steps."""
     steps, cuts = np.diff(at, axis=0), [0]
     for row in range(1, len(at)):
         first = cuts[-1]

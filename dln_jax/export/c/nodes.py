@@ -1,5 +1,6 @@
-"""Nodes of a program of small arrays, and what is known about them beforehand."""
+"""Nodes of a program of small arrays, and their values where they are constant."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any, NamedTuple
@@ -7,26 +8,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Region = tuple[int, ...]
-"""The loops and branches that a node is in, outermost first."""
+"""Numbers of the loops and branches around a node, outermost first."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """An array that a program computes; equal ones are the same object."""
+    """An array that a program computes; equal nodes are one object."""
 
     op: str
     shape: tuple[int, ...]
     dtype: str
-    """A kind of `kinds.C_TYPES`."""
+    """Key of `kinds.C_TYPES`."""
     args: tuple["Node", ...]
     attribute: Any
     value: np.ndarray | None
-    """Numbers of a `const`, positions of an `arrange` [shape]."""
+    """Numbers of a `const`, or positions [shape] of a `gather`."""
     region: Region
     number: int
 
     def __hash__(self) -> int:
-        """Its number: an address would order sets of nodes, and so the text, differently in each process."""
+        """Returns the number, because an address would order sets of nodes, and so the text, anew in each process."""
         return self.number
 
     @property
@@ -36,48 +37,62 @@ class Node:
 
 
 class Loop(NamedTuple):
-    """Inside of a `while`, `repeat` or `branch`."""
+    """Body of a `while` or `repeat`, or one case of a `branch`."""
 
     carries: list[Node]
-    """What a turn starts with; nothing for a branch."""
+    """State at the start of an iteration; empty for a branch."""
     conditions: list[Node]
-    """Whether there is another turn, of a `while`."""
+    """Condition of a `while` for another iteration."""
     results: list[Node]
-    """New carries, then what each turn of a `repeat` leaves; results of each branch in turn."""
+    """New carries, then the stacked outputs of a `repeat`; the results of a branch."""
     length: int | None = None
-    """Turns of a `repeat`."""
+    """Iterations of a `repeat`."""
     reverse: bool = False
 
 
 def is_constant(node: Node) -> bool:
-    """Whether it is known beforehand."""
-    return node.op == "const" or (node.op == "arrange" and all(each.op == "const" for each in node.args))
+    """Returns whether the value is known at compile time."""
+    return node.op == "const" or (node.op == "gather" and all(arg.op == "const" for arg in node.args))
 
 
 def values(node: Node) -> np.ndarray:
-    """Numbers of a node that is known beforehand."""
+    """Returns the value of a constant node."""
     if node.op == "const":
         return np.asarray(node.value)
-    return np.asarray(np.concatenate([values(each).ravel() for each in node.args])[np.asarray(node.value)])
+    return np.asarray(np.concatenate([values(arg).ravel() for arg in node.args])[np.asarray(node.value)])
 
 
 def is_all(node: Node, number: Any) -> bool:
-    """Whether all elements are known to be a number."""
+    """Returns whether all elements are known to equal a number."""
     return is_constant(node) and bool((values(node) == number).all())
 
 
 def is_uniform(node: Node) -> bool:
-    """Whether all elements are known to be one and the same."""
+    """Returns whether all elements are known to be equal."""
     if node.op == "const":
         array = np.asarray(node.value)
         return array.size > 0 and bool((array == array.flat[0]).all())
-    return node.op == "arrange" and node.value is not None and bool((node.value == node.value.flat[0]).all())
+    return node.op == "gather" and node.value is not None and bool((node.value == node.value.flat[0]).all())
+
+
+def owners(sources: Sequence[Node], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the index of the source at every position of the sources laid end to end, and their first positions."""
+    starts = np.cumsum([0, *(source.size for source in sources)])
+    return np.searchsorted(starts, positions, side="right") - 1, starts
+
+
+def read_source(node: Node, positions: np.ndarray) -> tuple[Node, np.ndarray]:
+    """Returns the one source that a `gather` reads at these positions, and the positions in it."""
+    positions = np.asarray(np.asarray(node.value).ravel()[positions])
+    owner, starts = owners(node.args, positions)
+    first = int(owner.flat[0])
+    assert (owner == first).all(), "a loop reads from several arrays"
+    return node.args[first], np.asarray(positions - starts[first])
 
 
 def without_unused(sources: list[Node], positions: np.ndarray) -> tuple[list[Node], np.ndarray]:
-    """Each source once, and only those of which something is taken."""
-    starts = np.cumsum([0, *(each.size for each in sources)])
-    owner = np.searchsorted(starts, positions, side="right") - 1
+    """Returns the distinct sources that are read, and the positions in them."""
+    owner, starts = owners(sources, positions)
     kept, start, moved = {}, 0, np.zeros(len(sources), np.int64)
     for index in np.unique(owner):
         source = sources[index]

@@ -1,4 +1,4 @@
-"""Elementwise operations: how each is written in C, computed beforehand, and what it costs."""
+"""Elementwise operations: their C, their NumPy function for constants, and their cost."""
 
 import functools
 import math
@@ -14,18 +14,18 @@ from dln_jax.export.c.kinds import C_TYPES, NUMPY_TYPES, UNSIGNED
 
 
 class Operation(NamedTuple):
-    """One elementwise operation."""
+    """An elementwise operation."""
 
     c: str
-    """C expression of the arguments {0}, {1}, ...; {f} is the suffix of functions of <math.h>."""
+    """C expression in the arguments {0}, {1}, ...; {f} is the suffix of functions of <math.h>."""
     fold: Callable[..., Any] | None
-    """The same of NumPy arrays; by None it is left to C, which has an answer at poles."""
+    """The same for NumPy arrays; None leaves constants to C, which defines the values at poles."""
     cost: int = 1
-    """Floating-point operations, 0 for what only compares, selects or moves."""
+    """Floating-point operations; comparisons and selections cost 0."""
     dtype: str | None = None
-    """Kind of the result; by default that of the arguments."""
+    """Kind of the result; None for the kind of the arguments."""
     function: str | None = None
-    """The function of <math.h> that it calls."""
+    """Function of <math.h> that it calls, if any."""
 
 
 def _function(name: str, fold: Callable[..., Any] | None, *, arguments: int = 1) -> Operation:
@@ -87,7 +87,7 @@ OPERATIONS = {
     },
     "round": _function("round", lambda x: np.copysign(np.floor(np.abs(x) + 0.5), x)),
     "is_finite": Operation("({0} - {0} == 0)", np.isfinite, 0, "bool"),
-    # To so many bits of exponent and mantissa.
+    # Arguments: a number, bits of the exponent, bits of the mantissa.
     "rounded": Operation("elementary_rounded({0}, {1}, {2})", None),
     # In the total order of IEEE 754: -0 before 0, NaN outside the infinities.
     "lt_to": Operation("(elementary_ordered({0}) < elementary_ordered({1}))", None, 0, "bool"),
@@ -115,11 +115,11 @@ OPERATIONS = {
     "to_real": Operation("((real){0})", lambda x: x, 0, "real"),
     "to_bool": Operation("({0} != 0)", lambda x: x != 0, 0, "bool"),
 }
-"""By name."""
+"""Operations by name."""
 
 
-def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
-    """C of an operation on numbers of a kind; `suffix` is that of functions of <math.h>."""
+def expression(op: str, dtype: str, *args: str, suffix: str = "") -> str:
+    """Returns the C of an operation on numbers of a kind; `suffix` ends the names of functions of <math.h>."""
     alike = len(args) == 2 and args[0] == args[1]  # compilers warn of comparing a number with itself
     if alike and (op in ("lt", "gt") or (dtype != "real" and op in ("eq", "ne", "le", "ge"))):
         return str(int(op in ("eq", "le", "ge")))
@@ -132,7 +132,7 @@ def written(op: str, dtype: str, *args: str, suffix: str = "") -> str:
 
 
 def _beside_zero(op: str, args: Sequence[str]) -> str | None:
-    """An operation on an unsigned number and a literal 0 that is known: compilers warn of the plain comparison."""
+    """Returns C for an unsigned number against a literal 0, where compilers warn of the plain comparison, or None."""
     zeros = ("0U", "0ULL")
     if op in ("max", "min") and not {*zeros}.isdisjoint(args):
         other = args[0] if args[1] in zeros else args[1]
@@ -144,8 +144,10 @@ def _beside_zero(op: str, args: Sequence[str]) -> str | None:
 
 
 COMMUTATIVE = frozenset(("add", "mul", "eq", "ne", "and", "or", "xor"))
-"""Exactly so, also in floating point."""
-TRANSCENDENTAL = frozenset(name for name, each in OPERATIONS.items() if each.function and name not in ("sqrt",))
-"""What calls a function."""
+"""Operations that commute bit for bit, also in floating point."""
+TRANSCENDENTAL = frozenset(
+    name for name, operation in OPERATIONS.items() if operation.function and name not in ("sqrt",)
+)
+"""Operations that call a function of <math.h>, but for sqrt."""
 VECTORISED = frozenset(_VECTORISED)
-"""What is written so that loops of it vectorise."""
+"""Operations whose C vectorises in loops."""

@@ -1,4 +1,4 @@
-"""Sorting in C: the order of rows of numbers by one or several keys."""
+"""C that sorts rows of numbers by one or several keys."""
 
 from collections.abc import Collection, Sequence
 from string import Template
@@ -43,24 +43,26 @@ def _name(kinds: Sequence[str]) -> str:
 
 
 def _function(kinds: Sequence[str]) -> str:
-    """The function that sorts by keys of these kinds, the first before the second."""
+    """Returns the C function that sorts by keys of these kinds, the first key first."""
     comparisons = ""
     for place, kind in enumerate(kinds):
         nan_last = " || (KEY[{0}] == KEY[{0}] && KEY[{1}] != KEY[{1}])" if kind == "real" else ""
-        each = _COMPARISONS.replace("LAST_I", nan_last.format("i", "j")).replace("LAST_J", nan_last.format("j", "i"))
-        comparisons += each.replace("KEY", f"key{place}")
+        comparison = _COMPARISONS.replace("LAST_I", nan_last.format("i", "j")).replace(
+            "LAST_J", nan_last.format("j", "i")
+        )
+        comparisons += comparison.replace("KEY", f"key{place}")
     keys = "".join(f", const {C_TYPES[kind]} *key{place}" for place, kind in enumerate(kinds))
     passed = "".join(f", key{place}" for place in range(len(kinds)))
     return Template(_ORDER.replace("$name", _name(kinds))).substitute(keys=keys, passed=passed, comparisons=comparisons)
 
 
 def definitions(orders: Collection[tuple[str, ...]]) -> str:
-    """C text of the functions that sort by keys of these kinds."""
+    """Returns the C functions that sort by keys of these kinds."""
     return "".join(map(_function, sorted(orders)))
 
 
 def order(body: Body, node: Node) -> None:
-    """A call of the function that sorts by the kinds of keys of a node."""
+    """Writes a call of the function that sorts by the keys of a node."""
     rows, n = node.shape
     kinds, merged = tuple(key.dtype for key in node.args), f"v{node.number}_merged"
     body.source.orders.add(kinds)

@@ -1,7 +1,7 @@
-"""Which nodes of a program become scalars, loops or nothing at all, where they are kept, and in which order.
+"""Decides which nodes of a program become scalars or loops, which get arrays, and in which order they are computed.
 
-Small arrays are written out, element by element, so that moving elements costs nothing and a compiler keeps them in
-registers. Others are loops over arrays; elementwise ones that nothing else reads are part of the loop that reads them.
+Small arrays are unrolled into scalars, so that moving elements costs nothing and a compiler keeps them in registers.
+Others are loops over arrays; an elementwise operation with one reader is fused into the loop of its reader.
 """
 
 from collections.abc import Iterable
@@ -13,62 +13,64 @@ from dln_jax.export.c.nodes import Loop, Node, Region, is_constant
 from dln_jax.export.c.operations import OPERATIONS, TRANSCENDENTAL, VECTORISED
 from dln_jax.export.c.program import Program
 
-WRITTEN_OUT = 64
-"""Elements of a result, or products of a sum, up to which they may be written out one by one."""
+UNROLL_LIMIT = 64
+"""Largest number of elements of a result, or of products of a sum, that may be unrolled."""
 _VECTOR = 8
 _VECTOR_OF_FUNCTIONS = 4
 _FACTORED = ("cholesky", "triangular_solve", "permutation", "geqrf", "householder_product")
 PLAIN_MEMORY = ("take", "order", "lu", "call", *_FACTORED)
-"""What reads arguments through a pointer."""
+"""Operations that read arguments through a pointer."""
 
 
 class Plan(NamedTuple):
-    """What is decided about the nodes that the results need."""
+    """Decisions about the nodes that the results need."""
 
     order: dict[Region, list[Node]]
-    """Nodes of each region as they are computed."""
-    written_out: set[Node]
-    """Computed element by element."""
+    """Nodes of a region in the order of their computation."""
+    unrolled: set[Node]
+    """Nodes that are computed element by element."""
     arrays: set[Node]
-    """Kept in an array; scalars otherwise."""
+    """Nodes that are stored in an array; others are scalars."""
     root: dict[Node, Node]
-    """The loop that an elementwise node is computed in, of each that has a loop."""
+    """Last node of the loop that computes an elementwise node."""
     needed: dict[Node, np.ndarray]
-    """Of what is written out, the elements that something reads."""
+    """Elements that something reads, of every node."""
     levels: dict[Node, int]
-    """Number of products that come before, one after the other."""
+    """Length of the longest chain of products before a node."""
     reads: dict[Node, set[Node]]
-    """Arrays of its region that each step reads; a loop reads what is read inside."""
+    """Arrays of its region that a step reads; a loop reads the arrays that its body reads."""
     readers: dict[Node, set[Node | None]]
-    """Steps that read an array, and None for the results."""
+    """Steps that read an array; None stands for the results."""
 
 
 def plan_of(program: Program, results: Iterable[Node]) -> Plan:
-    """The plan for a program with these results."""
+    """Returns the plan for a program with these results."""
     results = list(results)
     nodes, readers, whole, contiguous = _reached(program, results)
-    written_out = {node for node in nodes if _is_written_out(node)}
+    unrolled = {node for node in nodes if _is_unrolled(node)}
     arrays, followed = set(contiguous), set()
-    # What loops read is an array; of an arrange whose elements a loop cannot follow, a copy is.
+    # Loops read arrays. A gather that a loop cannot index linearly is copied to an array first.
     for node in reversed(nodes):
         looped = any(
-            reader in followed if reader.op == "arrange" else reader not in written_out for reader in readers[node]
+            reader in followed if reader.op == "gather" else reader not in unrolled for reader in readers[node]
         )
-        if node.op == "arrange" and node not in contiguous and not (looped and not is_direct(node)):
+        if node.op == "gather" and node not in contiguous and not (looped and not is_direct(node)):
             followed |= {node} if looped or node in whole else set()
-        elif node.op == "arrange":
+        elif node.op == "gather":
             arrays.add(node)
-            (written_out if node.size <= WRITTEN_OUT else followed).add(node)
-        elif (node.size > 1 and (looped or node in whole)) or not (node in written_out or _is_scalar(node)):
+            (unrolled if node.size <= UNROLL_LIMIT else followed).add(node)
+        elif (node.size > 1 and (looped or node in whole)) or not (node in unrolled or _is_scalar(node)):
             arrays.add(node)
     arrays = {node for node in arrays if node.op not in ("input", "const")}
-    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), written_out)
+    root: dict[Node, Node] = _fused(nodes, readers, whole | set(results), unrolled)
     arrays -= {node for node, into in root.items() if into is not node}
-    levels, needed = _levels(program, nodes), _needed(program, nodes, written_out, arrays, results)
+    levels, needed = _levels(program, nodes), _needed(program, nodes, unrolled, arrays, results)
     order: dict[Region, list[Node]] = {}
-    for node in sorted(nodes, key=lambda each: (levels[each], not _is_product(each, written_out), each.number)):
+    for node in sorted(
+        nodes, key=lambda candidate: (levels[candidate], not _is_product(candidate, unrolled), candidate.number)
+    ):
         ends = root.get(node, node)
-        if needed[ends].any() and (node in written_out or ends is node):
+        if needed[ends].any() and (node in unrolled or ends is node):
             order.setdefault(node.region, []).append(node)
     reads = _reads(program, nodes, arrays, root)
     steps: dict[Node, set[Node | None]] = {}
@@ -77,23 +79,23 @@ def plan_of(program: Program, results: Iterable[Node]) -> Plan:
     for step, read in every:
         for source in read:
             steps.setdefault(source, set()).add(step)
-    return Plan(order, written_out, arrays, root, needed, levels, reads, steps)
+    return Plan(order, unrolled, arrays, root, needed, levels, reads, steps)
 
 
 def inner(program: Program, node: Node) -> list[Loop]:
-    """What is inside of a loop or branch."""
+    """Returns the bodies of a loop or branch."""
     if node.op == "branch":
         return [program.loops[number] for number in node.attribute]
     return [program.loops[node.attribute]] if node.op in ("while", "repeat") else []
 
 
 def is_direct(node: Node) -> bool:
-    """Whether a loop follows an arrange with an index that is linear in its own."""
+    """Returns whether the positions of a gather are linear in the indices of a loop."""
     return len(node.args) == 1 and strides(node.value) is not None
 
 
 def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
-    """(first, steps) with positions = first + sum_a steps_a i_a, or None."""
+    """Returns (first, steps) with positions = first + sum_a steps_a i_a, or None if there are none."""
     assert positions is not None
     if positions.size == 0:
         return 0, (0,) * positions.ndim
@@ -108,59 +110,59 @@ def strides(positions: np.ndarray | None) -> tuple[int, tuple[int, ...]] | None:
 
 
 def _reached(program: Program, results: list[Node]) -> tuple[list[Node], dict[Node, list[Node]], set[Node], set[Node]]:
-    """Nodes that the results need in order, who reads each, which are read as a whole, and which as plain memory."""
-    found, waiting = set(), list(results)
+    """Returns the needed nodes in order, their readers, the nodes that are read whole, and those read by pointer."""
+    reached, waiting = set(), list(results)
     while waiting:
         node = waiting.pop()
-        if node not in found:
-            found.add(node)
+        if node not in reached:
+            reached.add(node)
             waiting += node.args
             for loop in inner(program, node):
                 waiting += [*loop.carries, *loop.conditions, *loop.results]
-    nodes = sorted(found, key=lambda node: node.number)
+    nodes = sorted(reached, key=lambda node: node.number)
     readers: dict[Node, list[Node]] = {node: [] for node in nodes}
-    whole, contiguous = {node for node in results if node.size > WRITTEN_OUT}, set()
+    whole, contiguous = {node for node in results if node.size > UNROLL_LIMIT}, set()
     for node in nodes:
-        for each in node.args:
-            readers[each].append(node)
-        if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_written_out(node)):
+        for arg in node.args:
+            readers[arg].append(node)
+        if node.op in PLAIN_MEMORY or (node.op in VECTORISED and not _is_unrolled(node)):
             contiguous |= set(node.args[:1] if node.op == "take" else node.args)
         for loop in inner(program, node):
             whole |= {*loop.results, *loop.conditions, *node.args}
     return nodes, readers, whole, contiguous
 
 
-def _is_written_out(node: Node) -> bool:
-    if node.op == "contract":
+def _is_unrolled(node: Node) -> bool:
+    if node.op == "dot_general":
         count, columns = node.args[1].shape[1:]
         beside = is_constant(node.args[1]) and columns >= _VECTOR_OF_FUNCTIONS
-        return node.size * count <= WRITTEN_OUT and not beside
+        return node.size * count <= UNROLL_LIMIT and not beside
     if node.op.startswith(("reduce_", "arg")):
-        return node.args[0].size <= WRITTEN_OUT and node.op.startswith("reduce_")
+        return node.args[0].size <= UNROLL_LIMIT and node.op.startswith("reduce_")
     if node.op == "take":
         return node.size < _VECTOR
     if node.op not in OPERATIONS:
         return False
     if node.size < (_VECTOR_OF_FUNCTIONS if node.op in TRANSCENDENTAL else _VECTOR):
         return True
-    scattered = any(each.op == "arrange" and not is_direct(each) for each in node.args)
-    return node.size <= WRITTEN_OUT and scattered and node.op not in TRANSCENDENTAL
+    scattered = any(arg.op == "gather" and not is_direct(arg) for arg in node.args)
+    return node.size <= UNROLL_LIMIT and scattered and node.op not in TRANSCENDENTAL
 
 
 def _is_scalar(node: Node) -> bool:
-    """Whether what computes it can leave it without memory."""
-    return node.size == 1 and node.op not in ("contract", *_FACTORED) and node.op[:4] != "put_"
+    """Returns whether a node can be a variable without an array."""
+    return node.size == 1 and node.op not in ("dot_general", *_FACTORED) and node.op[:4] != "put_"
 
 
-def _is_product(node: Node, written_out: set[Node]) -> bool:
-    return node.op == "contract" and node not in written_out
+def _is_product(node: Node, unrolled: set[Node]) -> bool:
+    return node.op == "dot_general" and node not in unrolled
 
 
-def _fused(nodes, readers, whole, written_out) -> dict[Node, Node]:
-    """The loop that each elementwise node is in."""
+def _fused(nodes, readers, whole, unrolled) -> dict[Node, Node]:
+    """Returns the last node of the loop that an elementwise node is fused into."""
     root: dict[Node, Node] = {}
     for node in reversed(nodes):
-        if node.op not in OPERATIONS or node in written_out:
+        if node.op not in OPERATIONS or node in unrolled:
             continue
         into = {root.get(reader) for reader in readers[node]}
         alone = node in whole or node.op in VECTORISED or any(reader.op in VECTORISED for reader in readers[node])
@@ -173,19 +175,19 @@ def _levels(program: Program, nodes: list[Node]) -> dict[Node, int]:
     levels: dict[Node, int] = {}
     highest: dict[int, int] = {}
     for node in nodes:
-        level = max((levels[each] for each in node.args), default=0)
+        level = max((levels[arg] for arg in node.args), default=0)
         for number in (node.attribute if node.op == "branch" else (node.attribute,)) if inner(program, node) else ():
             level = max(level, highest.get(number, 0))
-        levels[node] = level + (node.op == "contract")
+        levels[node] = level + (node.op == "dot_general")
         for number in node.region:
             highest[number] = max(highest.get(number, 0), levels[node])
     return levels
 
 
 def sources(node: Node, arrays: set[Node]) -> set[Node]:
-    """Arrays that a reading of a node reads."""
-    if node.op == "arrange" and node not in arrays:
-        return {source for each in node.args for source in sources(each, arrays)}
+    """Returns the arrays that a reading of a node reads."""
+    if node.op == "gather" and node not in arrays:
+        return {source for arg in node.args for source in sources(arg, arrays)}
     return {node} & arrays
 
 
@@ -193,22 +195,22 @@ def _reads(program: Program, nodes, arrays, root) -> dict[Node, set[Node]]:
     reads: dict[Node, set[Node]] = {}
     loops = {number: node for node in nodes if inner(program, node) for number in np.ravel(node.attribute)}
     for node in nodes:
-        if node.op == "arrange" and node not in arrays:
+        if node.op == "gather" and node not in arrays:
             continue
         read = [*node.args]
         for loop in inner(program, node):
             read += [*loop.results, *loop.conditions]
-        for each in read:
-            for source in sources(each, arrays):
-                # Where a loop inside of the array's region reads it, the loop does.
+        for argument in read:
+            for source in sources(argument, arrays):
+                # A reading in a nested loop counts as a reading by that loop.
                 depth = len(source.region)
                 step = loops[node.region[depth]] if len(node.region) > depth else root.get(node, node)
                 reads.setdefault(step, set()).add(source)
     return reads
 
 
-def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node, np.ndarray]:
-    """Elements that something reads, of each node."""
+def _needed(program: Program, nodes, unrolled, arrays, results) -> dict[Node, np.ndarray]:
+    """Returns which elements of every node something reads."""
     needed = {node: np.zeros(node.size, bool) for node in nodes}
     projected: dict[Node, set[int]] = {}
     for node in results:
@@ -220,31 +222,31 @@ def _needed(program: Program, nodes, written_out, arrays, results) -> dict[Node,
         if node in arrays:
             mask[:] = True
         for loop in inner(program, node):
-            for k, each in enumerate(loop.results):
+            for k, result in enumerate(loop.results):
                 if k < len(loop.carries) or k in projected.get(node, ()):
-                    needed[each][:] = True
-            for each in (*loop.conditions, *loop.carries):
-                needed[each][:] = True
+                    needed[result][:] = True
+            for result in (*loop.conditions, *loop.carries):
+                needed[result][:] = True
         if node.op == "project":
             projected.setdefault(node.args[0], set()).add(node.attribute)
-        if node.op == "arrange":
-            starts = np.cumsum([0, *(each.size for each in node.args)])
+        if node.op == "gather":
+            starts = np.cumsum([0, *(arg.size for arg in node.args)])
             positions = np.asarray(node.value).ravel()[mask]
-            for each, start in zip(node.args, starts, strict=False):
-                needed[each][positions[(positions >= start) & (positions < start + each.size)] - start] = True
-        elif node in written_out and node.op == "take":
+            for arg, start in zip(node.args, starts, strict=False):
+                needed[arg][positions[(positions >= start) & (positions < start + arg.size)] - start] = True
+        elif node in unrolled and node.op == "take":
             needed[node.args[0]][:] = True
             needed[node.args[1]][...] |= mask
-        elif node in written_out and node.op in OPERATIONS:
-            for each in node.args:
-                needed[each][...] |= mask if each.size == node.size else mask.any()
-        elif node in written_out and node.op == "contract":
+        elif node in unrolled and node.op in OPERATIONS:
+            for arg in node.args:
+                needed[arg][...] |= mask if arg.size == node.size else mask.any()
+        elif node in unrolled and node.op == "dot_general":
             rows, columns = (mask.reshape(node.shape).any(axis=axis) for axis in (2, 1))
-            for each, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
-                needed[each][...] |= np.broadcast_to(used, each.shape).ravel()
-        elif node in written_out and node.op.startswith("reduce_"):
+            for arg, used in zip(node.args, (rows[:, :, None], columns[:, None, :]), strict=True):
+                needed[arg][...] |= np.broadcast_to(used, arg.shape).ravel()
+        elif node in unrolled and node.op.startswith("reduce_"):
             needed[node.args[0]][...] |= np.repeat(mask, node.args[0].shape[1])
         else:
-            for each in node.args:
-                needed[each][:] = True
+            for arg in node.args:
+                needed[arg][:] = True
     return needed

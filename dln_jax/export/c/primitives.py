@@ -1,6 +1,6 @@
-"""What each primitive of JAX is as nodes of a program: elementwise operations, moves, products and reductions.
+"""Rules that turn JAX's elementwise and shape primitives into nodes of a program.
 
-Each rule takes the program, the equation's parameters and its arguments, and gives the result, or a list of them.
+A rule takes the program, the equation's parameters and its arguments, and returns the result or a list of results.
 """
 
 from collections.abc import Callable
@@ -34,10 +34,10 @@ def _elementwise(name: str) -> Rule:
 
 
 def _moved(move: Callable[..., np.ndarray]) -> Rule:
-    """A rule of what only moves elements: `move` does so to an array of their indices."""
+    """Returns the rule of a primitive that only moves elements; `move` does so to an array of their indices."""
 
     def rule(program: Program, parameters: dict[str, Any], node: Node, *_: Node) -> Node:
-        return program.arrange([node], move(np.arange(node.size).reshape(node.shape), parameters))
+        return program.gather([node], move(np.arange(node.size).reshape(node.shape), parameters))
 
     return rule
 
@@ -61,7 +61,7 @@ def _power(program: Program, _, x: Node, exponent: Node, *, dtype: str) -> Node:
 
 
 def _comparison(name: str) -> Rule:
-    """Of truth values by logic: compilers warn of comparing those."""
+    """Returns the rule of a comparison; booleans are compared by logic, since compilers warn of comparing them."""
 
     def rule(program: Program, _, a: Node, b: Node) -> Node:
         if a.dtype != "bool":
@@ -77,7 +77,7 @@ def _comparison(name: str) -> Rule:
 
 
 def _total_order(name: str) -> Rule:
-    """Whole numbers and truth values are compared as usual."""
+    """Returns the rule of a comparison in the total order of IEEE 754, which for other kinds is the usual one."""
     usual = _comparison(name)
 
     def rule(program: Program, parameters, a: Node, b: Node) -> Node:
@@ -111,7 +111,7 @@ def _sign(program: Program, _, x: Node) -> Node:
         return program.elementwise("min", x, one)
     minus = program.constant(-1, x.dtype)
     positive, negative = (program.elementwise(name, x, zero) for name in ("gt", "lt"))
-    # What is neither, 0 or NaN, is its own sign.
+    # 0 and NaN are their own sign.
     return program.select(positive, program.select(negative, x, minus), one)
 
 
@@ -155,7 +155,7 @@ def _round(program: Program, parameters, x: Node) -> Node:
 
 
 def convert(program: Program, node: Node, dtype: str) -> Node:
-    """The node as another type."""
+    """Returns the node converted to a kind."""
     if node.dtype == dtype:
         return node
     return program.elementwise(f"to_{dtype}", node)
@@ -170,33 +170,33 @@ def _pad(program: Program, parameters, x: Node, padding: Node) -> Node:
         shape[axis] = inner
         spread = np.full(shape, x.size)
         np.moveaxis(spread, axis, 0)[:: interior + 1] = np.moveaxis(index, axis, 0)
-        wide = [(max(low, 0), max(high, 0)) if each == axis else (0, 0) for each in range(index.ndim)]
+        wide = [(max(low, 0), max(high, 0)) if other == axis else (0, 0) for other in range(index.ndim)]
         index = np.pad(spread, wide, constant_values=x.size)
         cut = slice(max(-low, 0), index.shape[axis] - max(-high, 0))
         index = index[(slice(None),) * axis + (cut,)]
-    return program.arrange([x, padding], index)
+    return program.gather([x, padding], index)
 
 
 def _concatenate(program: Program, parameters, *nodes: Node) -> Node:
     starts = np.cumsum([0, *(node.size for node in nodes)])
     pieces = [np.arange(node.size).reshape(node.shape) + start for node, start in zip(nodes, starts, strict=False)]
-    return program.arrange(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
+    return program.gather(nodes, np.concatenate(pieces, axis=parameters["dimension"]))
 
 
 def _stack(program: Program, parameters, *nodes: Node) -> Node:
     pieces = np.arange(sum(node.size for node in nodes)).reshape(len(nodes), *nodes[0].shape)
-    return program.arrange(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
+    return program.gather(nodes, np.moveaxis(pieces, 0, parameters["axis"]))
 
 
 def _unstack(program: Program, parameters, node: Node) -> list[Node]:
     index = np.moveaxis(np.arange(node.size).reshape(node.shape), parameters["axis"], 0)
-    return [program.arrange([node], piece) for piece in index]
+    return [program.gather([node], piece) for piece in index]
 
 
 def _split(program: Program, parameters, node: Node) -> list[Node]:
     index = np.arange(node.size).reshape(node.shape)
     pieces = np.split(index, np.cumsum(parameters["sizes"])[:-1], axis=parameters["axis"])
-    return [program.arrange([node], piece) for piece in pieces]
+    return [program.gather([node], piece) for piece in pieces]
 
 
 def _iota(program: Program, parameters, dtype: str) -> Node:
@@ -215,7 +215,7 @@ def _reduce_precision(program: Program, parameters, x: Node) -> Node:
     own = np.finfo(program.real)
     if exponent >= own.nexp and mantissa >= own.nmant:
         return x
-    bits = [program.constant(min(*each), "real") for each in ((exponent, own.nexp), (mantissa, own.nmant))]
+    bits = [program.constant(min(*pair), "real") for pair in ((exponent, own.nexp), (mantissa, own.nmant))]
     return program.elementwise("rounded", x, *bits)
 
 
@@ -255,7 +255,7 @@ RULES: dict[str, Rule] = {
     "unstack": _unstack,
     "split": _split,
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""
 TYPED_RULES: dict[str, Rule] = {
     "abs": _by_kind("abs", "integer_abs"),
     "div": _by_kind("div", "integer_div"),
@@ -264,4 +264,4 @@ TYPED_RULES: dict[str, Rule] = {
     "convert_element_type": lambda program, _, x, *, dtype: convert(program, x, dtype),
     "iota": lambda program, parameters, *, dtype: _iota(program, parameters, dtype),
 }
-"""Those that take the type of the result."""
+"""Rules that also take the kind of the result."""

@@ -1,8 +1,8 @@
 """Products of matrices as C loops.
 
-Each loop keeps a block of sums in registers, side by side along the contiguous axis of the second matrix. Products with
-the same constant are one loop, so that value and tangents go through a matrix together; a constant is stored in the
-order of that loop. Where there is one column, sums are kept in parts.
+Every loop keeps a block of sums in registers, side by side along the contiguous axis of the second matrix. Products
+with the same constant share one loop, so that a value and its tangents pass through a network's layer together, and
+the constant is stored in the order of that loop. A product with one column splits its sums into parts.
 """
 
 import functools
@@ -11,18 +11,19 @@ from collections.abc import Callable
 import numpy as np
 
 from dln_jax.export.c.body import Body
+from dln_jax.export.c.kinds import C_TYPES
 from dln_jax.export.c.nodes import Node, is_constant, values
-from dln_jax.export.c.operations import written
+from dln_jax.export.c.operations import expression
 
 _LANES = {"f64": 4, "f32": 8}
 _TILE = 64
-"""Columns whose sums are kept at once: the more, the better gcc keeps them in registers."""
+"""Columns whose sums are kept at once; gcc allocates registers better for wide blocks."""
 _ROWS = 16
-"""Rows of one product up to which each is named; a loop goes over more."""
+"""Largest number of rows that get sums of their own; a product with more is a loop over rows."""
 
 
 def chain(pairs: list[tuple[str, str]], dtype: str) -> str:
-    """a b + ... as nested multiply-adds."""
+    """Returns the C of a sum of products, as nested multiply-adds."""
     (first, second), *rest = pairs
     if dtype != "real":
         product, total = _of_integers(dtype)
@@ -34,12 +35,12 @@ def chain(pairs: list[tuple[str, str]], dtype: str) -> str:
 
 
 def _of_integers(dtype: str) -> list[Callable[[str, str], str]]:
-    """C of a product and of a sum; of truth values, both and any."""
-    return [functools.partial(written, op, dtype) for op in (("and", "or") if dtype == "bool" else ("mul", "add"))]
+    """Returns functions that give the C of a product and of a sum (for booleans: and, or)."""
+    return [functools.partial(expression, op, dtype) for op in (("and", "or") if dtype == "bool" else ("mul", "add"))]
 
 
-def contracted(body: Body, members: list[Node]) -> None:
-    """Products of several matrices with one."""
+def dot_general(body: Body, members: list[Node]) -> None:
+    """Writes the products of several matrices with the same second matrix."""
     for node in members:
         body.kept(node)
     if members[0].dtype != "real":
@@ -64,7 +65,7 @@ def contracted(body: Body, members: list[Node]) -> None:
 
 
 def _parts(rows: int, columns: int, count: int) -> int:
-    """Sums of a column side by side: few columns take several to hide the latency of an addition."""
+    """Returns how many partial sums a column has: with few columns, several hide the latency of an addition."""
     parts = {1: 4 if columns <= 32 else 1, 2: 2 if columns <= 16 else 1}.get(rows, 1)
     while count % parts:
         parts //= 2
@@ -72,14 +73,14 @@ def _parts(rows: int, columns: int, count: int) -> int:
 
 
 def _block(body: Body, rows: list[tuple[Node, int]], count: int, columns: int) -> None:
-    """Rows of products with one matrix."""
+    """Writes rows of products with one matrix."""
     lanes, factor = _LANES[body.source.precision], rows[0][0].args[1]
     body.spend(2 * len(rows) * count * columns)
     start = 0
     while start < columns:
         width = min(_TILE, columns - start)
         tiles = (columns - start) // width
-        # What is constant is padded to whole vectors.
+        # Constants are padded to whole vectors.
         wide = -(-width // lanes) * lanes if is_constant(factor) else width
         parts = _parts(len(rows), wide, count)
         column = start + np.arange(tiles)[:, None, None] * width + np.arange(wide)
@@ -116,7 +117,7 @@ def _block(body: Body, rows: list[tuple[Node, int]], count: int, columns: int) -
 
 
 def _many(body: Body, node: Node) -> None:
-    """A product of many rows, or of a batch of matrices."""
+    """Writes a product of many rows, or of a batch of matrices."""
     a, b = node.args
     (batch, m, count), columns = a.shape, b.shape[2]
     body.spend(2 * batch * m * count * columns)
@@ -142,11 +143,11 @@ def _many(body: Body, node: Node) -> None:
 
 
 def _whole(body: Body, node: Node) -> None:
-    """A product of whole numbers or truth values."""
+    """Writes a product of integers or booleans."""
     a, b = node.args
     (batch, m, count), columns = a.shape, b.shape[2]
     i, j, k, c = np.meshgrid(*map(np.arange, (batch, m, count, columns)), indexing="ij")
-    kind, (product, total) = body.c_type(node.dtype), _of_integers(node.dtype)
+    kind, (product, total) = C_TYPES[node.dtype], _of_integers(node.dtype)
     for name, extent in (("b_", batch), ("r_", m), ("c_", columns)):
         body.opened(f"for (int {name} = 0; {name} < {extent}; ++{name})")
     body.line(f"{kind} sum_ = 0;")
@@ -161,7 +162,7 @@ def _whole(body: Body, node: Node) -> None:
 
 
 def _dots(body: Body, node: Node) -> None:
-    """A product with one column."""
+    """Writes a product with one column."""
     a, b = node.args
     batch, m, count = a.shape
     body.spend(2 * batch * m * count)

@@ -1,28 +1,28 @@
 """A program of small arrays: a graph of interned nodes, simplified as it is built.
 
-There are few kinds of nodes, because whatever only moves numbers (slices, transposes, concatenations, padding, gathers
-and selections that are known beforehand) is one of them, an `arrange`: for each of its elements, which element of which
-source it is. Arranges of arranges are one arrange.
+There are few kinds of nodes, because everything that only moves numbers (slices, transposes, concatenations, padding,
+gathers and selections at constant indices) is a `gather`: it states for every element which element of which source it
+is. A gather of gathers is one gather.
 
 | op | value |
 |---|---|
-| `input`, `const` | an argument's leaf; numbers |
-| `arrange` | elements of the sources, laid end to end, at the positions `value` |
-| a name of `operations.OPERATIONS` | elementwise, of arguments of one shape or scalars |
-| `contract` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
-| `reduce_*`, `arg*` | over the last axis of an argument [o, r] |
+| `input`, `const` | a leaf of an argument; numbers |
+| `gather` | elements of the sources, laid end to end, at the positions `value` |
+| a name in `operations.OPERATIONS` | elementwise, for arguments of one shape or scalars |
+| `dot_general` | A [b, m, k], B [b, k, n] -> sum over k [b, m, n] |
+| `reduce_*`, `arg*` | reduction over the last axis of the argument [o, r] |
 | `take` | flat elements of the first argument at the second's indices |
-| `order` | flat indices that sort rows by keys [o, n], each row by the first key, then the next |
+| `order` | flat indices that sort rows by keys [o, n], the first key first |
 | `put_*` | the first argument [n] with updates (third) at flat indices (second); negative ones are dropped |
-| `cholesky`, `triangular_solve`, `lu` | of small dense matrices |
-| `permutation` | the order of rows after exchanges, as `lu` has them |
-| `geqrf`, `householder_product` | R, the reflectors and their factors [m n + min(m, n)] of a matrix; their product |
+| `cholesky`, `triangular_solve`, `lu` | of a small dense matrix |
+| `permutation` | the order of rows after the exchanges of `lu` |
+| `geqrf`, `householder_product` | R, reflectors and their factors [m n + min(m, n)]; the product of reflectors |
 | `eigh` | eigenvectors and eigenvalues [n n + n] of a symmetric matrix |
-| `call` | a function of its own |
-| `while`, `repeat`, `branch` | control flow; `project` takes a result, `carry` and `counter` are what a turn sees |
+| `call` | a call of another program |
+| `while`, `repeat`, `branch` | control flow; `project` takes a result, an iteration reads `carry` and `counter` |
 
-Simplifications keep what IEEE arithmetic gives, but for the sign of a zero in 0 + x = x, which XLA simplifies too:
-1 x = x, but never 0 x = 0, which hides a NaN, nor 0 - x = -x, which has the other zero at 0.
+Simplifications keep the results of IEEE arithmetic, except the sign of zero in 0 + x = x, which XLA simplifies too.
+There is 1 x = x, but neither 0 x = 0, which would hide a NaN, nor 0 - x = -x, which has the wrong sign at 0.
 """
 
 import hashlib
@@ -39,15 +39,14 @@ from dln_jax.export.c.operations import COMMUTATIVE, OPERATIONS
 from dln_jax.types import InputError
 
 LARGEST = 1 << 22
-"""Elements of an array."""
-
+"""Largest number of elements of an array."""
 
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1, "integer_div": 1, "or": 0, "xor": 0, "and": ...}
-"""What leaves the other argument as it is; that of `and` has all bits of its kind."""
+"""Number that leaves the other argument unchanged; for `and`, all bits of its kind are set."""
 
 
 class Part(NamedTuple):
-    """A function that others call."""
+    """A program that others call."""
 
     program: "Program"
     results: list[Node]
@@ -55,20 +54,20 @@ class Part(NamedTuple):
 
 @dataclass
 class Program:
-    """Nodes in an order in which each follows its arguments."""
+    """A graph of nodes under construction; a node follows its arguments."""
 
     nodes: list[Node] = field(default_factory=list)
     loops: dict[int, Loop] = field(default_factory=dict)
     floor: Region = ()
-    """The branch that is being built: nodes stay in it even if they need nothing that is computed there."""
+    """Region of the branch under construction: its nodes stay in it even if they read nothing computed there."""
     real: Any = np.float64
-    """NumPy's type of real numbers, in which constants are folded."""
+    """NumPy type of real numbers, in which constants are folded."""
     repeated: Collection[int] = ()
-    """Jaxprs, by `id`, whose calls are calls here too."""
+    """`id`s of jaxprs whose calls stay calls."""
     parts: dict[bytes, Part] = field(default_factory=dict)
-    """Functions that are called, by their `identity`, the attribute of a `call`."""
+    """Called programs by their `identity`, the attribute of a `call`."""
     lowered: dict[Any, bytes] = field(default_factory=dict)
-    """Identities of functions by the `id` of their jaxpr and the arguments that are constant."""
+    """Identities of called programs, by the `id` of the jaxpr and the constant arguments."""
     _interned: dict[Any, list[Node]] = field(default_factory=dict)
 
     def make(
@@ -81,14 +80,14 @@ class Program:
         value: np.ndarray | None = None,
         region: Region = (),
     ) -> Node:
-        """The node, new or met before, in the innermost region of its arguments: nothing stays in a loop needlessly."""
+        """Returns the interned node, placed in the innermost region of its arguments, so outside loops if possible."""
         shape, args = tuple(map(int, shape)), tuple(args)
         if prod(shape) > LARGEST:
             raise InputError(
                 f"an array of shape {shape} is too large for generated C; expected at most {LARGEST} numbers"
             )
-        region = max((region, self.floor, *(each.region for each in args)), key=len)
-        # A value's type is part of it: 1.0 and 1 may have the same bytes in no case, but True and 1 do.
+        region = max((region, self.floor, *(arg.region for arg in args)), key=len)
+        # The dtype belongs to the key, because True and 1 may have the same bytes.
         key = (op, shape, dtype, args, attribute, None if value is None else (value.tobytes(), value.dtype.str))
         for known in self._interned.setdefault(key, []):
             if region[: len(known.region)] == known.region:
@@ -99,31 +98,31 @@ class Program:
         return node
 
     def identity(self, results: Sequence[Node]) -> bytes:
-        """A digest of all that the results depend on, constants included bit by bit."""
+        """Returns a digest of everything that the results depend on, constants bit for bit."""
         digest = hashlib.sha256()
         for node in self.nodes:
             value_type = None if node.value is None else node.value.dtype.str
-            args = [each.number for each in node.args]
+            args = [arg.number for arg in node.args]
             digest.update(
                 repr((node.op, node.shape, node.dtype, args, node.attribute, value_type, node.region)).encode()
             )
             digest.update(b"" if node.value is None else node.value.tobytes())
         for number, loop in self.loops.items():
-            inside = [[each.number for each in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
+            inside = [[node.number for node in nodes] for nodes in (loop.carries, loop.conditions, loop.results)]
             digest.update(repr((number, inside, loop.length, loop.reverse)).encode())
-        digest.update(repr([each.number for each in results]).encode())
+        digest.update(repr([result.number for result in results]).encode())
         return digest.digest()
 
     def constant(self, value: Any, dtype: str) -> Node:
-        """Numbers of a kind."""
+        """Returns a constant of a kind."""
         array = np.asarray(value).astype(self.real if dtype == "real" else NUMPY_TYPES[dtype])
         return self.make("const", array.shape, dtype, value=np.ascontiguousarray(array).reshape(array.shape))
 
-    def arrange(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
-        """Elements of the sources, laid end to end, at the positions [shape]."""
+    def gather(self, sources: Sequence[Node], positions: np.ndarray | np.integer) -> Node:
+        """Returns the elements at `positions` [shape] of the sources laid end to end."""
         inner, flat, start = [], [], 0
         for source in sources:
-            parts = source.args if source.op == "arrange" else (source,)
+            parts = source.args if source.op == "gather" else (source,)
             within = np.arange(source.size) if source.value is None or source.op == "const" else source.value.ravel()
             inner += parts
             flat.append(within + start)
@@ -132,34 +131,34 @@ class Program:
         inner, positions = without_unused(inner, positions)
         if not inner or positions.size == 0:
             return self.constant(np.zeros(positions.shape), sources[0].dtype)
-        if all(each.op == "const" for each in inner):
-            total = sum(each.size for each in inner)
+        if all(source.op == "const" for source in inner):
+            total = sum(source.size for source in inner)
             if positions.size <= max(total, 64):
-                joined = np.concatenate([each.value.ravel() for each in inner if each.value is not None])
+                joined = np.concatenate([source.value.ravel() for source in inner if source.value is not None])
                 return self.constant(joined[positions], inner[0].dtype)
         alone = len(inner) == 1 and inner[0].shape == positions.shape
         if alone and np.array_equal(positions.ravel(), np.arange(positions.size)):
             return inner[0]
-        return self.make("arrange", positions.shape, inner[0].dtype, inner, value=positions)
+        return self.make("gather", positions.shape, inner[0].dtype, inner, value=positions)
 
     def reshape(self, node: Node, shape: Sequence[int]) -> Node:
-        """The same elements in the same order."""
-        return self.arrange([node], np.arange(node.size).reshape(shape))
+        """Returns the same elements in another shape."""
+        return self.gather([node], np.arange(node.size).reshape(shape))
 
     def broadcast(self, node: Node, shape: Sequence[int]) -> Node:
-        """As NumPy broadcasts."""
-        return self.arrange([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
+        """Returns the node broadcast as by NumPy."""
+        return self.gather([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
     def elementwise(self, op: str, *args: Node) -> Node:
-        """An operation of `OPERATIONS`, on arguments of one kind that broadcast as NumPy's."""
+        """Returns an operation of `OPERATIONS` on arguments of one kind, broadcast as by NumPy."""
         operation = OPERATIONS[op]
-        shape = np.broadcast_shapes(*(each.shape for each in args))
-        args = tuple(each if each.shape in ((), shape) else self.broadcast(each, shape) for each in args)
-        kinds = {each.dtype for each in (args[1:] if op == "select" else args)}
+        shape = np.broadcast_shapes(*(arg.shape for arg in args))
+        args = tuple(arg if arg.shape in ((), shape) else self.broadcast(arg, shape) for arg in args)
+        kinds = {arg.dtype for arg in (args[1:] if op == "select" else args)}
         assert len(kinds) == 1, f"{op} of {', '.join(sorted(kinds))}"
         dtype = operation.dtype or kinds.pop()
-        # Real numbers that are only repeated stay so: a table of them would be read from memory.
-        known = all(each.op == "const" or (dtype != "real" and is_constant(each)) for each in args)
+        # Repeated real numbers are not folded: a table of them would be read from memory.
+        known = all(arg.op == "const" or (dtype != "real" and is_constant(arg)) for arg in args)
         if known and operation.fold is not None:
             with np.errstate(all="ignore"):
                 value = operation.fold(*map(values, args))
@@ -169,11 +168,11 @@ class Program:
         if (pushed := self._below_broadcast(op, args, shape)) is not None:
             return pushed
         if op in COMMUTATIVE:
-            args = tuple(sorted(args, key=lambda each: each.number))
+            args = tuple(sorted(args, key=lambda arg: arg.number))
         return self.make(op, shape, dtype, args)
 
-    def contract(self, a: Node, b: Node) -> Node:
-        """sum_k a[b, m, k] b[b, k, n]; a constant comes second."""
+    def dot_general(self, a: Node, b: Node) -> Node:
+        """Returns sum_k a[b, m, k] b[b, k, n]; a constant comes second, by transposition."""
         (batch, m, k), n = a.shape, b.shape[2]
         if a.op == b.op == "const" and a.value is not None and b.value is not None:
             return self.constant(np.matmul(a.value, b.value), a.dtype)
@@ -183,21 +182,21 @@ class Program:
             product = "and" if a.dtype == "bool" else "mul"
             return self.elementwise(product, self.broadcast(a, (batch, m, n)), self.broadcast(b, (batch, m, n)))
         if is_constant(a) and not is_constant(b):
-            return self.transpose(self.contract(self.transpose(b), self.transpose(a)))
-        return self.make("contract", (batch, m, n), a.dtype, (a, b))
+            return self.transpose(self.dot_general(self.transpose(b), self.transpose(a)))
+        return self.make("dot_general", (batch, m, n), a.dtype, (a, b))
 
     def transpose(self, node: Node) -> Node:
-        """With the last two axes exchanged."""
-        return self.arrange([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
+        """Returns the node with its last two axes exchanged."""
+        return self.gather([node], np.swapaxes(np.arange(node.size).reshape(node.shape), -1, -2))
 
     def select(self, chosen: Node, if_false: Node, if_true: Node) -> Node:
-        """Elementwise, moved beforehand where the choice is known."""
+        """Returns an elementwise selection; one with a constant condition is a gather."""
         shape = np.broadcast_shapes(chosen.shape, if_false.shape, if_true.shape)
         if is_constant(chosen):
             chosen_value = np.broadcast_to(values(chosen), shape)
-            both = [self.broadcast(each, shape) for each in (if_false, if_true)]
+            both = [self.broadcast(case, shape) for case in (if_false, if_true)]
             index = np.arange(chosen_value.size).reshape(shape)
-            return self.arrange(both, np.where(chosen_value, index + chosen_value.size, index))
+            return self.gather(both, np.where(chosen_value, index + chosen_value.size, index))
         return self.elementwise("select", chosen, if_true, if_false)
 
     def _simpler(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
@@ -221,35 +220,35 @@ class Program:
         return None
 
     def _below_broadcast(self, op: str, args: tuple[Node, ...], shape: tuple[int, ...]) -> Node | None:
-        """The operation before the arguments are repeated, where all are repeated in the same way."""
-        repeated = [each for each in args if each.size > 1 and not is_uniform(each)]
-        others = [each for each in args if each.size == 1 or is_uniform(each)]
-        if not shape or any(each.op == "const" for each in repeated) or len(repeated) + len(others) < len(args):
+        """Returns the operation applied before a common broadcast of its arguments, or None if there is none."""
+        repeated = [arg for arg in args if arg.size > 1 and not is_uniform(arg)]
+        others = [arg for arg in args if arg.size == 1 or is_uniform(arg)]
+        if not shape or any(arg.op == "const" for arg in repeated) or len(repeated) + len(others) < len(args):
             return None
         if not repeated:
             if prod(shape) <= 1:
                 return None
             return self.broadcast(self.elementwise(op, *map(self._one, args)), shape)
         positions, source = np.asarray(repeated[0].value), repeated[0].args[:1]
-        for each in repeated:
-            alike = each.op == "arrange" and len(each.args) == 1 and each.args[0].shape == source[0].shape
-            if not alike or each.args[0].size >= each.size or not np.array_equal(np.asarray(each.value), positions):
+        for arg in repeated:
+            alike = arg.op == "gather" and len(arg.args) == 1 and arg.args[0].shape == source[0].shape
+            if not alike or arg.args[0].size >= arg.size or not np.array_equal(np.asarray(arg.value), positions):
                 return None
-        below = [each.args[0] if any(each is one for one in repeated) else self._one(each) for each in args]
-        return self.arrange([self.elementwise(op, *below)], positions)
+        below = [arg.args[0] if any(arg is one for one in repeated) else self._one(arg) for arg in args]
+        return self.gather([self.elementwise(op, *below)], positions)
 
     def _one(self, node: Node) -> Node:
-        """The scalar that all elements are."""
-        return node if node.shape == () else self.arrange([node], np.zeros((), np.int64))
+        """Returns the scalar that all elements equal."""
+        return node if node.shape == () else self.gather([node], np.zeros((), np.int64))
 
 
 def _neutral(op: str, dtype: str) -> Any:
-    """The number that leaves the other argument of an operation as it is."""
+    """Returns the number that leaves the other argument of an operation unchanged."""
     return ~NUMPY_TYPES[dtype](0) if op == "and" else _NEUTRAL[op]
 
 
 def _comparison_known(op: str, args: tuple[Node, ...]) -> bool | None:
-    """Result of a comparison that no numbers can change; compilers warn of those."""
+    """Returns the result of a comparison that does not depend on its operands; compilers warn of those."""
     if op in ("lt", "gt") and args[0] is args[1]:
         return False
     if op in ("eq", "ne", "le", "ge") and args[0] is args[1] and args[0].dtype != "real":

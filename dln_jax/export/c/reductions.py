@@ -1,4 +1,4 @@
-"""Products and reductions of JAX as nodes of a program."""
+"""Rules that turn JAX's products and reductions into nodes of a program."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,30 +21,30 @@ def _dot_general(program: Program, parameters, a: Node, b: Node, *, dtype: str) 
 
     def ordered(node: Node, *groups) -> Node:
         index = np.arange(node.size).reshape(node.shape).transpose([axis for group in groups for axis in group])
-        return program.arrange([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
+        return program.gather([node], index.reshape([prod(node.shape[axis] for axis in group) for group in groups]))
 
-    product = program.contract(ordered(a, a_batch, a_free, a_sum), ordered(b, b_batch, b_sum, b_free))
+    product = program.dot_general(ordered(a, a_batch, a_free, a_sum), ordered(b, b_batch, b_sum, b_free))
     shape = [a.shape[axis] for axis in (*a_batch, *a_free)] + [b.shape[axis] for axis in b_free]
     return program.reshape(product, shape)
 
 
 def rows_of(program: Program, node: Node, axes: tuple[int, ...]) -> Node:
-    """The node as [o, r], with the given axes last and as one."""
+    """Returns the node as a matrix [o, r], its columns the elements along `axes`."""
     kept = [axis for axis in range(len(node.shape)) if axis not in axes]
     index = np.arange(node.size).reshape(node.shape).transpose([*kept, *axes])
-    return program.arrange([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
+    return program.gather([node], index.reshape(prod(node.shape[axis] for axis in kept), -1))
 
 
-def _limit(dtype: str, *, most: bool) -> Any:
-    """The least or largest number of a kind."""
+def _limit(dtype: str, *, upper: bool) -> Any:
+    """Returns the lower or upper limit of the numbers of a kind."""
     if dtype in ("real", "bool"):
-        return most if dtype == "bool" else np.inf if most else -np.inf
+        return upper if dtype == "bool" else np.inf if upper else -np.inf
     limits = np.iinfo(NUMPY_TYPES[dtype])
-    return limits.max if most else limits.min
+    return limits.max if upper else limits.min
 
 
 def _reduction(op: str, start: Callable[[str], Any]) -> Rule:
-    """`start` is the reduction of nothing, of a kind of numbers."""
+    """Returns the rule of a reduction; `start` gives the value for an empty array of a kind."""
 
     def rule(program: Program, parameters, node: Node) -> Node:
         axes = tuple(map(int, parameters["axes"]))
@@ -55,7 +55,7 @@ def _reduction(op: str, start: Callable[[str], Any]) -> Rule:
         if rows.shape[1] == 1:
             return program.reshape(rows, shape)
         if rows.shape[1] == 2:
-            first, second = (program.arrange([rows], np.arange(rows.size).reshape(rows.shape)[:, k]) for k in range(2))
+            first, second = (program.gather([rows], np.arange(rows.size).reshape(rows.shape)[:, k]) for k in range(2))
             return program.reshape(program.elementwise(op, first, second), shape)
         return program.reshape(program.make(f"reduce_{op}", rows.shape[:1], node.dtype, [rows]), shape)
 
@@ -63,9 +63,9 @@ def _reduction(op: str, start: Callable[[str], Any]) -> Rule:
 
 
 def _extreme(op: str) -> Rule:
-    """The largest or smallest; of truth values, whether any or all are true."""
+    """Returns the rule of max or min; for booleans that is or, and."""
     on_truths = _reduction("or" if op == "max" else "and", lambda _: op == "min")
-    others = _reduction(op, partial(_limit, most=op == "min"))
+    others = _reduction(op, partial(_limit, upper=op == "min"))
     return lambda program, parameters, node: (on_truths if node.dtype == "bool" else others)(program, parameters, node)
 
 
@@ -80,7 +80,7 @@ def _arg(name: str) -> Rule:
 
 
 def _cumulative(op: str) -> Rule:
-    """Written out: element by element of the axis."""
+    """Returns the rule of a cumulative operation, unrolled along the axis."""
 
     def rule(program: Program, parameters, node: Node) -> Node:
         axis = parameters["axis"]
@@ -88,12 +88,12 @@ def _cumulative(op: str) -> Rule:
         index = index[::-1] if parameters["reverse"] else index
         pieces: list[Node] = []
         for positions in index:
-            piece = program.arrange([node], positions)
+            piece = program.gather([node], positions)
             pieces.append(program.elementwise(op, pieces[-1], piece) if pieces else piece)
         if parameters["reverse"]:
             pieces.reverse()
         joined = np.arange(node.size).reshape(index.shape)
-        return program.arrange(pieces, np.moveaxis(joined, 0, axis)) if pieces else node
+        return program.gather(pieces, np.moveaxis(joined, 0, axis)) if pieces else node
 
     return rule
 
@@ -111,10 +111,10 @@ RULES: dict[str, Rule] = {
     "cummax": _cumulative("max"),
     "cummin": _cumulative("min"),
 }
-"""By the primitive's name."""
+"""Rules by the name of the primitive."""
 TYPED_RULES: dict[str, Rule] = {
     "dot_general": _dot_general,
     "argmax": _arg("argmax"),
     "argmin": _arg("argmin"),
 }
-"""Those that take the type of the result."""
+"""Rules that also take the kind of the result."""

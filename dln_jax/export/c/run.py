@@ -1,4 +1,4 @@
-"""A trained run as C99 source: every function that its model has, or those that are asked for."""
+"""Exports a trained run as C99 source: all functions of its model, or a selection."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,28 +23,28 @@ def export_run(
     casadi: bool = False,
     overwrite: bool = False,
 ) -> list[Path]:
-    """`export_c` of the model in a run's folder.
+    """Exports the model in a run's folder by `export_c`, and returns the paths of the files.
 
     Args:
-        run: the folder.
-        directory: of the export.
-        functions: names of `families.functions_of_run`; all by default, but for those that are too large for C, and
-            for CasADi those that are no derivatives.
-        name: of the export.
-        precision: f32 or f64; by default that of the training.
+        run: folder of the run.
+        directory: folder of the export.
+        functions: names from `families.functions_of_run`; default: all but those that are too large for C, and for
+            CasADi all that are not derivatives.
+        name: name of the export.
+        precision: f32 or f64; default: the precision of the training.
         iterations: Newton steps of the implicit midpoint rule.
         libm, casadi, overwrite: as for `export_c`.
 
     Raises:
-        InputError: no run, no such function, or what `export_c` refuses.
+        InputError: the folder holds no run, a function does not exist, or `export_c` refuses one.
     """
     trained = load(run)
     precision = precision or str(trained.description["precision"])
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     chosen = functions_of_run(trained, precision=precision, names=functions, iterations=iterations)
-    # CasADi has the first and second derivatives of what it is given.
-    itself = casadi if functions else casadi and [each for each in chosen if not each.endswith(DERIVATIVES)]
+    # NAME_casadi.c contains first and second derivatives of its functions.
+    itself = casadi if functions else casadi and [function for function in chosen if not function.endswith(DERIVATIVES)]
     return export_c(
         chosen, directory, name=name, precision=precision, libm=libm, casadi=itself, overwrite=overwrite,
         leave_out_large=functions is None,

@@ -1,4 +1,4 @@
-"""JAX functions as C99 source without dependencies, a demo of them, and what builds both.
+"""Exports JAX functions as C99 source without dependencies, with a demo program and a CMake file.
 
 The source holds constant tables and functions of one state: no allocation, no mutable state outside the stack, no
 library but <math.h>. The same functions, name and precision give the same files, byte for byte.
@@ -37,17 +37,17 @@ from dln_jax.precision import computing_in
 from dln_jax.types import InputError, require_positive
 
 Functions = Mapping[str, tuple[Callable[..., Any], Sequence[Any]]]
-"""Functions of arrays by name, each with example arguments."""
+"""Functions of arrays by name, with example arguments."""
 STACK = 256 * 1024
-"""Bytes of the stack that a function may take."""
+"""Default limit of the stack that a function may use, in bytes."""
 LENGTH = 10_000_000
-"""Bytes of a source."""
+"""Largest length of a source in bytes."""
 LINES = 4000
-"""Of a function, with those that it calls, up to which it is exported without being asked for."""
+"""Largest size in lines, including callees, at which a function is exported by default."""
 
 
 class TooLargeError(InputError):
-    """A function that would take more of the stack, or of a source, than generated C suits."""
+    """A function needs more stack, or more lines, than generated C suits."""
 
 
 _PROMISES = """Functions of one state, which keep their workspace on the stack and may run in several threads.
@@ -77,22 +77,23 @@ def export_c(
     """Writes NAME.h, NAME.c, NAME_demo.c, NAME.json and CMakeLists.txt, and returns their paths.
 
     Args:
-        functions: of arrays by name, parameters closed over, each with one example for each argument: an array or a
-            tree of arrays. Arguments keep their names, and results those of a dictionary or named tuple.
-        directory: is created where it is missing.
+        functions: name -> (function, examples): a function with its parameters closed over, and one example per
+            argument, an array or a tree of arrays. C arguments are named after the function's parameters, C results
+            after the keys of a dictionary or the fields of a named tuple.
+        directory: folder of the export; created if missing.
         name: a C name; every file and public function starts with it.
-        precision: f32 or f64 of all real numbers; by default that of the examples.
-        libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p, in place of ones that vectorise.
-        casadi: add NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; or those of these
-            names.
-        leave_out_large: leave functions out that would be refused for their stack, or take more than 4,000 lines, which
-            compile for seconds each, and of NAME_casadi.c also those that CasADi cannot take; the files name them.
-        stack: bytes that a function may take of it; a plan over many steps may need more than the default.
-        overwrite: replace files that exist.
+        precision: f32 or f64, for all real numbers; default: the precision of the examples.
+        libm: call the C library's exp, expm1, tanh, sin, cos, log and log1p instead of vectorisable ones.
+        casadi: also write NAME_casadi.c, the functions with exact derivatives for CasADi's `external`; a collection
+            names the functions to include.
+        leave_out_large: omit functions that exceed the stack or 4,000 lines (which take seconds to compile), and from
+            NAME_casadi.c functions that CasADi cannot take; the files list what is missing.
+        stack: bytes of stack that a function may use; a plan over many steps may need more than the default.
+        overwrite: replace existing files.
 
     Raises:
-        InputError: what has no C, a name that is none in C, more stack than asked for, or source than 10 MB, files that
-            exist, or the folder of a run, whose files are never replaced.
+        InputError: a function has no C or needs more stack, a name is invalid in C, the source exceeds 10 MB, files
+            exist, or the folder belongs to a run, whose files are never replaced.
     """
     texts = source_files(
         functions, name=check_name(name), precision=precision, libm=libm, casadi=casadi,
@@ -111,7 +112,7 @@ def source_files(
     leave_out_large: bool = False,
     stack: int = STACK,
 ) -> dict[str, bytes]:
-    """Content of each file, by its name."""
+    """Returns the contents of the files by name; arguments as for `export_c`."""
     require_positive(stack=stack)
     if not functions:
         raise InputError("there is no function to export; give at least one, as {'name': (function, examples)}")
@@ -119,37 +120,9 @@ def source_files(
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; expected f32 or f64")
     with computing_in(precision):
-        return _source_files(functions, name, precision, libm, casadi, leave_out_large, stack)
-
-
-def _source_files(
-    functions: Functions,
-    name: str,
-    precision: str,
-    libm: bool,
-    casadi: bool | Collection[str],
-    leave_out_large: bool,
-    stack: int,
-) -> dict[str, bytes]:
-    source, signatures, texts, left_out = Source(precision, libm), {}, [], []
-    every = {
-        check_name(key, "the name of a function"): _traced(key, *each, precision) for key, each in functions.items()
-    }
-    repeated = repeated_calls([each.closed for each in every.values()])
-    for key, each in every.items():
-        before = source.copy()
-        try:
-            signature, text, lines = _function(source, name, key, each, repeated, stack)
-            if leave_out_large and lines > LINES:
-                raise TooLargeError(f"{key}, of {lines} lines")
-        except TooLargeError as error:
-            if not leave_out_large:
-                raise
-            left_out.append(str(error))
-            source = before
-            continue
-        signatures[key] = signature
-        texts.append(text)
+        source, signatures, texts, left_out = _exported(
+            functions, Source(precision, libm), name, leave_out_large, stack
+        )
     version, real = importlib.metadata.version("dln-jax"), PRECISIONS[precision][1]
     written_by = f"Written by dln-jax {version}, C format {FORMAT}."
     files = {
@@ -163,13 +136,41 @@ def _source_files(
     }
     if casadi:
         chosen = {
-            key: each for key, each in functions.items() if key in signatures and (casadi is True or key in casadi)
+            key: pair for key, pair in functions.items() if key in signatures and (casadi is True or key in casadi)
         }
-        files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large, stack)
+        with computing_in(precision):
+            files |= _for_casadi(chosen, name, libm, precision, written_by, leave_out_large, stack)
     if (longest := max(map(len, files.values()))) > LENGTH:
         raise InputError(f"the source would take {longest / 1e6:.0f} MB; generated C suits up to {LENGTH / 1e6:.0f} MB")
     encoded = {file_name: text.encode() for file_name, text in files.items()}
     return {**encoded, f"{name}.json": described(description(name, precision, version, signatures), encoded)}
+
+
+def _exported(
+    functions: Functions, source: Source, name: str, leave_out_large: bool, stack: int
+) -> tuple[Source, dict[str, Signature], list[str], list[str]]:
+    """Returns the source, signatures and texts of the functions, and why functions were left out."""
+    signatures, texts, left_out = {}, [], []
+    every = {
+        check_name(key, "the name of a function"): _traced(key, *pair, source.precision)
+        for key, pair in functions.items()
+    }
+    repeated = repeated_calls([function.closed for function in every.values()])
+    for key, traced_function in every.items():
+        before = source.copy()
+        try:
+            signature, text, lines = _function(source, name, key, traced_function, repeated, stack)
+            if leave_out_large and lines > LINES:
+                raise TooLargeError(f"{key}, of {lines} lines")
+        except TooLargeError as error:
+            if not leave_out_large:
+                raise
+            left_out.append(str(error))
+            source = before
+            continue
+        signatures[key] = signature
+        texts.append(text)
+    return source, signatures, texts, left_out
 
 
 def _for_casadi(
@@ -178,7 +179,7 @@ def _for_casadi(
     if precision != "f64":
         raise InputError("CasADi computes in double; export with precision f64")
     source, text, left_out = external.external_functions(name, functions, libm=libm, stack=stack, leave_out=leave_out)
-    absent = "\n".join(f"Left out: {each}" for each in left_out)
+    absent = "\n".join(f"Left out: {reason}" for reason in left_out)
     about = comment(external.ABOUT.format(name=name, written_by=written_by), *[absent] * bool(absent))
     return {
         f"{name}_casadi.c": about + _preamble(source, name) + text,
@@ -204,14 +205,14 @@ def _traced(key: str, function: Callable[..., Any], examples: Sequence[Any], pre
 
 
 def _function(
-    source: Source, name: str, key: str, each: _Traced, repeated: Collection[int], stack: int
+    source: Source, name: str, key: str, traced_function: _Traced, repeated: Collection[int], stack: int
 ) -> tuple[Signature, str, int]:
-    """Signature, C text and lines of one function, those of functions that it calls included."""
-    signature = Signature(tuple(each.arguments), tuple(each.results))
-    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(each.arguments)}
+    """Returns the signature, the C text, and the number of lines, callees included, of a function."""
+    signature = Signature(tuple(traced_function.arguments), tuple(traced_function.results))
+    named = {k: (leaf.name, leaf.shape == ()) for k, leaf in enumerate(traced_function.arguments)}
     targets = [None] if signature.returns else [leaf.name for leaf in signature.results]
     try:
-        program, _, results = program_of(each.closed, repeated, precision=source.precision)
+        program, _, results = program_of(traced_function.closed, repeated, precision=source.precision)
         body = body_of(source, program, results, named, targets)
     except InputError as error:
         raise InputError(f"{key}: {error}") from error
@@ -242,7 +243,7 @@ def _precision(functions: Functions) -> str:
 
 
 def _preamble(source: Source, name: str) -> str:
-    """What comes before the functions."""
+    """Returns the part of a source before its functions."""
     real, suffix = PRECISIONS[source.precision][1], source.suffix
     tables = "\n".join(table(table_name, array, source.precision) for table_name, array in source.tables.values())
     upper = suffix.upper()
@@ -263,13 +264,13 @@ def _preamble(source: Source, name: str) -> str:
 
 
 def _header(name: str, written_by: str, signatures: Mapping[str, Signature], real: str, left_out: Sequence[str]) -> str:
-    absent = "\n".join(f"Left out: {each}; ask for it by name." for each in left_out)
+    absent = "\n".join(f"Left out: {reason}; ask for it by name." for reason in left_out)
     about, guard = comment(f"{name}.h", written_by, _PROMISES, *[absent] * bool(absent)), f"{name.upper()}_H"
     declared = ""
-    for key, each in signatures.items():
-        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in each.results if leaf.shape)
-        facts = f"{each.operations} floating-point operations, {each.stack_bytes} bytes of stack"
-        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, each, real)};\n"
+    for key, signature in signatures.items():
+        shapes = ", ".join(f"{leaf.name} {list(leaf.shape)}" for leaf in signature.results if leaf.shape)
+        facts = f"{signature.operations} floating-point operations, {signature.stack_bytes} bytes of stack"
+        declared += f"\n/* {f'{shapes}; ' if shapes else ''}{facts} */\n{declaration(name, key, signature, real)};\n"
     return (
         f'{about}#ifndef {guard}\n#define {guard}\n\n#include <stdint.h>\n\n#ifdef __cplusplus\nextern "C" {{\n#endif\n'
         f"{declared}\n#ifdef __cplusplus\n}}\n#endif\n\n#endif\n"

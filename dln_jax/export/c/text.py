@@ -1,4 +1,4 @@
-"""Pieces of C text: numbers, tables, comments and names."""
+"""C text of numbers, tables, comments and names."""
 
 import re
 from string import Template
@@ -17,8 +17,8 @@ acos acosh asin asinh atan atan2 atanh cbrt ceil copysign cos cosh erf erfc exp 
 fmod frexp hypot ilogb ldexp lgamma llrint llround log log10 log1p log2 logb lrint lround modf nan nearbyint nextafter
 nexttoward pow remainder remquo rint round scalbln scalbn sin sinh sqrt tan tanh tgamma trunc
 """
-# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and what a source defines itself:
-# a function, a library or a header of that name would not build, or hide what is needed.
+# Keywords of C99 and C++, headers and functions of their libraries, targets of make, and names that a source defines:
+# a function, library or header with such a name would not build, or would hide the original.
 _RESERVED = frozenset(
     re.findall(
         r"\w+",
@@ -39,7 +39,7 @@ _RESERVED = frozenset(
 
 
 def check_name(name: str, what: str = "name") -> str:
-    """A name that may stand in C; InputError otherwise."""
+    """Returns a valid name in C, and raises InputError for any other."""
     taken = name.lower() in _RESERVED or re.fullmatch(r"(v|c|n|t|i|table|part)_?\d\w*|elementary_.*|.*_", name)
     if not _NAME.fullmatch(name) or taken or len(name) > 40:
         raise InputError(
@@ -50,12 +50,12 @@ def check_name(name: str, what: str = "name") -> str:
 
 
 def fill(text: str, precision: str, **values) -> str:
-    """The text with `$name` replaced; `${f}` is the suffix of literals and functions, and `real` the C type."""
+    """Returns the text with `$name` replaced; `${f}` is the suffix of literals and functions, `$real` the C type."""
     return Template(text).substitute(f=PRECISIONS[precision][2], real=PRECISIONS[precision][1], **values)
 
 
 def number(value, precision: str) -> str:
-    """The shortest literal that reads back as the same number, InputError where it is too large for the precision."""
+    """Returns the shortest literal of the same number; raises InputError if the precision cannot hold it."""
     numpy_type, _, suffix = PRECISIONS[precision]
     if not np.isfinite(value):
         return "(real)NAN" if value != value else "(real)INFINITY" if value > 0 else "-(real)INFINITY"
@@ -67,7 +67,7 @@ def number(value, precision: str) -> str:
 
 
 def literal(value, precision: str) -> str:
-    """A number inside of an expression."""
+    """Returns a number for use in an expression, in parentheses if negative."""
     text = number(value, precision)
     return f"({text})" if text.startswith("-") else text
 
@@ -76,21 +76,21 @@ _wrapper = TextWrapper(116, initial_indent="    ", subsequent_indent="    ", bre
 
 
 def table(name: str, array: np.ndarray, precision: str) -> str:
-    """A constant array."""
+    """Returns the definition of a constant array."""
     kind = "real" if array.dtype.kind == "f" else kind_of(array.dtype)
-    texts = (number(each, precision) if kind == "real" else integer(int(each), kind) for each in array.ravel())
-    lines = "\n".join(_wrapper.wrap(" ".join(f"{each}," for each in texts)))
+    texts = (number(value, precision) if kind == "real" else integer(int(value), kind) for value in array.ravel())
+    lines = "\n".join(_wrapper.wrap(" ".join(f"{text}," for text in texts)))
     return f"static const {C_TYPES[kind]} {name}[{array.size}] = {{\n{lines}\n}};\n"
 
 
 def integer(value: int, kind: str) -> str:
-    """A literal of a whole number; C has none for the least ones."""
-    least = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
-    if value in least:
-        return least[value]
+    """Returns a whole number as a literal; C has none for the lowest of 32 and 64 bits, which have names."""
+    lower = {-(2**31): "INT32_MIN", -(2**63): "INT64_MIN"}
+    if value in lower:
+        return lower[value]
     return str(value) + {"unsigned": "U", "unsigned_long": "ULL"}.get(kind, "")
 
 
 def comment(*paragraphs: str) -> str:
-    """A block comment of lines as given."""
+    """Returns a block comment with the lines unchanged."""
     return "/*\n" + "".join(f" * {line}".rstrip() + "\n" for line in "\n\n".join(paragraphs).splitlines()) + " */\n"

@@ -26,7 +26,7 @@ SOME, ALL = "some samples", "all samples"
 class State(NamedTuple):
     """Everything that a run needs to continue."""
 
-    solver: levenberg_marquardt.State
+    solver: levenberg_marquardt.LevenbergMarquardtState
     earlier: Array
     """[] iterations of the stage before."""
     best: Best
@@ -103,7 +103,7 @@ def _compile(
     advance = jax.jit(advance, compiler_options=quick_compilation())
     advance = advance.lower((chunks, np.asarray(0)), state.solver).compile()
 
-    def judge(step: Array, given: tuple[Best, levenberg_marquardt.State]) -> tuple[Best, Array]:
+    def judge(step: Array, given: tuple[Best, levenberg_marquardt.LevenbergMarquardtState]) -> tuple[Best, Array]:
         best, solver = given
         # One seed after the other: a score that calls LAPACK must not do so for a batch (see `solvers.lapack`).
         scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)

@@ -1,4 +1,4 @@
-"""Minima of sums of element energies, and the linear systems on the way."""
+"""Minimises sums of element energies, and solves the linear systems of its Newton steps."""
 
 from dln_jax.solvers.elements.assembly import Pattern, pattern
 from dln_jax.solvers.elements.energies import ElementEnergy, value

@@ -1,7 +1,7 @@
-"""Where the gradient and the Hessian of a sum of element energies come from, and how they are put together.
+"""Assembles the gradient and the Hessian of a sum of element energies.
 
-Which elements meet where is known before anything is traced: assembly is by gathering and adding along index arrays
-made here once, because scattering costs a loop iteration per element.
+The elements' connectivity is known before tracing. Assembly gathers and adds along index arrays that are made once
+here, because a scatter costs a loop iteration per element.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,10 +17,10 @@ from dln_jax.types import InputError
 
 
 class Pattern(NamedTuple):
-    """Where the gradient and the lower triangle of the Hessian come from. Static arrays.
+    """Sources of the gradient and of the lower triangle of the Hessian, as static arrays.
 
-    Unknown number `r` is x.ravel()[r]. Sources index what the elements have, component by component (all elements'
-    first, then all elements' second, ...); one past the end stands for zero.
+    Unknown number `r` is x.ravel()[r]. Sources index the elements' components (the first component of all elements,
+    then the second, ...); an index past the end stands for zero.
     """
 
     blocks: int
@@ -31,13 +31,13 @@ class Pattern(NamedTuple):
     """Unknowns that are solved for."""
     rows: Int[np.ndarray, " entries"]
     columns: Int[np.ndarray, " entries"]
-    """Of each entry of the Hessian; columns <= rows."""
+    """Row and column of every entry of the Hessian; columns <= rows."""
     sources: tuple[Int[np.ndarray, "some terms"], ...]
-    """Element entries that add up to each entry, for entries 0, 1, ... in turn, grouped by how many there are."""
+    """Element entries whose sum is entry 0, 1, ... of the Hessian, in tables grouped by the number of terms."""
     diagonal: Int[np.ndarray, " unknowns"]
-    """Place of each unknown's diagonal entry among the entries; one past the end where it is not free."""
+    """Index of every unknown's diagonal entry among the entries; past the end if the unknown is not free."""
     corners: tuple[Int[np.ndarray, "n b valence"], ...]
-    """For each energy, the element components that add up to each unknown's."""
+    """For every energy, the element components whose sum is the gradient of an unknown."""
 
     @property
     def unknowns(self) -> int:
@@ -46,16 +46,16 @@ class Pattern(NamedTuple):
 
 
 def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: Any = None) -> Pattern:
-    """The sparsity pattern of a sum of element energies on x [blocks, width].
+    """Returns the sparsity pattern of a sum of element energies on x [blocks, width].
 
     Args:
-        energies: whose indices count.
+        energies: the terms, with their indices.
         blocks: n.
         width: b.
         free: [n, b], which unknowns are solved for; all of them by default.
 
     Raises:
-        InputError: an index that is out of range, or named twice by one element.
+        InputError: an index is out of range, or occurs twice in an element.
     """
     free = np.ones((blocks, width), bool) if free is None else np.asarray(free, bool)
     if free.shape != (blocks, width):
@@ -85,7 +85,7 @@ def pattern(energies: Sequence[ElementEnergy], blocks: int, width: int, free: An
 def value_and_gradient(
     energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]
 ) -> tuple[Float[Array, ""], Blocks]:
-    """E(x), and dE/dx with zeros where x is not free."""
+    """Returns E(x), and dE/dx with zeros where x is not free."""
     total, gradient = jnp.zeros((), x.dtype), jnp.zeros_like(x)
     for element, corners, of_elements in zip(energies, at.corners, data, strict=True):
         values, gradients = jax.vmap(jax.value_and_grad(element.energy))(local(element, x), of_elements)
@@ -95,17 +95,17 @@ def value_and_gradient(
 
 
 def gradient(energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]) -> Blocks:
-    """dE/dx, with zeros where x is not free."""
+    """Returns dE/dx, with zeros where x is not free."""
     return value_and_gradient(energies, at, x, data)[1]
 
 
 def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "s m"]) -> Blocks:
-    """Adds what the elements have at their corners to the blocks there."""
+    """Adds the components of the elements' corners to the blocks there."""
     if corners.shape[2] == 1 and np.array_equal(corners[:, :, 0].T.ravel(), np.arange(components.size)):
         return components.T.reshape(corners.shape[:2])
     padding = components.size
-    # Where each component goes; the transposed map reads there, where differentiation would scatter, which costs a loop
-    # iteration per element on a CPU.
+    # The unknown that a component is added to. The transposed map gathers from there; JAX's own transpose would
+    # scatter, which costs a loop iteration per element on a CPU.
     unknown, slot = np.divmod(np.flatnonzero(corners.reshape(-1) < padding), corners.shape[2])
     to = np.empty(padding, int)
     to[corners.reshape(-1, corners.shape[2])[unknown, slot]] = unknown
@@ -115,7 +115,7 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
 
     # y = G x, whose transpose is to be a gather too, is the second half of the solution of
     #     [[1, 0], [-G, 1]] (u, w) = (x, 0),    with the transposed solution u = x + Gᵀ w,
-    # because a linear solve is what JAX lets one give a transpose of, and map over.
+    # because JAX lets callers define the transpose of a linear solve, and can batch it.
     def product(both: Array) -> Array:
         return jnp.concatenate([both[:padding], both[padding:] - add(both[:padding])])
 
@@ -131,20 +131,20 @@ def assemble(corners: Int[np.ndarray, "n b valence"], components: Float[Array, "
 
 
 def entries(at: Pattern, hessians: Sequence[Array]) -> Float[Array, " entries"]:
-    """Values of the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
+    """Returns the Hessian's lower triangle at `at.rows`, `at.columns`, from the Hessians of the elements."""
     flat = jnp.concatenate([*(h.reshape(-1) for h in hessians), jnp.zeros(1, hessians[0].dtype)])
     return jnp.concatenate([flat[of_group].sum(-1) for of_group in at.sources])
 
 
 def _components(of_corners: Any) -> Float[Array, "s m"]:
-    """What `local` gives, component by component."""
+    """Returns the result of `local`, or its gradient, component by component."""
     if isinstance(of_corners, tuple):
         return jnp.stack(jax.tree.leaves(of_corners))
     return of_corners.reshape(len(of_corners), -1).T
 
 
-def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys most"]:
-    """The places of each key 0 .. keys - 1, in a padded table."""
+def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[np.ndarray, "keys terms"]:
+    """Returns the places of the keys 0 .. keys - 1 in a padded table."""
     counts = np.bincount(key, minlength=keys)
     table = np.full((keys, max(1, counts.max(initial=0))), padding)
     slots = np.arange(table.shape[1])
@@ -158,7 +158,7 @@ def _group(key: np.ndarray, place: np.ndarray, keys: int, padding: int) -> Int[n
 def _group_by_count(
     key: np.ndarray, place: np.ndarray, padding: int
 ) -> tuple[np.ndarray, tuple[Int[np.ndarray, "some terms"], ...]]:
-    """Distinct keys and the places of each, in two tables: keys with few places, then the rest."""
+    """Returns the distinct keys and their places, in two tables: keys with few places, then the rest."""
     distinct, number, counts = np.unique(key, return_inverse=True, return_counts=True)
     table = _group(number, place, len(distinct), padding)
     few = counts <= np.median(counts)
@@ -177,4 +177,6 @@ def _require_indices(indices: np.ndarray, blocks: int, number: int) -> None:
     ordered = np.sort(indices, axis=1)
     twice = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(twice):
-        raise InputError(f"element {twice[0]} of energy {number} has indices {indices[twice[0]]}; expected each once")
+        raise InputError(
+            f"element {twice[0]} of energy {number} has indices {indices[twice[0]]}; expected no index twice"
+        )

@@ -1,7 +1,7 @@
-"""How many products conjugate gradients take for a search direction, measured before a solver is chosen.
+"""Measures how many products conjugate gradients need for a search direction, before a solver is chosen.
 
-The stiffness of a body, its Poisson's ratio, the time step and the mesh decide together: the products grow with the
-square root of the condition number of the Hessian, which is known once its numbers are.
+Stiffness, Poisson's ratio, time step and mesh together determine the number of products, which grows with the square
+root of the condition number of the Hessian. It can be measured only for concrete numbers.
 """
 
 from collections.abc import Sequence
@@ -22,15 +22,16 @@ from dln_jax.solvers.elements.energies import Blocks, ElementEnergy
 def search_takes_at_most(
     products: int, energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any], *, residual: float
 ) -> bool:
-    """Whether conjugate gradients with a block-Jacobi preconditioner solve with the Hessian at x in so many products.
+    """Returns whether conjugate gradients with a block-Jacobi preconditioner need at most `products` products.
 
-    Tried on a uniform and on a random right-hand side. Compiles one product of an element's Hessian.
+    It solves with the Hessian at x for a uniform and a random right-hand side, and compiles one product of an element's
+    Hessian.
 
     Args:
         products: the limit, which also bounds the work.
         energies, at: the sum of energies and its pattern.
         x, data: concrete values.
-        residual: relative.
+        residual: relative residual of the solution.
     """
     hessian, inverse = _hessian(energies, at, x, data)
     unknowns = int(at.free.sum())
@@ -46,7 +47,7 @@ def _solved(hessian: csr_array, inverse: csr_array, b: np.ndarray, products: int
 def _hessian(
     energies: Sequence[ElementEnergy], at: Pattern, x: Blocks, data: Sequence[Any]
 ) -> tuple[csr_array, csr_array]:
-    """The Hessian of the free unknowns, and the inverses of its diagonal blocks."""
+    """Returns the Hessian of the free unknowns, and the inverses of its diagonal blocks."""
     rows, columns, values = [], [], []
     with jax.ensure_compile_time_eval():
         for element, of in zip(energies, data, strict=True):
@@ -75,7 +76,7 @@ def _hessian(
 
 
 def _element_hessian(element: ElementEnergy, x: Float[Array, "k b"], data: Any) -> Float[Array, "s s"]:
-    """Column by column in a loop, which compiles several times faster than all of them written out."""
+    """Computes the Hessian by columns in a loop, which compiles several times faster than unrolled columns."""
 
     def column(direction: Float[Array, " s"]) -> Float[Array, " s"]:
         along = direction.reshape(x.shape)

@@ -2,7 +2,7 @@
 
     E(x) = sum over energies, sum over elements e:  energy(x[indices[e]], data[e]),    x [n, b]
 
-An element couples a few of the n blocks of b unknowns each (the corners of a triangle, the ends of a spring), so that
+An element couples a few of the n blocks of b unknowns (the corners of a triangle, the ends of a spring), so that
 the Hessian is sparse; `assembly` puts it together.
 """
 
@@ -28,36 +28,36 @@ class ElementEnergy(NamedTuple):
     energy: Callable[[Any, Any], Float[Array, ""]]
     """(unknowns x[i][j] of one element, its data) -> energy."""
     indices: Int[np.ndarray, "m k"]
-    """Blocks of unknowns of each element; an element may name a block once."""
-    written_out: bool = False
-    """Whether the energy takes `Corners`, scalars in place of an array [k, b]: arithmetic of scalars fuses over all
-    elements, so that its derivatives are several times faster; for elements of up to a dozen unknowns."""
+    """Blocks of unknowns of the elements; a block occurs at most once in an element."""
+    unrolled: bool = False
+    """Whether the energy takes scalars (`Corners`) instead of an array [k, b]. Arithmetic of scalars fuses over all
+    elements and makes derivatives several times faster, for elements of up to a dozen unknowns."""
 
 
 def value(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> Float[Array, ""]:
-    """E(x)."""
+    """Returns E(x)."""
     terms = [jax.vmap(e.energy)(local(e, x), d).sum() for e, d in zip(energies, data, strict=True)]
     return sum(terms, jnp.zeros((), x.dtype))
 
 
 def local(element: ElementEnergy, x: Blocks) -> Any:
-    """The unknowns of all elements, as the energy takes them: [m, k, b], or scalars [m] in nested tuples."""
-    if not element.written_out:
+    """Returns the unknowns of all elements in the form that the energy takes: [m, k, b], or nested tuples of [m]."""
+    if not element.unrolled:
         return x[element.indices]
     corners = (_take(x, corner) for corner in element.indices.T)
     return tuple(tuple(corner[:, j] for j in range(x.shape[1])) for corner in corners)
 
 
 def element_hessians(energies: Sequence[ElementEnergy], x: Blocks, data: Sequence[Any]) -> tuple[Array, ...]:
-    """Lower triangles of the Hessian of each element, row by row: [s (s + 1)/2, m] for each energy, s = k b."""
+    """Returns the lower triangles of the element Hessians, by rows: [s (s + 1)/2, m] per energy, s = k b."""
     return tuple(
-        _written_out_hessians(e, x, of) if e.written_out else _array_hessians(e, x, of)
+        _unrolled_hessians(e, x, of) if e.unrolled else _array_hessians(e, x, of)
         for e, of in zip(energies, data, strict=True)
     )
 
 
 def square(lower: Float[Array, "entries m"]) -> Float[Array, "m s s"]:
-    """Whole element Hessians from their lower triangles."""
+    """Returns whole element Hessians from their lower triangles."""
     s = round((np.sqrt(8 * lower.shape[0] + 1) - 1) / 2)
     row, column = np.indices((s, s))
     larger, smaller = np.maximum(row, column), np.minimum(row, column)
@@ -65,7 +65,7 @@ def square(lower: Float[Array, "entries m"]) -> Float[Array, "m s s"]:
 
 
 def lower_triangles(whole: Float[Array, "m s s"]) -> Float[Array, "entries m"]:
-    """The inverse of `square`."""
+    """Returns the lower triangles of whole element Hessians, the inverse of `square`."""
     return whole[:, *np.tril_indices(whole.shape[-1])].T
 
 
@@ -75,7 +75,7 @@ def _array_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array
     return lower_triangles(whole.reshape(-1, s, s))
 
 
-def _written_out_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
+def _unrolled_hessians(element: ElementEnergy, x: Blocks, data: Any) -> Float[Array, "entries m"]:
     def of_one(corners: Corners, data: Any) -> list[Array]:
         scalars, structure = jax.tree.flatten(corners)
 
@@ -95,9 +95,9 @@ def _take(x: Blocks, blocks: np.ndarray) -> Float[Array, "m b"]:
 
 
 def project(hessians: Sequence[Array], shift: Float[Array, ""]) -> tuple[Array, ...]:
-    """Element Hessians (lower triangles) with negative eigenvalues set to zero, plus a multiple of the unit matrix.
+    """Sets negative eigenvalues of element Hessians (lower triangles) to zero, and shifts their diagonals.
 
-    `shift` is what is added to the diagonals, relative to the largest eigenvalue of all.
+    `shift` is relative to the largest eigenvalue of all elements.
     """
     spectra = []
     for lower in hessians:

@@ -1,4 +1,4 @@
-"""A backtracking line search that still sees descent where the energy is lost in rounding."""
+"""A backtracking line search that still detects descent when rounding hides changes of the energy."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,14 +15,14 @@ _HALVINGS = 40
 
 
 class Point(NamedTuple):
-    """A point and what is known there."""
+    """A point with its energy and gradient."""
 
     x: Blocks
     energy: Float[Array, ""]
     gradient: Blocks
 
 
-class _Trial(NamedTuple):
+class _LineSearchTrial(NamedTuple):
     point: Point
     length: Float[Array, ""]
     accepted: Bool[Array, ""]
@@ -36,18 +36,18 @@ def line_search(
     unclear: Float[Array, ""],
     scale: Float[Array, "n 1"],
 ) -> tuple[Point, Bool[Array, ""]]:
-    """The first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient where the energy cannot tell.
+    """Takes the first of the steps 1, 1/2, 1/4, ... that lowers the energy, or the gradient if rounding hides that.
 
-    Changes of the energy below `unclear` tell nothing: terms that cancel at rest are that large. A stiff body's
-    gradient is balanced to many digits after its energy has become blind. Returns the point, which is the start if no
-    step is accepted, and whether one is.
+    Changes of the energy below `unclear` are rounding of terms that cancel at rest; the gradient of a stiff body keeps
+    improving by many digits beyond that. Returns the point, which is the start if no step is accepted, and whether a
+    step is accepted.
 
     Args:
         evaluate: x -> energy and gradient.
-        start: where the search starts.
-        direction: of descent.
-        slope: of the energy along the direction, <= 0.
-        unclear: what the energy cannot tell from zero.
+        start: the point where the search starts.
+        direction: a descent direction.
+        slope: derivative of the energy along the direction, <= 0.
+        unclear: changes of the energy that rounding hides.
         scale: unit of the gradient's rows.
     """
 
@@ -56,19 +56,21 @@ def line_search(
 
     before = size(start.gradient)
 
-    def attempt(trial: _Trial) -> _Trial:
+    def attempt(trial: _LineSearchTrial) -> _LineSearchTrial:
         x = start.x + trial.length * direction
         energy, gradient = evaluate(x)
         change = energy - start.energy
         lower = change <= _DECREASE * trial.length * slope
         flatter = (jnp.abs(change) <= unclear) & (size(gradient) < before)
         accepted = (lower | flatter) & jnp.isfinite(energy) & jnp.isfinite(gradient).all()
-        return _Trial(Point(x, energy, gradient), trial.length / 2, accepted)
+        return _LineSearchTrial(Point(x, energy, gradient), trial.length / 2, accepted)
 
     one = jnp.ones((), start.x.dtype)
     smallest = 2.0**-_HALVINGS
     last = jax.lax.while_loop(
-        lambda trial: ~trial.accepted & (trial.length > smallest), attempt, _Trial(start, one, jnp.asarray(False))
+        lambda trial: ~trial.accepted & (trial.length > smallest),
+        attempt,
+        _LineSearchTrial(start, one, jnp.asarray(False)),
     )
     kept = [jnp.where(last.accepted, new, old) for new, old in zip(last.point, start, strict=True)]
     return Point(*kept), last.accepted

@@ -1,13 +1,13 @@
-"""Symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
+"""Solves symmetric positive definite systems H p = b whose matrix is a sum of element Hessians.
 
-Three ways, chosen by their work before anything is traced, from size, structure and, where known, the stiffness:
+There are three methods. The choice is made before tracing, by the estimated work for size, structure and stiffness:
 
 - dense Cholesky for small systems;
-- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most;
-- conjugate gradients with a block-Jacobi preconditioner on the element Hessians, without any matrix, where the band is
-  wide: bodies in space from some thousand unknowns on.
+- block-tridiagonal Cholesky after reverse Cuthill-McKee ordering, a `lax.scan` over blocks, for most systems;
+- matrix-free conjugate gradients with a block-Jacobi preconditioner on the element Hessians for wide bands: bodies in
+  space with more than some thousand unknowns.
 
-A matrix that is not positive definite gives a solution that is not finite: nothing is shifted or clamped here.
+A matrix that is not positive definite gives a solution that is not finite, without shifts or clamping.
 """
 
 import itertools
@@ -31,12 +31,12 @@ from dln_jax.solvers.elements.symmetric_systems import conjugate_gradients, fact
 from dln_jax.solvers.elimination import solve as eliminate
 from dln_jax.solvers.lapack import cholesky, shared_or_batched, substitute
 
-# Measured on two cores: beyond so many unknowns the dense factorisation is slower than the block-tridiagonal one.
+# With more unknowns the dense factorisation is slower than the block-tridiagonal one, measured on two cores.
 _DENSE_UNKNOWNS = 160
 # Of so many at once, bands up to here are factorised faster than each matrix by LAPACK; as measured with 56 to 120
 # unknowns, bands of 11 to 40 and 2 to 64 systems: 4 times at 56, 11 and 64.
 _WIDEST_BAND = 20
-_FEWEST_BANDS = 4
+_LOWER_BANDS = 4
 # Measured as processor time of one core in float64, on eleven bodies in the plane and in space (675 to 20,502 unknowns,
 # rows of cells and Delaunay meshes, nu 0.3 to 0.49, E 1e6 and 1e8 Pa, time steps of 1/60 s). A factorisation of n
 # unknowns in blocks of b takes 1.3e-10 s n b (b + 150), within a factor of 1.6; a product with m element Hessians of s
@@ -48,28 +48,28 @@ _FACTORISATION_SECONDS = 1.3e-10
 _BLOCK_OVERHEAD = 150
 _PRODUCT_SECONDS = 6e-10
 _PRODUCTS = 15
-# Where the products of a search are measured, they still come with so many times the Newton iterations.
+# An inexact search takes this many times the Newton iterations, also when its products are measured.
 _MORE_ITERATIONS = 1.75
-_FEWEST_PRODUCTS = 20
+_LOWER_PRODUCTS = 20
 # Entries n b of the blocks, whose values, factor and index tables take 48 bytes each, beyond which they are not stored.
-_MOST_ENTRIES = 3e7
+_UPPER_ENTRIES = 3e7
 
 
 # Relative residuals of the conjugate gradients, and the products after which they give up.
 _SOLVE_RESIDUAL = 1e-10
 SEARCH_RESIDUAL = 1e-2
-_MOST_PRODUCTS = 10_000
+_UPPER_PRODUCTS = 10_000
 
 
 class LinearSolver(NamedTuple):
-    """How systems with the Hessian are solved."""
+    """A method for systems with the Hessian."""
 
     factorise: Callable[[Sequence[Array], Float[Array, " entries"]], Any]
-    """(element Hessians, entries of their sum) -> what the solves need."""
+    """(element Hessians, entries of their sum) -> the factor for the solves."""
     solve: Callable[[Any, Blocks], Blocks]
-    """(factor, b) -> p, as accurate as rounding allows; p is zero where the pattern is not free."""
+    """(factor, b) -> p, to the accuracy of rounding; p is zero where the pattern is not free."""
     search: Callable[[Any, Blocks], Blocks]
-    """The same, as accurate as a search direction has to be."""
+    """(factor, b) -> p, accurate enough for a search direction."""
 
 
 Columns = Float[Array, "n k"]
@@ -77,12 +77,12 @@ LinearSolverFactory = Callable[[Sequence[ElementEnergy], Pattern], LinearSolver]
 
 
 def by_size(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """The way that `least_work` names by size and structure, for stiffness that is not known."""
+    """Chooses the method with the least work by size and structure, for unknown stiffness."""
     return least_work(energies, at)(energies, at)
 
 
 def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, data: Sequence[Any]) -> LinearSolver:
-    """The way that `least_work` names for the Hessian at x, with concrete data of the elements."""
+    """Chooses the method with the least work for the Hessian at x, with concrete data of the elements."""
     measure = partial(search_takes_at_most, energies=energies, at=at, x=x, data=data, residual=SEARCH_RESIDUAL)
     return least_work(energies, at, measure)(energies, at)
 
@@ -90,34 +90,34 @@ def by_stiffness(energies: Sequence[ElementEnergy], at: Pattern, *, x: Blocks, d
 def least_work(
     energies: Sequence[ElementEnergy], at: Pattern, search_takes_at_most: Callable[[int], bool] | None = None
 ) -> LinearSolverFactory:
-    """`dense`, `block_tridiagonal` or `matrix_free`: the least work by estimates of a factorisation and of products.
+    """Returns `dense`, `block_tridiagonal` or `matrix_free`, by estimates of the work of factorisations and products.
 
-    `search_takes_at_most` tells whether a search direction takes at most this many products; it is asked only where
-    size and structure leave the choice open. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer or
-    nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
+    `search_takes_at_most` returns whether a search direction takes at most this many products; it is called only if
+    size and structure do not settle the choice. Without it, moderate stiffness and nu = 0.3 are assumed: much stiffer
+    or nearly incompressible bodies (nu > 0.49) then gain by `block_tridiagonal`, soft ones in small time steps by
     `matrix_free`.
     """
     if at.unknowns <= _DENSE_UNKNOWNS:
         return dense
     size = _band(at, _ordering(at)) * at.width
     stored = at.unknowns * size
-    if stored > _MOST_ENTRIES:
+    if stored > _UPPER_ENTRIES:
         return matrix_free
     factorisation = _FACTORISATION_SECONDS * stored * (size + _BLOCK_OVERHEAD)
     product = _PRODUCT_SECONDS * sum(len(e.indices) * (e.indices.shape[1] * at.width) ** 2 for e in energies)
     if search_takes_at_most is None:
-        # Vertices along an edge of the body, which information crosses by one a product.
+        # Vertices along an edge of the body; a product carries information across one of them.
         across = at.blocks ** (1 / min(at.width, 3))
         return block_tridiagonal if factorisation <= _PRODUCTS * across * product else matrix_free
     affordable = int(factorisation / (_MORE_ITERATIONS * product))
-    # So few would gain little, and the measurement costs a compilation.
-    if affordable < _FEWEST_PRODUCTS or not search_takes_at_most(affordable):
+    # So few products gain little, and the measurement costs a compilation.
+    if affordable < _LOWER_PRODUCTS or not search_takes_at_most(affordable):
         return block_tridiagonal
     return matrix_free
 
 
 def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Cholesky factorisation of the whole matrix; under `vmap`, on a processor, of the bands of all where narrow."""
+    """Factorises the whole matrix by Cholesky; under `vmap`, on a CPU, all narrow bands together."""
     table = _lookup(at)(np.arange(at.unknowns)[:, None], np.arange(at.unknowns)[None, :])
 
     def factorise(_: Sequence[Array], values: Float[Array, " entries"]) -> Array:
@@ -137,7 +137,7 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
         solve = partial(of_blocks, substituted)
         return LinearSolver(factorise, solve, solve)
 
-    # Factorised as it is solved, because the two ways have factors of different shapes.
+    # The solve includes the factorisation, because the two methods have factors of different shapes.
     solve = partial(of_blocks, _one_or_many(lambda values, b: substituted(factorise((), values), b), at, order, band))
     return LinearSolver(lambda _, values: values, solve, solve)
 
@@ -145,7 +145,7 @@ def dense(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 def _one_or_many(
     one: Callable[[Array, Columns], Columns], at: Pattern, order: np.ndarray, band: int
 ) -> Callable[[Array, Columns], Columns]:
-    """(entries, b) -> x by `one`, or for a batch by the bands of all."""
+    """Returns the solve (entries, b) -> x by `one`, for a batch by banded factorisations side by side."""
     row, column = places(at.unknowns, band)
     numbers = np.append(order, np.full(max(row.max(), column.max()) + 1 - at.unknowns, at.unknowns))
     beyond = (row == column) & (row >= at.unknowns)
@@ -157,16 +157,16 @@ def _one_or_many(
         return x[np.argsort(order)].transpose(2, 0, 1)
 
     def many(values: Float[Array, "systems entries"], b: Float[Array, "systems n k"]) -> Array:
-        each = jax.vmap(one)
-        if len(values) < _FEWEST_BANDS:
-            return each(values, b)
-        return lax.platform_dependent(values, b, cpu=by_bands, default=each)
+        of_each = jax.vmap(one)
+        if len(values) < _LOWER_BANDS:
+            return of_each(values, b)
+        return lax.platform_dependent(values, b, cpu=by_bands, default=of_each)
 
     return shared_or_batched(one, many)
 
 
 def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Cholesky factorisation block by block, the unknowns ordered so that only neighbouring blocks couple."""
+    """Factorises by blocks with Cholesky, the unknowns ordered so that only neighbouring blocks couple."""
     order = _ordering(at)
     size = _band(at, order)
     count = -(-at.blocks // size)
@@ -193,9 +193,9 @@ def block_tridiagonal(_: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
 
 
 def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
-    """Conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
+    """Solves by conjugate gradients with a block-Jacobi preconditioner, on products with the element Hessians.
 
-    A solve that does not get to its relative residual is not finite.
+    A solution that does not reach its relative residual is not finite.
     """
     n, b = at.blocks, at.width
     numbers = np.arange(n * b).reshape(n, b)
@@ -219,13 +219,13 @@ def matrix_free(energies: Sequence[ElementEnergy], at: Pattern) -> LinearSolver:
             return (inverse @ x[..., None])[..., 0]
 
         right = jnp.where(at.free, right, 0)
-        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_MOST_PRODUCTS)
+        return conjugate_gradients(product, right, precondition, tolerance=tolerance, iterations=_UPPER_PRODUCTS)
 
     return LinearSolver(factorise, partial(run, _SOLVE_RESIDUAL), partial(run, SEARCH_RESIDUAL))
 
 
 def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """(rows, columns) -> index into the entries with the constants 0 and 1 behind them; beyond the rows all is zero."""
+    """Returns (rows, columns) -> index into the entries followed by the constants 0 and 1; 0 beyond the matrix."""
     size = at.unknowns + 1
     key = at.rows * size + at.columns
     order = np.argsort(key)
@@ -236,8 +236,8 @@ def _lookup(at: Pattern) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         # The lower triangle stands for both.
         wanted = np.maximum(row, column) * size + np.minimum(row, column)
         nearest = np.minimum(np.searchsorted(key[order], wanted), len(key) - 1)
-        found = np.where(key[order][nearest] == wanted, order[nearest], len(key))
-        return np.where((row == column) & fixed[row], _one(at), found)
+        place = np.where(key[order][nearest] == wanted, order[nearest], len(key))
+        return np.where((row == column) & fixed[row], _one(at), place)
 
     return places
 
@@ -251,14 +251,14 @@ def _with_constants(values: Float[Array, " entries"]) -> Float[Array, " entries2
 
 
 def _ordering(at: Pattern) -> Int[np.ndarray, " n"]:
-    """Reverse Cuthill-McKee, or the given order where its band is narrower (meshes built row by row)."""
+    """Returns the reverse Cuthill-McKee order, or the present one if its band is narrower (meshes built by rows)."""
     rows, columns = at.rows // at.width, at.columns // at.width
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(at.blocks, at.blocks)).tocsr()
-    found = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
-    return min(found, np.arange(at.blocks), key=lambda order: _band(at, order))
+    ordering = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True).astype(int)
+    return min(ordering, np.arange(at.blocks), key=lambda order: _band(at, order))
 
 
 def _band(at: Pattern, order: np.ndarray) -> int:
-    """Largest distance in the ordering between two blocks that couple; at least 1."""
+    """Returns the largest distance in the order between two blocks that couple, at least 1."""
     place = np.argsort(order)
     return max(1, int(np.abs(place[at.rows // at.width] - place[at.columns // at.width]).max(initial=0)))

@@ -1,12 +1,12 @@
-"""Minima of sums of element energies by Newton's method, differentiable by the implicit function theorem.
+"""Minimises sums of element energies by Newton's method, differentiable by the implicit function theorem.
 
     x* = argmin E(x; theta),    H p = -g,    x <- x + t p                      (Newton with a line search)
     dx* = -H⁻¹ (dg/dtheta) dtheta,    g = dE/dx,    H = d²E/dx²                (implicit function theorem)
 
-The Hessian is used as it is; only when its factorisation fails are the Hessians of the elements projected to positive
-semi-definite ones (projecting always costs several times the iterations on badly deformed bodies). The derivative is
-that of the minimum and not of the iterations: one factorisation and one solve, in forward and in reverse mode and to
-any order. A derivative at a point that is no minimum is NaN, never a plausible number.
+Newton's method uses the true Hessian. Only if its factorisation fails are the element Hessians projected to positive
+semi-definite ones (always projecting costs several times the iterations on badly deformed bodies). The derivative
+belongs to the minimum and not to the iterations: it takes one factorisation and one solve, in forward and reverse mode
+and to any order. At a point that is not a minimum the derivative is NaN, never a plausible number.
 """
 
 import functools
@@ -26,7 +26,7 @@ from dln_jax.solvers.elements.linear_solvers import LinearSolver, LinearSolverFa
 from dln_jax.solvers.newton import Info
 from dln_jax.types import InputError, require_positive
 
-# Gradients and energies cannot be told from zero below so many units of rounding.
+# Gradients and energies below this many units of rounding are indistinguishable from zero.
 _ROUNDING_UNITS = 16
 # Shifts of the projected Hessian's diagonal, relative to the largest eigenvalue of an element, tried in turn: projected
 # elements alone may add up to a singular matrix. They change the search's directions and not the minimum.
@@ -34,14 +34,14 @@ _SHIFTS = (1e-6, 1e-3, 1.0)
 
 
 class _Sum(NamedTuple):
-    """What is minimised, and how its linear systems are solved."""
+    """The sum that is minimised, and the solver of its linear systems."""
 
     energies: tuple[ElementEnergy, ...]
     at: Pattern
     solver: LinearSolver
 
 
-class _State(NamedTuple):
+class _MinimumIterate(NamedTuple):
     point: Point
     floor: Blocks
     unclear: Float[Array, ""]
@@ -62,25 +62,25 @@ def minimise(
     at: Pattern | None = None,
     definite: bool = False,
 ) -> tuple[Blocks, Info]:
-    """x [n, b] at which the sum of the energies is least, near x0, with how the search ended.
+    """Returns the x [n, b] near x0 that minimises the sum of the energies, and the outcome of the search.
 
     Derivatives are those of the minimum, with respect to `data` and to the entries of x0 that are not free. Arrays that
     an energy closes over are constants.
 
     Args:
-        energies: what is added up, or one function (x [n, b], data) -> scalar of all unknowns.
+        energies: the terms of the sum, or one function (x [n, b], data) -> scalar of all unknowns.
         x0: start [n, b]; float32 or float64 decides the precision.
-        data: for each energy, the data of its elements (leading axis m); for one function, its second argument.
-        free: [n, b], which unknowns are solved for; the others keep their value in x0. All by default.
+        data: for every energy, the data of its elements (leading axis m); for one function, its second argument.
+        free: [n, b], which unknowns are solved for (default: all); the others keep their value in x0.
         scale: positive unit of the gradient's rows, [n] or a number; masses make the residual an acceleration.
-        tolerance: largest |dE/dx| / scale that counts as a minimum; rounding always does.
+        tolerance: largest |dE/dx| / scale that counts as a minimum; a gradient of rounding size always does.
         iterations: Newton steps after which the search gives up, which `Info.converged` reports.
         linear_solver: `by_size`, or `dense`, `block_tridiagonal`, `matrix_free` of `solvers.elements.linear_solvers`.
-        at: the energies' pattern, if it is at hand; made here otherwise.
+        at: the energies' pattern, if already computed.
         definite: also report `Info.definite`, which costs another Hessian, factorisation and solve to full accuracy.
 
     Raises:
-        InputError: indices, shapes or numbers that do not fit.
+        InputError: indices, shapes or settings are invalid.
     """
     require_positive(tolerance=tolerance, iterations=iterations)
     if x0.ndim != 2:
@@ -98,7 +98,7 @@ def minimise(
         x, info = _newton(total, x0, data, scale, tolerance, iterations)
         if not definite:
             return x, info
-        # The factor of a matrix that is not positive definite, and what is solved with it, is not finite.
+        # For a matrix that is not positive definite, the factor and its solutions are not finite.
         solved = total.solver.solve(_factor(total, x, data), jnp.ones_like(x))
         return x, info._replace(definite=jnp.isfinite(solved).all())
 
@@ -123,19 +123,19 @@ def _no_tangent(leaf: Array) -> Any:
 
 def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_dot: Any) -> Blocks:
     energies, at, solver = total
-    # What does not vary is left out: its derivatives would be computed only to be multiplied by zero.
+    # Constant data are left out: their derivatives would only be multiplied by zero.
     leaves, structure = jax.tree.flatten(data)
     dots = jax.tree.leaves(data_dot, is_leaf=_is_constant)
     varying = [i for i, dot in enumerate(dots) if not _is_constant(dot)]
     moving = not (at.free.all() or _is_constant(x0_dot))
 
-    # Reverse mode keeps the arguments and nothing else: reading back what could be kept takes longer than the work.
+    # Reverse mode saves only the arguments: recomputing takes less time than reading saved intermediates.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def response(x: Blocks, leaves: list[Array], given_dots: list[Array], fixed_dot: Any) -> Blocks:
         data = structure.unflatten(leaves)
 
-        def gradient_of(x: Blocks, given: list[Array]) -> Blocks:
-            replaced = dict(zip(varying, given, strict=True))
+        def gradient_of(x: Blocks, variables: list[Array]) -> Blocks:
+            replaced = dict(zip(varying, variables, strict=True))
             all_leaves = [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
             return gradient(energies, at, x, structure.unflatten(all_leaves))
 
@@ -144,11 +144,11 @@ def _implicit_derivative(total: _Sum, x: Blocks, data: Any, x0_dot: Any, data_do
             curved = jax.jvp(lambda x: gradient(energies, at, x, data), (x,), (masked,))[1]
             return jnp.where(at.free, curved, v)
 
-        given = [leaves[i] for i in varying]
+        varied = [leaves[i] for i in varying]
         if moving:
-            _, right = jax.jvp(gradient_of, (x, given), (fixed_dot, given_dots))
+            _, right = jax.jvp(gradient_of, (x, varied), (fixed_dot, given_dots))
         else:
-            _, right = jax.jvp(lambda given: gradient_of(x, given), (given,), (given_dots,))
+            _, right = jax.jvp(lambda variables: gradient_of(x, variables), (varied,), (given_dots,))
         # The solve is differentiated by its product, so that the factor needs no derivatives of its own.
         factor = _factor(total, *jax.lax.stop_gradient((x, data)))
         return jax.lax.custom_linear_solve(product, -right, lambda _, b: solver.solve(factor, b), symmetric=True)
@@ -170,28 +170,30 @@ def _newton(total: _Sum, x0: Blocks, data: Any, scale: Array, tolerance: float, 
     def evaluate(x: Blocks) -> tuple[Array, Blocks]:
         return value_and_gradient(energies, at, x, data)
 
-    def within(state: _State) -> Array:
+    def within(state: _MinimumIterate) -> Array:
         return (jnp.abs(state.point.gradient) <= jnp.maximum(tolerance * scale, state.floor)).all()
 
-    def running(state: _State) -> Array:
+    def running(state: _MinimumIterate) -> Array:
         return ~within(state) & ~state.stuck & (state.iterations < iterations)
 
-    def iterate(state: _State) -> _State:
+    def iterate(state: _MinimumIterate) -> _MinimumIterate:
         x, energy, gradient = state.point
         hessians = element_hessians(energies, x, data)
         values = entries(at, hessians)
         direction = _descent_direction(total, hessians, values, gradient)
         slope = jnp.vdot(direction, gradient)
-        # What cancels in a row of the gradient is of the size of |H| |x|.
+        # Terms that cancel in a row of the gradient are of the size of |H| |x|.
         diagonal = jnp.take(jnp.abs(values), at.diagonal, mode="fill", fill_value=0).reshape(x.shape)
         extent = jnp.max(jnp.abs(x), initial=0)
         floor = rounding * diagonal * extent
         unclear = rounding * jnp.abs(energy) + floor.sum() * extent
         point, accepted = line_search(evaluate, state.point, direction, slope, unclear, scale)
-        return _State(point, floor, unclear, state.iterations + 1, ~accepted)
+        return _MinimumIterate(point, floor, unclear, state.iterations + 1, ~accepted)
 
     first = Point(x0, *evaluate(x0))
-    start = _State(first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False))
+    start = _MinimumIterate(
+        first, jnp.zeros_like(x0), rounding * jnp.abs(first.energy), jnp.asarray(0), jnp.asarray(False)
+    )
     last = jax.lax.while_loop(running, iterate, start)
     x, energy, slope = last.point
     residual = jnp.max(jnp.abs(slope) / scale, initial=0)

@@ -18,7 +18,7 @@ Factor = tuple[Float[Array, "count s s"], Float[Array, "count s s"]]
 
 
 def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "count1 s s"]) -> Factor:
-    """L of a block-tridiagonal matrix; not finite if it is not positive definite.
+    """Returns L of a block-tridiagonal matrix; not finite if the matrix is not positive definite.
 
     Args:
         diagonal: D_i; only their lower triangles are read.
@@ -37,7 +37,7 @@ def factorise_blocks(diagonal: Float[Array, "count s s"], below: Float[Array, "c
 
 
 def solve_blocks(factor: Factor, b: Float[Array, "count s"]) -> Float[Array, "count s"]:
-    """x with L Lᵀ x = b."""
+    """Returns x with L Lᵀ x = b."""
 
     def forwards(y: Array, blocks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         lower, w, right = blocks
@@ -63,10 +63,10 @@ def conjugate_gradients(
     tolerance: float,
     iterations: int,
 ) -> Vector:
-    """x with A x = b to a relative residual, |b - A x| <= tolerance |b|, from x = 0.
+    """Returns x with A x = b to a relative residual, |b - A x| <= tolerance |b|, starting from x = 0.
 
-    A direction of curvature <= 0 shows that A is not positive definite; then, and if the iterations do not suffice, the
-    result is not finite.
+    A direction of curvature <= 0 shows that A is not positive definite. The result is not finite then, or if the
+    iterations do not suffice.
 
     Args:
         product: x -> A x, A symmetric.
@@ -91,7 +91,7 @@ def conjugate_gradients(
         return x, r, z + (next_rz / rz) * p, next_rz, count + 1, curvature > 0
 
     z = precondition(b)
-    # A right-hand side that is not finite ends the loop at once, because it compares as false.
+    # A right-hand side that is not finite ends the loop at once, because comparisons with NaN are false.
     last = jax.lax.while_loop(more, iterate, (jnp.zeros_like(b), b, z, jnp.vdot(b, z), 0, jnp.asarray(True)))
     x, r, _, _, _, definite = last
     solved = definite & (jnp.linalg.norm(r.reshape(-1)) <= enough)

@@ -80,7 +80,7 @@ def _program(mesh: Mesh, way: linear_solvers.LinearSolverFactory) -> Any:
 def _choice(scene: SoftScene, dt: float) -> linear_solvers.LinearSolverFactory:
     """What `make_step` takes for a step of backward Euler from rest."""
     rest, masses = scene.params.rest, scene.params.masses
-    inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], written_out=True)
+    inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], unrolled=True)
     energies = (inertia, *element_energies(scene))
     at = pattern(energies, len(rest), rest.shape[1], scene.free)
     data = (masses / dt**2, *prepare(scene, scene.params, rest, dt=dt))

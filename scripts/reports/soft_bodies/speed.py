@@ -114,7 +114,7 @@ def linear_solvers(quick: bool) -> Findings:
         material = elastic(mesh, stable_neo_hookean, youngs_modulus=1e6, poisson_ratio=0.4)
         scene = make_scene(mesh, [material])
         rest, masses = scene.params.rest, scene.params.masses
-        inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], written_out=True)
+        inertia = ElementEnergy(_inertia, np.arange(len(rest))[:, None], unrolled=True)
         energies = (inertia, *element_energies(scene))
         at = pattern(energies, *rest.shape)
         data = (masses / DT**2, *prepare(scene, scene.params, rest, dt=DT))
