@@ -26,7 +26,7 @@ ROOMS = [name for name in ROOMS if not UNCHECKED.startswith(f"{name}.")]
 install_import_hook(ROOMS, "typechecking.checked")
 
 PROGRAMS = "DLN_JAX_TEST_PROGRAMS"
-"""Environment variable: folder of compiled programs, shared by the test processes and by the commands that they start."""
+"""Environment variable: folder of compiled programs, shared by the test processes and the commands that they start."""
 LARGEST_FOLDER = 512 * 2**20
 """Bytes; one run of all tests leaves 40 MB. Programs of tests that have changed stay until this size is reached."""
 
@@ -72,7 +72,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Sets XLA's options before a device is first used: tests run a program a few times, so that compiling it costs more."""
+    """Sets XLA's options before a device is first used: a test runs its programs less long than it compiles them."""
     if config.getoption("--slow"):
         config.option.markexpr = ""
     if not config.getoption("--optimised"):
@@ -88,6 +88,11 @@ def no_program_has_options_of_its_own(pytestconfig):
         if not pytestconfig.getoption("--optimised"):
             patch.setattr(compilation, "_OPTIONS", {})
         yield
+
+
+def slow_among(values, is_slow):
+    """Returns parameters of a test, marked slow where `is_slow(value)`."""
+    return [pytest.param(value, marks=[pytest.mark.slow] * is_slow(value)) for value in values]
 
 
 LONGEST = """

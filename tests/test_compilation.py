@@ -47,12 +47,13 @@ def test_the_compiler_is_at_its_defaults_where_asked(pytestconfig):
         assert "XLA_FLAGS" not in os.environ and "JAX_DISABLE_MOST_OPTIMIZATIONS" not in os.environ
 
 
+@pytest.mark.slow
 def test_what_users_run_is_right_as_they_compile_it(pytestconfig):
     if pytestconfig.getoption("--optimised"):
         pytest.skip("this is what all tests are now")
     tests = [f"tests/{name}" for name in AS_USERS_COMPILE]
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", *tests]
+    command = [sys.executable, "-m", "pytest", "-n", "0", "--optimised", "--slow", *tests]
     result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tyro
 from calls import command
-from conftest import PROGRAMS, SHORTEST_COMPILATION
+from conftest import PROGRAMS, SHORTEST_COMPILATION, slow_among
 from interpreters import Program, interpreters
 
 from dln_jax.cli.commands import COMMANDS
@@ -103,7 +103,12 @@ def test_every_command_of_a_block_is_known():
     assert all(any(tuple(words[: len(known)]) == known for known in NOT_RUN) for words in others)
 
 
-@pytest.mark.parametrize("words", SCRIPTS[1:], ids=shlex.join)
+def elsewhere(words):
+    """Whether a command is in none of the README's blocks."""
+    return all(words not in commands(block.text) for block in blocks("bash") if block.page == "README.md")
+
+
+@pytest.mark.parametrize("words", slow_among(SCRIPTS[1:], elsewhere), ids=shlex.join)
 def test_a_command_of_a_block_runs(words, workplace):
     before = len(list(workplace.glob("*"))) + len(list((workplace / "runs").iterdir()))
     run(words)
@@ -132,7 +137,11 @@ def run_fresh():
         yield run_programs
 
 
-@pytest.mark.parametrize("block", blocks("python"), ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}")
+@pytest.mark.parametrize(
+    "block",
+    slow_among(blocks("python"), lambda block: block.page != "README.md"),
+    ids=lambda block: f"{block.page}:{block.text.split()[-1][:30]}",
+)
 def test_a_python_block_runs_in_a_fresh_interpreter_and_says_something(block, workplace, run_fresh, tmp_path):
     if "import casadi" in block.text:
         pytest.importorskip("casadi")

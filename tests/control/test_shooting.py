@@ -62,6 +62,7 @@ def from_a_straight_line():
     return shooter(True)(DOWN, np.linspace(DOWN, 0 * DOWN, STEPS + 1), np.zeros((STEPS, 1)), 10.0)
 
 
+@pytest.mark.slow
 def test_a_guess_that_is_no_motion_comes_to_the_optimum_of_single_shooting():
     found = from_a_straight_line()
     assert found.converged and found.defect < 1e-8 and np.abs(found.plan.u).max() <= 10.0

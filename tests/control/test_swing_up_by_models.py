@@ -25,6 +25,7 @@ def with_potential(extra):
     return dynamics(LagrangianSystem(lambda q, qd: L(q, qd) - extra(q)))
 
 
+@pytest.mark.slow
 def test_dry_friction_holds_no_pole_down():
     tried = try_starts(PLANT, model_of_plant(PLANT), starts=8, seed=5, seconds=3.0)
     assert tried.outcomes.share == 1 and tried.outcomes.worst < 3.0

@@ -220,6 +220,7 @@ def test_metrics_sum_over_components_and_ensembles_average():
     np.testing.assert_allclose(typical_spread(together.spread, first) ** 2, np.mean(together.spread.y[:5] ** 2))
 
 
+@pytest.mark.slow
 def test_gauss_newton_reaches_the_noise_and_selects_by_validation():
     sets = functions.split(functions.sine(samples=1000))
     settings = Network(precision="f64", width=4)
@@ -232,6 +233,7 @@ def test_gauss_newton_reaches_the_noise_and_selects_by_validation():
     np.testing.assert_allclose(best, min(at.validation for at in training.history), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_members_of_an_ensemble_train_as_if_alone():
     """Adam on the sum of losses moves each member as it would move by itself, on the same batches."""
     sets = functions.split(functions.sine(samples=200))

@@ -37,6 +37,7 @@ def log(stiffness):
     return from_arrays({"t": t, "q": q, "qd": qd, "qdd": qdd, "tau": np.asarray(tau), "trajectory": trajectory})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "added"), [(SPRING, True), (0.0, False)])
 def test_a_network_is_added_only_where_it_helps(stiffness, added):
     data = log(stiffness)

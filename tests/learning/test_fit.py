@@ -301,6 +301,7 @@ def pendulum_sets():
     return split(generators.uniform(pendulum(friction=0.5), samples=300, rate_bound=3.0, acceleration_bound=5.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [True, False])
 def test_training_learns_a_plant_and_misfit_shows_what_the_model_lacks(pendulum_sets, friction):
     needs = Needs(("revolute",), friction=friction)

@@ -96,6 +96,7 @@ def predicted_for(model, parameters, data, *, momenta=False):
     return prediction_metrics(stretches, predicted, fitted=WINDOW, variance=data.q.var(axis=0))
 
 
+@pytest.mark.slow
 def test_parameters_are_recovered_as_well_as_noise_allows(passive):
     found = passive.second.parameters
     at = statistics(passive.task, found)
@@ -118,6 +119,7 @@ def test_motions_are_predicted_as_by_the_true_model(passive):
     assert found["vpt_seconds"] >= first["vpt_seconds"]
 
 
+@pytest.mark.slow
 def test_momenta_of_the_model_beat_velocities_in_their_place(passive):
     fitted, validation, _ = parts(passive.data)
     before = make_structured_hamiltonian(NEEDS, width=8, depth=1, dtype=jnp.float64)

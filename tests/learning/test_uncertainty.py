@@ -53,6 +53,7 @@ def fitted():
     return parameters, estimate(ARM, parameters, train, validation, ridge=0.0, negligible=1e-12)
 
 
+@pytest.mark.slow
 def test_the_deviation_is_that_of_refits_to_other_noise(fitted):
     parameters, found = fitted
     train = drawn(0)
@@ -160,6 +161,7 @@ def test_a_direction_that_data_never_showed_is_told_even_where_the_deviation_is_
     assert found.distance < 1 and found.parameters < 1 < found.undetermined
 
 
+@pytest.mark.slow
 def test_a_network_is_uncertain_where_it_has_seen_nothing():
     needs = Needs(joints=("revolute", "revolute"))
     model = make_delan(needs, width=4, depth=1, dtype=jnp.float64)

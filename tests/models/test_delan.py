@@ -109,6 +109,7 @@ def test_a_full_turn_changes_nothing():
     np.testing.assert_allclose(torque(q), torque(q + 2 * np.pi * np.array([1.0, -3.0])), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_the_forward_model_is_a_diffrax_vector_field():
     model = small(2)
     system = dynamics(model.energies(model.init(jax.random.key(2))))

@@ -50,6 +50,7 @@ def stubbed(tmp_path, monkeypatch):
     return calls
 
 
+@pytest.mark.slow
 def test_every_published_number_has_a_row_with_a_bound(stubbed, tmp_path, capsys):
     command(arm_table, "--out", "table")
     report = json.loads((tmp_path / "table" / "report.json").read_text())
@@ -99,6 +100,7 @@ def test_data_of_another_plant_is_refused(stubbed, tmp_path, capsys):
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.slow
 def test_the_trigonometric_model_and_the_plant_are_measured(tmp_path):
     """The plant along its own free swings, and the linear model, which is as good."""
     sets = states(None, samples=60)

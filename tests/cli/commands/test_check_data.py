@@ -59,6 +59,7 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, 
     assert {each.name for each in (tmp_path / "check").iterdir()} >= {"findings.json", "metrics.json", "log.png"}
 
 
+@pytest.mark.slow
 def test_training_filters_when_it_is_asked_to_and_says_so_when_it_does_not(log, tmp_path, capsys):
     errors = {}
     for name, options in (("raw", []), ("filtered", ["--cutoff", "auto"])):

@@ -39,6 +39,7 @@ def arm(tmp_path):
 QUICK = ("--harmonics", 3, "--seconds", 6, "--trajectories", 1, "--starts", 1)
 
 
+@pytest.mark.slow
 def test_a_folder_with_motions(arm, tmp_path, capsys):
     out = tmp_path / "run"
     payload = ("--payload", 0.5, "--payload-position", "0.1,0,0", "--height", -0.2)

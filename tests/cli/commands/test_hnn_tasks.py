@@ -102,6 +102,7 @@ def workplace(tmp_path_factory):
 TINY = ("--seeds", "1", "--steps", "1", "--trajectories", "10")
 
 
+@pytest.mark.slow
 def test_every_task_runs_and_reports(workplace, capsys):
     command(hnn_table, *TINY, "--real-pendulum", "swing.npz", "--out", "all")
     report = json.loads((workplace / "all" / "report.json").read_text())
@@ -125,6 +126,7 @@ def test_every_task_runs_and_reports(workplace, capsys):
     assert "published_energy_mse" in {quantity for case, quantity in rows if case == "pendulum/phase-network"}
 
 
+@pytest.mark.slow
 def test_a_finished_table_measures_nothing_twice(workplace, capsys, monkeypatch):
     monkeypatch.setattr(table, "problem_of", lambda *a, **k: pytest.fail("measured again"))
     monkeypatch.setattr(hnn_table, "chosen_tasks", lambda given: list(TASKS))
@@ -211,6 +213,7 @@ def positions(workplace):
 OWN = ("--task", "measured", "--data", "positions.npz", "--needs", '{"joints": ["prismatic"]}', "--no-low-latency")
 
 
+@pytest.mark.slow
 def test_own_positions_train_and_resume_to_the_same_model(positions, capsys):
     command(train_hnn_task, *OWN, "--optimizer", "adam", "--steps", "2", "--no-figures", "--out", "whole")
     assert "finite differences" in capsys.readouterr().out
@@ -276,6 +279,7 @@ def test_options_and_models_of_other_commands_are_refused(positions, capsys):
     assert "'task' is no argument of this release" in refused(capsys, train_hnn, "--out", str(old), "--resume")
 
 
+@pytest.mark.slow
 def test_no_time_but_the_one_asked_for_ends_a_fit(positions, capsys, monkeypatch):
     """A recipe's time is that of the table; out of time, the fit of rates is the result, in a folder like any other."""
     slow = {name: recipe._replace(seconds=1e-6) for name, recipe in hnn_models.RECIPES.items()}

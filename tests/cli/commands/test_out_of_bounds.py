@@ -197,6 +197,7 @@ def environment(folder):
     return {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache"), "PYTHONUNBUFFERED": "1"}
 
 
+@pytest.mark.slow
 def test_closed_and_full_outputs_end_quietly(here):
     """With the help of a command, and its mistakes: the interpreter must not complain about them as it ends."""
     shell = f"{sys.executable} -m scripts.make_data"

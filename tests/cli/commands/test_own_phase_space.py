@@ -117,6 +117,7 @@ def test_order_that_forces_do_not_show_is_asked_for(files, capsys):
     assert "--order is for measured" in refused(capsys, train_hnn_task, "--order", "axes", "--out", "none")
 
 
+@pytest.mark.slow
 def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
     """Whatever ends the fit of motions, the folder holds a model."""
 
@@ -129,6 +130,7 @@ def test_fit_of_rates_is_saved_before_motions_begin(files, capsys, monkeypatch):
     assert np.isfinite(load(files / "half").flow.rates([0.1], [0.2])).all()
 
 
+@pytest.mark.slow
 def test_motions_are_left_out_where_they_could_not_be_compiled_in_time(files):
     """A fit whose next program would compile past the limit ends before it, with the fit of rates."""
     own = problem_of(MEASURED, data=files / "spring.npz", stated=Stated(SLIDING))
@@ -189,6 +191,7 @@ class Clock:
         return slow
 
 
+@pytest.mark.slow
 def test_seconds_count_from_the_start_of_the_command_to_the_stored_model(files, monkeypatch):
     """Reading takes 20 s, choosing 10 s and each dispatch 4 s: the model is stored before 60 s and a dispatch."""
     clock, stored = Clock(), []

@@ -260,6 +260,7 @@ def test_injection_raises_the_energy_to_what_was_asked():
     np.testing.assert_allclose(q / 3, (p / 4) ** 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_injected_motion_and_its_figure(untrained, data):
     model, parameters = untrained
     found = frame_metrics.inject_energy(model, parameters, data.pairs[0, 0], factor=2.5, times=6)
@@ -284,6 +285,7 @@ def test_animations_have_every_frame(tmp_path, data):
             assert image.n_frames == count and image.size[0] > 100
 
 
+@pytest.mark.slow
 def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_metrics, "predict", quick_predict)
     data = pixel_task.pixel_data(6, 13)
@@ -300,6 +302,7 @@ def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     assert shapes[0]["decoder"] == shapes[1]["decoder"] and shapes[0]["encoder"] == shapes[1]["encoder"]
 
 
+@pytest.mark.slow
 def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     for name in ("FRAMES", "TRAJECTORIES"):
         monkeypatch.setattr(pixel_task, name, 13)
@@ -328,6 +331,7 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     pixel_task.pixel_data.cache_clear()
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(data):
     coefficients = compress(principal_components(data.frames, 8), data.frames)
     model = make_latent_phase(latent_field("black-box-hnn", width=6, depth=1), np.zeros(16), width=8, scale=1.5)

@@ -43,6 +43,7 @@ def test_tracking_is_held_against_true_parameters():
     assert rows[-1].value == pytest.approx(1.2) and rows[-1].passed is False
 
 
+@pytest.mark.slow
 def test_some_faults_of_logs_are_found_and_a_sound_log_has_none():
     for number in (1, 6):
         log = log_checks.drawn(number, repeats=number == 1)

@@ -60,6 +60,7 @@ def test_the_beam_falls_and_its_energies_add_up():
     assert (np.diff(energies["total"]) < 0).all()  # What the implicit step damps.
 
 
+@pytest.mark.slow
 def test_the_ends_of_the_bar_are_turned_by_the_angle():
     example = twist(cells=1, turns=1.5)
     rest, held = example.scene.mesh.vertices, example.scene.held
@@ -77,6 +78,7 @@ def test_the_ends_of_the_bar_are_turned_by_the_angle():
     assert np.abs(last[free] - rest[free]).max() > 0.3
 
 
+@pytest.mark.slow
 def test_the_block_slides_as_friction_says_or_sticks():
     example = slope(cells=1)
     run = played(example, 0.02, 40)
@@ -110,6 +112,7 @@ def test_a_box_in_space_is_turned_and_not_deformed():
     assert mesh.vertices[:, 2].min() == pytest.approx(np.ptp(mesh.vertices[:, 2]))
 
 
+@pytest.mark.slow
 def test_the_creature_crawls():
     example = creature()
     x, _, converged = played(example, example.dt, 60)(example.scene.params)
@@ -163,6 +166,7 @@ def test_steps_that_did_not_converge_are_not_silent(capsys):
     assert "1 of 3 steps did not converge, the first at t = 2 s" in said and "not finite from t = 3 s" in said
 
 
+@pytest.mark.slow
 def test_the_script_takes_a_mesh_of_ones_own(tmp_path, capsys):
     mesh = beam_mesh(2.0, 1.0, 2, 1)
     right = np.flatnonzero(mesh.vertices[:, 0] == 2.0)

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from calls import command, refused
+from conftest import slow_among
 
 from dln_jax.types import InputError
 from scripts.reports.case import named
@@ -18,9 +19,10 @@ CASES = [
     for name in SUBJECTS[subject]
     if name not in ELSEWHERE
 ]
+LONG = ("gradients/crawler", "references/orders", "references/elastica")
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_among(CASES, LONG.__contains__))
 def test_soft_bodies_meet_their_bounds(name):
     (case,) = named(cases(quick=True), name)
     rows = case.measure().rows

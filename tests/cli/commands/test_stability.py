@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from calls import command, refused
+from conftest import slow_among
 
 from dln_jax.metrics.misfit import velocity_misfit
 from dln_jax.metrics.report import expect
@@ -14,10 +15,11 @@ from scripts.reports.case import named
 from scripts.reports.commands import stability
 from scripts.reports.stability import NAMES, cases
 
+LONG = ("sizes", "float32", "lyapunov-time", "close-encounters", "batches")
 STEPS = {"separatrix": 5_000, "lyapunov-time": 20_000}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_among(NAMES, LONG.__contains__))
 def test_hard_cases_meet_their_bounds(name):
     (case,) = named(cases(steps=STEPS.get(name, 1)), name)
     rows = case.measure().rows

@@ -8,6 +8,7 @@ from calls import command, refused
 from dln_jax.cli.commands import swing_up
 
 
+@pytest.mark.slow
 def test_a_run_stores_data_numbers_and_pictures(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("dln_jax.training.swing_ups.run.MOST_SHOWN", 2)
     few = ("--seconds-of-data", 4, "--starts", 2)

@@ -86,6 +86,7 @@ def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workpla
     np.testing.assert_allclose(found.inverse_dynamics(*state), dynamics(RUBBED).inverse_dynamics(*state), atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_potential_of_no_rigid_body_is_found_by_the_basis_that_has_it(workplace, capsys):
     needs = ("--needs", PLAIN)
     command(train_delan, "--model", "auto", "--data", "spring.npz", *needs, "--out", "spring", *QUIET)

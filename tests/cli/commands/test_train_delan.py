@@ -100,6 +100,7 @@ def test_resuming_with_other_settings_or_nothing_is_refused(trained, workplace, 
     assert not (workplace / "void").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_parameters(workplace):
     """SIGKILL after the first checkpoint, then --resume: the model equals an unbroken run's to the last bit."""
     settings = (
@@ -138,6 +139,7 @@ def test_a_killed_run_resumes_to_the_same_parameters(workplace):
     assert one == other
 
 
+@pytest.mark.slow
 def test_a_file_of_ones_own_with_prismatic_joints_and_only_positions(workplace, capsys):
     data = generators.free_swing(cart_pole(), trajectories=4, steps=50)
     random = np.random.default_rng(0)
@@ -158,6 +160,7 @@ def test_a_file_of_ones_own_with_prismatic_joints_and_only_positions(workplace, 
     assert load(workplace / "mine").dynamics.inverse_dynamics(*state).dtype == jnp.float64
 
 
+@pytest.mark.slow
 def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
     settings = (*TINY, "--scene", "pendulum", "--learning-rate", "1e19", "--no-figures", "--no-uncertainty")
     line = refused(capsys, train_delan, *settings, "--out", "exploded")
@@ -166,6 +169,7 @@ def test_a_loss_that_explodes_keeps_the_last_good_model(workplace, capsys):
     assert np.isfinite(tau).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimizer", ["adam", "gauss-newton"])
 def test_out_of_time_is_a_run_that_has_learned_and_can_go_on_with_more(workplace, capsys, optimizer):
     options = ("--optimizer", optimizer, "--width", "3", "--depth", "1", *BRIEF, "--scene", "pendulum")
@@ -313,6 +317,7 @@ def test_a_model_that_is_worse_than_a_constant_is_refused_in_words(workplace, ca
     assert json.loads((workplace / "noise" / "metrics.json").read_text())["verdict"] == 2
 
 
+@pytest.mark.slow
 def test_a_cart_that_is_driven_alone_is_trained(workplace, capsys):
     """The torque of its pole is zero in every sample."""
     data = generators.uniform(cart_pole(), samples=80, rate_bound=2.0, acceleration_bound=5.0)

@@ -83,6 +83,7 @@ def test_a_default_run_writes_all_its_files_and_the_model_can_be_loaded(workplac
     assert "already contains a run" in refused(capsys, train_diffnet, *TINY, "--out", folder)
 
 
+@pytest.mark.slow
 def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(workplace, monkeypatch, capsys):
     coarse = partial(functions.cosine_sine_grid, points=9)
     monkeypatch.setitem(function_task.NAMED, "cos_sin", (functions.cosine_sine, coarse))
@@ -97,6 +98,7 @@ def test_adam_on_two_inputs_with_an_ensemble_shows_its_spread_outside_the_data(w
     assert "3 networks 2 x 4 x 4 x 1" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_file_of_ones_own_trains_in_standard_units_and_is_stored_in_its_own(workplace):
     data = own_file("mine.npz")
     run = ("--function", "mine.npz", "--activation", "tanh", "--width", "6", "--depth", "1", "--steps", "30")
@@ -227,6 +229,7 @@ def test_the_table_compares_every_number_and_bounds_the_best(workplace, monkeypa
     assert len(type2) == 4 and all(f"{number:.1e}" in out for each in type2 for number in each.values())
 
 
+@pytest.mark.slow
 def test_the_report_states_the_ratio_for_every_number_of_inputs(workplace, monkeypatch):
     monkeypatch.setattr(one_pass, "INPUTS", (1, 2))
     command(diffnet_report, "--width", "4", "--depth", "1", "--batch", "8", "--repetitions", "2", "--out", "report")

@@ -49,6 +49,7 @@ def metrics_of(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_learned_tree_is_searched_for_and_is_exact(workplace, capsys):
     options = ("--data", "swing.npz", "--model", "learned-tree", "--no-figures", "--no-low-latency")
     command(train_delan, *options, "--out", "tree")
@@ -99,6 +100,7 @@ def test_the_trigonometric_model_is_exact_and_is_timed_in_both_modes(workplace, 
     np.testing.assert_allclose(tau, [2.0 + 9.81 * np.sin(0.5) + 0.2], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_basis_that_is_too_small_says_that_its_mass_matrix_is_none(workplace, capsys):
     """M = m_0 + m_1 cos q is fitted to torques of -cos q qdd."""
     random = np.random.default_rng(0)
@@ -128,6 +130,7 @@ def test_auto_takes_gauss_newton_for_a_small_network_and_several_seeds_give_thei
     assert "adam (" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     command(train_delan, *QUICK, "--model", "black-box-delan", "--out", "black-box")
     metrics = metrics_of(workplace / "black-box")
@@ -136,6 +139,7 @@ def test_black_box_models_report_their_mass_matrix(workplace, capsys):
     assert isinstance(load(workplace / "feed-forward").dynamics, PlainDynamics)
 
 
+@pytest.mark.slow
 def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     command(train_hnn, *QUICK, "--out", "hamiltonian")
     assert "structured-hnn" in capsys.readouterr().out
@@ -144,6 +148,7 @@ def test_hamiltonians_are_fitted_to_momenta_or_torques(workplace, capsys):
     assert "no momenta p in the data" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys, monkeypatch):
     monkeypatch.setattr(dynamics_growth, "WIDTHS", (2, 3))
     monkeypatch.setattr(dynamics_growth, "DEPTHS", (1,))
@@ -161,6 +166,7 @@ def test_a_target_grows_the_network_and_lists_every_candidate(workplace, capsys,
     assert "--target grows one structured network" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", [Adam(12, batch=32), GaussNewton(12)])
 def test_seeds_in_one_program_equal_single_runs(workplace, optimiser):
     sets = split(schema.load("swing.npz"))

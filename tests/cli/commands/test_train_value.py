@@ -13,6 +13,7 @@ from dln_jax.training.values import Trained, load_value
 TINY = ("--method", "residual", "--width", "3", "--depth", "1", "--iterations", "1", "--starts", "3")
 
 
+@pytest.mark.slow
 def test_a_run_is_stored_and_comes_back(tmp_path, capsys):
     command(train_value, *TINY, "--goal", "0.2", "--out", tmp_path / "run")
     assert "train seconds" in capsys.readouterr().out

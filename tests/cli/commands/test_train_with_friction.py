@@ -45,6 +45,7 @@ def test_the_trigonometric_model_finds_friction_by_its_linear_fit(workplace, cap
     assert json.loads((workplace / "linear" / "metrics.json").read_text())["torque_mse"] < 1e-20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "script, model, optimizer",
     [

@@ -283,6 +283,7 @@ def kill_as_it_begins(job):
     os.kill(int(found.split()[0]), signal.SIGKILL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "package"), [("here", "dln_jax"), ("ray", "ray")])
 def test_jobs_in_processes_of_their_own(where, package, tmp_path, capsys):
     """One is done, one fails, and one is killed from outside."""

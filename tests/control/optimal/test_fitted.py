@@ -38,6 +38,7 @@ def value_of(network, seed=0):
     return lambda x: network.value_and_gradient(parameters, x)
 
 
+@pytest.mark.slow
 def test_targets_are_weighted_returns_and_their_slopes():
     value, x, steps, dt = value_of(NETWORK), jnp.array([2.0, 1.0]), 4, 0.02
     step, discount = flow(PENDULUM, dt, clipped=True), np.exp(-0.1 * dt)
@@ -77,6 +78,7 @@ def test_the_value_of_a_line_and_of_the_worst_of_lines(share):
     assert found.history[-1].validation <= 1.01 * min(at.validation for at in found.history)
 
 
+@pytest.mark.slow
 def test_seeds_are_what_each_is_alone_and_states_are_of_the_wide_box():
     numbers = Iteration(iterations=1, starts=8, seconds=0.1, steps=2, batch=8, kept=2)
     both, again = (fit_values(LINE, value_network(LINE, widths=()), seeds, numbers=numbers) for seeds in ((0, 1), (1,)))

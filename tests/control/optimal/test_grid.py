@@ -30,6 +30,7 @@ LINEAR = ControlProblem(
 )
 
 
+@pytest.mark.slow
 def test_the_value_of_a_linear_plant():
     S = lqr(A - 0.15 * np.eye(2), B, np.eye(2), np.eye(1)).S
     corners = {"low": [-2, -2], "high": [2, 2], "most": 8.0}
@@ -113,6 +114,7 @@ def of_weak_pendulum():
     return problem, solve_on_grid(problem, (51, 101), low=[-math.pi, -14], high=[math.pi, 14], most=LIMIT)
 
 
+@pytest.mark.slow
 def test_value_converges_where_it_has_ridges(of_weak_pendulum):
     _, found = of_weak_pendulum
     assert found.converged

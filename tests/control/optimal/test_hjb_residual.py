@@ -47,6 +47,7 @@ def linear_flexible_cart_pole():
     return A, np.concatenate([np.zeros(3), np.linalg.solve(M, [1.0, 0, 0])])[:, None]
 
 
+@pytest.mark.slow
 def test_six_states_have_the_regulators_value():
     A, B = linear_flexible_cart_pole()
     Q, R, high = np.diag([10.0, 10, 10, 0.1, 0.1, 0.1]), np.array([[0.1]]), np.array([0.5, 0.5, 0.5, 2, 2, 5])
@@ -63,6 +64,7 @@ def test_six_states_have_the_regulators_value():
     np.testing.assert_allclose(slope, 2 * x @ S, rtol=1e-8, atol=1e-8 * np.abs(x @ S).max())
 
 
+@pytest.mark.slow
 def test_a_network_has_the_value_of_limited_controls():
     limit, weight = 5.5, 2 * 5.5 / np.pi
     problem = LINE._replace(action_cost=limited_atan(limit, weight))

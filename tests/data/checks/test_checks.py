@@ -211,6 +211,7 @@ TREE_FAULTS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_clean_log_suits_its_robot(clean):
     examined = examine(as_recording(schema.from_arrays(clean)), arm())
     on_tree = examined.on_tree
@@ -291,6 +292,7 @@ def test_a_tilt_and_a_wrong_clock_are_found_with_the_robot(clean):
     assert on_tree.torques.log.speed == pytest.approx(1.25, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_covariance_of_torques_is_that_of_an_energy(place):
     """The closed forms equal derivatives of the energies' covariance by JAX: of any energy, then of two bodies.

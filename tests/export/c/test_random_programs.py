@@ -78,6 +78,7 @@ def close(ours, theirs, where):
         np.testing.assert_array_equal(ours, theirs, err_msg=where)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("seeds", batches(0, DEFAULT), ids=str)
 def test_random_programs_agree_with_jax(seeds, tmp_path):

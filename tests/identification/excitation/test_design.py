@@ -63,6 +63,7 @@ def test_random_motions_break_no_limit_and_use_some(drawn):
         assert 0 < design.slack < 0.1
 
 
+@pytest.mark.slow
 def test_the_condition_falls(drawn, designed):
     assert designed["condition"].condition < 0.75 * np.median([each.condition for each in drawn])
 

@@ -38,6 +38,7 @@ def root_mean_square(arm, fit, needs, seed=5):
     return np.sqrt(np.mean((np.asarray(found) - test.tau) ** 2))
 
 
+@pytest.mark.slow
 def test_an_arm_is_found_down_to_the_noise():
     data = lip_trajectories(SKEW, (0, 1), friction=True, noise=NOISE, every=50)
     said = []
