@@ -24,8 +24,20 @@ version = release = dln_jax.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
+if "DOCUMENTATION_ONLINE" in os.environ:  # the inventories are fetched, and a warning where there is no network
+    extensions.append("sphinx.ext.intersphinx")
+intersphinx_mapping = {
+    "python": ("https://docs.python.org/3", None),
+    "numpy": ("https://numpy.org/doc/stable", None),
+    "jax": ("https://docs.jax.dev/en/latest", None),
+    "optax": ("https://optax.readthedocs.io/en/latest", None),
+}
+myst_enable_extensions = ["dollarmath"]
 exclude_patterns = ["_build", "examples", "gallery/*.ipynb", "gallery/*.py"]
 myst_heading_anchors = 3
 default_role = "code"  # docstrings write `name` as Markdown does
@@ -63,7 +75,7 @@ PACKAGES = {
     "zoo": "Models by name, run folders",
     "learning": "Learning",
     "metrics": "Numbers about a model",
-    "figures": "Pictures",
+    "figures": "Figures",
     "control": "Control",
     "export": "Real time, C and StableHLO",
     "softbody": "Soft bodies",
@@ -74,6 +86,59 @@ PACKAGES = {
     "precision": "Precision",
 }
 """Folders and modules of dln_jax that the API pages show, in the order of the contents."""
+
+
+PUBLIC = {
+    "Basic": {
+        "Energies and equations of motion": [
+            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow", "Dynamics", "Flow",
+            "Decomposition",
+        ],
+        "Data": ["load_trajectories", "save_trajectories", "Trajectories", "Needs"],
+        "Models and training": ["make_delan", "Model", "fit", "GaussNewton", "Adam", "Problem", "Training"],
+        "Runs": ["load", "save", "Run", "build", "describe"],
+        "Deployment": ["export_c", "load_c", "low_latency", "enable_low_latency"],
+        "Errors": ["InputError"],
+    },
+    "Advanced": {
+        "Robots": ["read_robot", "Robot", "Tree", "tree_system", "joint_dissipation"],
+        "Further records of a system": [
+            "ClosedForm", "RecursiveSystem", "InverseForward", "PhaseRates", "PlainDynamics", "PlainFlow",
+        ],
+    },
+}  # fmt: skip
+"""The names of `dln_jax` itself, in the order in which a reader needs them."""
+
+
+def write_public_page():
+    """One page of the public names by their public path."""
+    listed = [name for groups in PUBLIC.values() for names in groups.values() for name in names]
+    missing = set(dln_jax.__all__) - {*listed, "__version__"}
+    assert not missing and len(set(listed)) == len(listed), f"names without a place on the page: {missing}"
+    parts = ["Public names", "=" * len("Public names"), "", "Names of `dln_jax` itself. The packages have more.", ""]
+    for level, groups in PUBLIC.items():
+        parts += [level, "-" * len(level), ""]
+        for title, names in groups.items():
+            parts += [title, "~" * len(title), ""]
+            for name in names:
+                is_class = isinstance(getattr(dln_jax, name), type)
+                kind, options = ("autoclass", ["   :members:"]) if is_class else ("autofunction", [])
+                parts += [f".. {kind}:: dln_jax.{name}", *options, ""]
+    write_if_changed(HERE / "api" / "public.rst", parts)
+
+
+def write_if_changed(path, parts):
+    """Writes the lines of a page, unless the file holds them already: an unchanged page is not built again."""
+    text = "\n".join(parts)
+    if not path.exists() or path.read_text() != text:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+
+
+def defined_name(public):
+    """(module, name there, public name) of a name of `dln_jax`."""
+    value = getattr(dln_jax, public)
+    return getattr(value, "__module__", ""), getattr(value, "__name__", ""), public
 
 
 def modules(package):
@@ -94,15 +159,16 @@ def write_api_pages():
     for package, title in PACKAGES.items():
         parts = [title, "=" * len(title), ""]
         for module in modules(package):
+            elsewhere = sorted(original for original in map(defined_name, dln_jax.__all__) if original[0] == module.__name__)
             members = [] if hasattr(module, "__path__") else ["   :members:"]
+            if elsewhere:  # each object has one place, so that a reference to it leads there
+                members.append(f"   :exclude-members: {', '.join(name for _, name, _ in elsewhere)}")
+            see = [f"See :doc:`public`: {', '.join(f'`dln_jax.{public}`' for *_, public in elsewhere)}.", ""]
             short = module.__name__.removeprefix("dln_jax.")
             heading = [] if short == package else [short, "-" * len(short), ""]
             parts += [*heading, f".. automodule:: {module.__name__}", *members, "   :ignore-module-all:", ""]
-        text = "\n".join(parts)
-        path = folder / f"{package}.rst"
-        if not path.exists() or path.read_text() != text:
-            path.parent.mkdir(exist_ok=True)
-            path.write_text(text)
+            parts += see if elsewhere else []
+        write_if_changed(folder / f"{package}.rst", parts)
 
 
 RULE = re.compile(r"\|[-| ]+\|")
@@ -161,6 +227,7 @@ def ancestors(node):
 
 def setup(app):
     """Sphinx calls it."""
+    write_public_page()
     write_api_pages()
     app.connect("autodoc-process-docstring", to_rst, priority=100)
     app.connect("doctree-resolved", tidy)

@@ -31,7 +31,7 @@ def traced(function: Callable[..., Any], examples: Sequence[Any]) -> tuple[Any, 
 
 
 def repeated_calls(every: Sequence[Any]) -> set[int]:
-    """Returns the `id`s of the large jaxprs that these closed jaxprs seem to call several times.
+    """Returns the `id` values of the large jaxprs that these closed jaxprs seem to call several times.
 
     Calls that look alike here become one function only if their programs are identical (`Program.identity`).
     """

@@ -37,7 +37,7 @@ def program_of(
 
     Args:
         closed: the jaxpr, as `jaxprs.traced` returns it.
-        repeated: `id`s of jaxprs whose calls stay calls in the program.
+        repeated: `id` values of jaxprs whose calls stay calls in the program.
         precision: f32 or f64.
 
     Raises:

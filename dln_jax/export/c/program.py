@@ -63,7 +63,7 @@ class Program:
     real: Any = np.float64
     """NumPy type of real numbers, in which constants are folded."""
     repeated: Collection[int] = ()
-    """`id`s of jaxprs whose calls stay calls."""
+    """`id` values of jaxprs whose calls stay calls."""
     parts: dict[bytes, Part] = field(default_factory=dict)
     """Called programs by their `identity`, the attribute of a `call`."""
     lowered: dict[Any, bytes] = field(default_factory=dict)
