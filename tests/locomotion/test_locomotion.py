@@ -147,6 +147,9 @@ def test_a_resumed_run_continues_bit_for_bit(compiled, tmp_path):
 
 
 def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):
+    # A shell that starts the tests in the background has them ignore interrupts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
     def learned(compiled, folder, **keywords):
         folder.mkdir(exist_ok=True)
         return learn(compiled, seed=3, goal=Goal(2 * compiled.learner.steps), directory=folder, **keywords)
@@ -157,6 +160,7 @@ def test_an_interrupt_waits_for_the_checkpoint(compiled, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         learned(compiled._replace(improve=interrupted), tmp_path / "parts")
+    signal.signal(signal.SIGINT, before)
     assert len(json.loads((tmp_path / "parts" / "checkpoint-3.json").read_text())["records"]) == 1
     continued, whole = learned(compiled, tmp_path / "parts", resume=True), learned(compiled, tmp_path / "whole")
     assert same(continued.parameters, whole.parameters)
