@@ -13,9 +13,9 @@ from dln_jax.learning.engine.problem import Progress, Stop, Training
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.datasets import generators
 from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
-from dln_jax.training.dynamics import growth as dynamics_growth
 from dln_jax.training.dynamics import network as dynamics_training
-from dln_jax.training.dynamics.growth import Candidate
+from dln_jax.training.dynamics.methods import growth as dynamics_growth
+from dln_jax.training.dynamics.methods.growth import Candidate
 from tests.calls import command
 
 

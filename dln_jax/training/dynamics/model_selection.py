@@ -27,11 +27,13 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.models.rigid_tree import USUAL, RigidTreeParameters
 from dln_jax.models.serial_tree import tree_of
 from dln_jax.time_limit import deadline, seconds_left
-from dln_jax.training.dynamics.direct_fits import fit_directly, training_of
-from dln_jax.training.dynamics.network import train
+from dln_jax.training.dynamics.methods import METHODS
+from dln_jax.training.dynamics.methods.direct import training_of
+from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, ArmOptions, Options
+from dln_jax.training.dynamics.planning import task_of
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task, needs_of_tree, task_of
+from dln_jax.training.dynamics.task import Task
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
 from dln_jax.zoo.descriptions import Description, build, describe
@@ -153,10 +155,7 @@ def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: 
     limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
     own = dataclasses.replace(given, model=name)
     task = task_of(own, recorded, checked=True, until=time.perf_counter() + limit)
-    if task.solver is None:
-        task, training = fit_directly(task, own)
-    else:
-        training = train(task, task.solver, folder, resume=given.resume, mesh=mesh)
+    task, training = METHODS[name].fit(task, own, folder, mesh)
     return Fitted(build(task.description), training.parameters, (task, training))
 
 

@@ -9,10 +9,9 @@ from dln_jax.cli.arguments import Unstated, choice, refuse_given, require_positi
 from dln_jax.cli.encoders import Filtered
 from dln_jax.cli.options import Drawn, Limited, Resumable, Scaled, SingleCalls
 from dln_jax.scenes.registry import SCENES
-from dln_jax.types import InputError, require_positive, require_seed
+from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 
-SAMPLES_OF_KERNEL = 600
 NETWORK, AUTO = "structured-delan", "auto"
 """The model that embedded data train by default, and that which the ladder chooses, the default for files."""
 OF_NETWORKS = ("width", "depth", "activation")
@@ -118,44 +117,6 @@ def with_model(given: Options) -> tuple[Options, str]:
     kind = "one model" if asked[0] == "objective" else "networks"
     said = f"{option} is for {kind}, so the model is {NETWORK}; without it several models are tried (--model auto)"
     return dataclasses.replace(given, model=NETWORK), said
-
-
-def check_options(given: Options, kind: str) -> None:
-    """Refuses options that the model does not read."""
-    if given.data is None:
-        refuse_given(given, ["rate", "units"], "for a file: add --data")
-    require_positive(seeds=given.seeds, folds=given.folds)
-    require_positive_if_given(given, ["seconds"])
-    require_seed(given.seed, given.seeds)
-    if isinstance(given, ArmOptions):
-        check_arm_options(given, kind)
-    if kind == AUTO:
-        if given.objective is not None:
-            raise InputError(
-                "--objective is for one model, and --model auto compares several by their torques; choose a --model "
-                "with an energy, such as structured-delan, trigonometric or learned-tree, or leave --objective out"
-            )
-        check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
-        return
-    properties = CATALOGUE[kind].properties
-    if properties.kernel:
-        refuse_given(given, ["objective"], "for models with parameters; the trigonometric kernel is fitted to torques")
-        check_direct_options(given, ("degree", "seconds"), "the trigonometric kernel", "is one linear problem")
-        require_positive_if_given(given, ["samples"])
-        return
-    if properties.searched:
-        check_direct_options(given, ("degree", "samples"), "the learned tree", "has a search of its own")
-        return
-    if properties.linear:
-        check_direct_options(given, ("seconds", "samples"), "the trigonometric model", "is one least-squares problem")
-        return
-    refuse_given(given, ["degree"], "for the trigonometric model")
-    if given.target is not None:
-        if kind != "structured-delan" or given.optimizer == "adam" or given.seeds > 1:
-            raise InputError("--target grows one structured network by gauss-newton; leave the other options out")
-        refuse_given(given, ["width", "depth"], "what --target grows")
-        refuse_given(given, ["samples"], "for one network, and --target grows several")
-        require_positive(target=given.target)
 
 
 def check_direct_options(given: Options, others: tuple[str, ...], model: str, why: str) -> None:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from jax.sharding import Mesh
 
 from dln_jax.cli.optimisers import name_of
 from dln_jax.cli.running import command_folder
@@ -15,15 +14,14 @@ from dln_jax.learning.engine.optimisers import Adam
 from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, torque_scale
 from dln_jax.scale.devices import device_lines
-from dln_jax.training.dynamics.direct_fits import fit_directly
-from dln_jax.training.dynamics.growth import grow_to_target
+from dln_jax.training.dynamics.methods import METHODS
 from dln_jax.training.dynamics.model_selection import climb_ladder
-from dln_jax.training.dynamics.network import cross_validated, train
-from dln_jax.training.dynamics.options import AUTO, Options, check_options, with_model
+from dln_jax.training.dynamics.options import AUTO, Options, with_model
+from dln_jax.training.dynamics.planning import check_options, task_of
 from dln_jax.training.dynamics.programs import programs_ahead, programs_of
 from dln_jax.training.dynamics.recorded import Recorded, read
 from dln_jax.training.dynamics.results import best_seed, definiteness_of, evaluate, print_metrics
-from dln_jax.training.dynamics.task import Task, task_of
+from dln_jax.training.dynamics.task import Task
 from dln_jax.training.dynamics.uncertainty import store_uncertainty
 from dln_jax.training.dynamics.verdict import refuse, say
 from dln_jax.training.results import settings_of
@@ -57,7 +55,7 @@ def run(given: Options, command: str) -> None:
             announce_model(chosen)
             fixed = chosen.solver is not None and given.target is None  # its description is that of the model to come
             ahead = programs_ahead(chosen, mesh, uncertainty=given.uncertainty) if fixed else None
-            task, training = trained(chosen, given, folder, mesh)
+            task, training = METHODS[chosen.kind].fit(chosen, given, folder, mesh)
             programs = ahead or programs_of(task, mesh)
         if training.stop.reason != "not finite" and not np.isfinite(training.validation).any():
             raise InputError(
@@ -108,20 +106,6 @@ def announce_model(task: Task) -> None:
         print(f"{task.kind}, {task.precision}, {name_of(task.solver.optimiser)}{why}")
     for line in device_lines(task.precision):
         print(line)
-
-
-def trained(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """The task's model, and the task with whatever of it the fit has chosen."""
-    if task.solver is None:
-        return fit_directly(task, given)
-    if given.target is not None:
-        return grow_to_target(task, task.solver.optimiser, given.target, folder, resume=given.resume, mesh=mesh)
-    several = given.seeds > 1 and given.folds > 1
-    fits = given.folds + 1 if several else 1
-    training = train(task, task.solver, folder, resume=given.resume, mesh=mesh, fits=fits)
-    if several:
-        task = cross_validated(task, task.solver, folder, folds=given.folds, resume=given.resume, mesh=mesh)
-    return task, training
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:

@@ -16,9 +16,9 @@ from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
-from dln_jax.training.dynamics import direct_fits
+from dln_jax.training.dynamics.methods import learned_tree
 from dln_jax.training.dynamics.model_selection import climb_ladder
-from dln_jax.training.dynamics.options import check_options
+from dln_jax.training.dynamics.planning import check_options
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
@@ -106,7 +106,7 @@ def test_a_sketch_and_parents_reach_the_search(workplace, capsys, monkeypatch):
         seen.update(parents=tuple(parents), sketch=settings.sketch, angle=settings.sketch_angle, scale=velocity_scale)
         raise InputError("seen")
 
-    monkeypatch.setattr(direct_fits, "fit_tree", searched)
+    monkeypatch.setattr(learned_tree, "fit_tree", searched)
     options = (*TREE, "--needs", PLAIN, "--velocity-scale", "0.02", "--sketch", "sketch.json", "--parents", "0,1")
     assert "seen" in refused(capsys, train_delan, *options, "--out", "sketched")
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02

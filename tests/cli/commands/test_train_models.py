@@ -23,7 +23,7 @@ from dln_jax.mechanics.hamiltonian import HamiltonianSystem
 from dln_jax.scenes.datasets import generators
 from dln_jax.scenes.pendulum import pendulum
 from dln_jax.training import low_latency_calls
-from dln_jax.training.dynamics import growth as dynamics_growth
+from dln_jax.training.dynamics.methods import growth as dynamics_growth
 from dln_jax.zoo.descriptions import build, describe_for
 from dln_jax.zoo.run import load
 

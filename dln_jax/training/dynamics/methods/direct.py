@@ -1,0 +1,51 @@
+"""What fits without an optimiser share: their history of one step, and Gauss-Newton for another objective."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dln_jax.learning import dynamics
+from dln_jax.learning.engine.fit import fit
+from dln_jax.learning.engine.optimisers import GaussNewton
+from dln_jax.learning.engine.problem import Progress, Stop, Training, one_after_the_other
+from dln_jax.models.model import Parameters
+from dln_jax.precision import data_type
+from dln_jax.training.dynamics.task import Task
+from dln_jax.types import InputError
+from dln_jax.zoo.descriptions import build
+
+REFINEMENTS = 50
+"""Upper bound on the Gauss-Newton steps from a direct fit, which is near the minimum."""
+
+
+def training_of(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:
+    """Wraps a direct fit as a one-step training history."""
+    model, dtype = build(task.description), data_type(task.precision)
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
+    errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)
+    at = Progress(1, loss, float(np.mean(errors)), float("nan"), seconds)
+    return Training(parameters, [at], Stop("finished", 1), 1, 0.0)
+
+
+def refined_if_asked(task: Task, training: Training) -> Training:
+    """The direct fit, which is to torques; for another objective it is where Gauss-Newton starts."""
+    return training if task.objective.of_torques else refined(task, training)
+
+
+def refined(task: Task, start: Training) -> Training:
+    """The fit of the task's objective from the parameters of another; those are kept if validation prefers them.
+
+    Raises:
+        InputError: the model has too many parameters for Gauss-Newton, or a type in which that does not work.
+    """
+    model = build(task.description)
+    suited, reason = dynamics.suited_optimiser(model, task.sets, task.objective)
+    if suited is not GaussNewton or task.precision != "f64":
+        why = reason if task.precision == "f64" else "the precision is f32"
+        raise InputError(f"--objective refines a {task.kind} model by Gauss-Newton in f64, but {why}; leave it out")
+    problem = dynamics.problem(model, task.sets, task.objective)._replace(parameters=start.parameters)
+    found = fit(problem, GaussNewton(steps=REFINEMENTS, improvement=1e-6), seconds=task.seconds, must_start=False)
+    history = one_after_the_other([start.history, found.history])
+    print(f"refined by both sides' errors: validation {start.validation:.2e}, after it {found.validation:.2e}")
+    better = np.isfinite(found.validation) and found.validation < start.validation
+    return (found if better else start)._replace(history=history, compile_seconds=found.compile_seconds)

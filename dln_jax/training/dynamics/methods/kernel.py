@@ -1,0 +1,60 @@
+"""The trigonometric energies as a Gaussian process; validation chooses between two orders of the bodies."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from jax.sharding import Mesh
+
+from dln_jax.cli.arguments import refuse_given, require_positive_if_given, resolved
+from dln_jax.learning.engine.problem import Training
+from dln_jax.learning.kernel import choose_kernel
+from dln_jax.learning.objectives import Objective
+from dln_jax.training.dynamics.methods.direct import refined_if_asked, training_of
+from dln_jax.training.dynamics.options import Options, check_direct_options
+from dln_jax.training.dynamics.recorded import Recorded
+from dln_jax.training.dynamics.task import Method, Task
+from dln_jax.zoo.descriptions import describe_for
+
+SAMPLES = 600
+"""Largest number of samples that the kernel is made of, unless stated."""
+
+
+def check(given: Options, kind: str) -> None:
+    """Refuses the options of networks and of models with parameters."""
+    refuse_given(given, ["objective"], "for models with parameters; the trigonometric kernel is fitted to torques")
+    check_direct_options(given, ("degree", "seconds"), "the trigonometric kernel", "is one linear problem")
+    require_positive_if_given(given, ["samples"])
+
+
+def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) -> tuple[dict[str, Any], None]:
+    """The kernel of at most the stated number of samples."""
+    sizes = resolved(given, {"samples": SAMPLES})
+    precision = given.precision or "f64"
+    return describe_for(kind, recorded.sets.train, recorded.needs, precision=precision, **sizes), None
+
+
+def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+    """Two kernels, one for a chain of bodies and one without that assumption, of which validation chooses."""
+    began = time.perf_counter()
+    upper, available = task.description["samples"], len(task.sets.train.tau)
+    chosen, trials = choose_kernel(task.needs, task.sets.train, task.sets.validation, samples=upper)
+    solution = chosen.outcome
+    if solution.samples < available:
+        print(f"kernel: {solution.samples} of {available} samples, evenly spaced; --samples takes more")
+    tried = ", ".join(f"{_order(trial.candidate)}: {trial.validation:.2e}" for trial in trials)
+    print(f"validation error in units of the torques' variance by order of the bodies: {tried}")
+    noise = ", ".join(f"{sd:.2g}" for sd in solution.noise)
+    size = f"{solution.parameter_count} equations, log likelihood {solution.likelihood:.2f} by the torque"
+    print(f"kernel: {_order(chosen.candidate)}, {size}, noise of the joints {noise}")
+    description = {**task.description, "samples": solution.samples, "serial": chosen.candidate}
+    task = task._replace(description=description)
+    training = training_of(task, solution.parameters, solution.torque_mse, time.perf_counter() - began)
+    return task, refined_if_asked(task, training)
+
+
+def _order(serial: bool) -> str:
+    return "a chain" if serial else "any order"
+
+
+KERNEL = Method(check, plan, fit)
