@@ -13,8 +13,8 @@ from dln_jax.learning.engine.problem import Progress, Stop, Training
 from dln_jax.scenes.chain import chain
 from dln_jax.scenes.datasets import generators
 from dln_jax.time_limit import SOON, counting_from, deadline, seconds_left
-from dln_jax.training.dynamics import network as dynamics_training
 from dln_jax.training.dynamics.methods import growth as dynamics_growth
+from dln_jax.training.dynamics.methods import network
 from dln_jax.training.dynamics.methods.growth import Candidate
 from tests.calls import command
 
@@ -67,7 +67,7 @@ def test_growing_networks_share_one_limit(arm, clock, monkeypatch):
 
     grow = dynamics_growth.grow_to_target
     monkeypatch.setattr(dynamics_growth, "_try", tried)
-    monkeypatch.setattr("dln_jax.training.dynamics.run.grow_to_target", ended)
+    monkeypatch.setattr(network, "grow_to_target", ended)
     with pytest.raises(Enough):
         command(train_delan, *arm, "--target", "1e-9")
     assert left == [30.0, 10.0]
@@ -84,7 +84,7 @@ def test_folds_share_the_limit_with_the_training(arm, clock, monkeypatch):
             raise Enough
         return training(np.ones(2))
 
-    monkeypatch.setattr(dynamics_training, "fit", fit)
+    monkeypatch.setattr(network, "train_problem", fit)
     with pytest.raises(Enough):
         command(train_delan, *arm, "--seeds", "2", "--folds", "3")
     assert limits == pytest.approx([7.5] * 4)

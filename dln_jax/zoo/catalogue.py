@@ -56,11 +56,6 @@ class Properties(NamedTuple):
     kernel: bool = False
     """It is made of samples, by as many equations as they have torques (`learning.kernel`)."""
 
-    @property
-    def direct(self) -> bool:
-        """Whether it is fitted without an optimiser."""
-        return self.linear or self.searched or self.kernel
-
 
 class Entry(NamedTuple):
     """A model of the catalogue."""

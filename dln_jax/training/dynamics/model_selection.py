@@ -31,7 +31,6 @@ from dln_jax.training.dynamics.methods import METHODS
 from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, ArmOptions, Options
-from dln_jax.training.dynamics.planning import task_of
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.training.dynamics.task import Task
 from dln_jax.training.identification.additions import with_network
@@ -153,9 +152,8 @@ def _too_large(size: int | None) -> Callable[[float], str]:
 def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
     """A model that `--model` names, as it would be trained alone."""
     limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
-    own = dataclasses.replace(given, model=name)
-    task = task_of(own, recorded, checked=True, until=time.perf_counter() + limit)
-    task, training = METHODS[name].fit(task, own, folder, mesh)
+    own, method = dataclasses.replace(given, model=name), METHODS[name]
+    task, training = method.fit(planned(method, own, name, recorded, time.perf_counter() + limit), own, folder, mesh)
     return Fitted(build(task.description), training.parameters, (task, training))
 
 

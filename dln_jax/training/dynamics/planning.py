@@ -1,14 +1,12 @@
 """From options and data to a task: what is refused, and the model that is trained."""
 
 from dln_jax.cli.arguments import refuse_given, require_positive_if_given
-from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, objective_of
 from dln_jax.time_limit import deadline
 from dln_jax.training.dynamics.methods import METHODS
 from dln_jax.training.dynamics.options import AUTO, ArmOptions, Options, check_arm_options, check_direct_options
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task, seeds_of
+from dln_jax.training.dynamics.task import Task, planned
 from dln_jax.types import InputError, require_positive, require_seed
-from dln_jax.zoo.descriptions import build
 
 
 def check_options(given: Options, kind: str) -> None:
@@ -31,25 +29,12 @@ def check_options(given: Options, kind: str) -> None:
     check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
 
 
-def task_of(given: Options, recorded: Recorded, *, checked: bool = False, until: float | None = None) -> Task:
+def task_of(given: Options, recorded: Recorded) -> Task:
     """The model that the arguments name, for these data; nothing is written yet.
-
-    Args:
-        given: the arguments.
-        recorded: the data.
-        checked: whether it is known that the model reads the options that are given.
-        until: deadline of the fit by `time.perf_counter` (default: that of the command).
 
     Raises:
         InputError: options that it does not read, or data that it cannot be fitted to.
     """
     kind = str(given.model)
-    if not checked:
-        check_options(given, kind)
-    objective = objective_of(kind, recorded.sets.train, given.objective)
-    if objective is TORQUE and given.target is None:
-        objective = SCALED_TORQUE
-    description, solver = METHODS[kind].plan(given, kind, recorded, objective)
-    build(description)  # refuses what no model can be made of, before anything is written
-    until = deadline(given.seconds) if until is None else until
-    return Task(recorded, kind, description, objective, solver, seeds_of(given), until)
+    check_options(given, kind)
+    return planned(METHODS[kind], given, kind, recorded, deadline(given.seconds))

@@ -10,12 +10,13 @@ from dln_jax.data.splits import Split
 from dln_jax.learning.engine.optimisers import Optimiser
 from dln_jax.learning.engine.problem import Problem, Training
 from dln_jax.learning.kinematics import TreeFit
-from dln_jax.learning.objectives import Objective
+from dln_jax.learning.objectives import SCALED_TORQUE, TORQUE, Objective, objective_of
 from dln_jax.scenes.scene import Scene
 from dln_jax.time_limit import seconds_left
 from dln_jax.training.dynamics.options import Options
 from dln_jax.training.dynamics.recorded import Recorded
 from dln_jax.types import Needs
+from dln_jax.zoo.descriptions import build
 
 
 class Solver(NamedTuple):
@@ -88,6 +89,20 @@ class Method(NamedTuple):
     """(options, model, data, objective) -> description of the model, and its solver if it has one."""
     fit: Callable[[Task, Options, Path, Mesh | None], tuple[Task, Training]]
     """(task, options, run folder, devices) -> the fit, and the task with the description that the fit has chosen."""
+
+
+def planned(method: Method, given: Options, kind: str, recorded: Recorded, until: float) -> Task:
+    """Returns the task of a model by name, which ends at `until` by `time.perf_counter`; nothing is written yet.
+
+    Raises:
+        InputError: data that the model cannot be fitted to.
+    """
+    objective = objective_of(kind, recorded.sets.train, given.objective)
+    if objective is TORQUE and given.target is None:
+        objective = SCALED_TORQUE
+    description, solver = method.plan(given, kind, recorded, objective)
+    build(description)  # refuses what no model can be made of
+    return Task(recorded, kind, description, objective, solver, seeds_of(given), until)
 
 
 def seeds_of(given: Options) -> int | tuple[int, ...]:

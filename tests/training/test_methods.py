@@ -1,0 +1,97 @@
+"""A new way of fitting is a method and an entry of the catalogue: the rest of the pipeline needs no change."""
+
+import json
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dln_jax
+from dln_jax.cli.commands import train_delan, train_hnn
+from dln_jax.data import schema
+from dln_jax.mechanics.lagrangian import LagrangianSystem
+from dln_jax.models.model import Model
+from dln_jax.scenes.datasets import generators
+from dln_jax.scenes.pendulum import pendulum
+from dln_jax.training.dynamics.methods import METHODS
+from dln_jax.training.dynamics.methods.direct import training_of
+from dln_jax.training.dynamics.options import AUTO, Options, check_direct_options
+from dln_jax.training.dynamics.run import run
+from dln_jax.training.dynamics.task import Method
+from dln_jax.types import Needs
+from dln_jax.zoo.catalogue import CATALOGUE, Entry, Properties
+from dln_jax.zoo.descriptions import describe_for
+
+
+def make_rod(needs: Needs, *, dtype=jnp.float64) -> Model:
+    """L = ½ inertia qd² + weight cos q, with two parameters."""
+
+    def energies(parameters):
+        inertia, weight = parameters
+        return LagrangianSystem(lambda q, qd: 0.5 * inertia * qd[0] ** 2 + weight * jnp.cos(q[0]))
+
+    return Model(lambda key: jnp.ones(2, dtype), energies)
+
+
+def fit(task, given, folder, mesh):
+    """Inertia and weight from tau = inertia qdd + weight sin q, by least squares in closed form."""
+    train = task.sets.train
+    columns = np.column_stack([train.qdd[:, 0], np.sin(train.q[:, 0])])
+    parameters = np.linalg.lstsq(columns, train.tau[:, 0])[0]
+    return task, training_of(task, jnp.asarray(parameters), 0.0, 0.0)
+
+
+ROD = Method(
+    check=lambda given, kind: check_direct_options(given, ("degree",), "the rod", "has two parameters"),
+    plan=lambda given, kind, recorded, objective: (
+        describe_for(kind, recorded.sets.train, recorded.needs, precision="f64"),
+        None,
+    ),
+    fit=fit,
+)
+
+
+@dataclass(frozen=True)
+class Arguments(Options):
+    """Of a command that trains it."""
+
+    model: str = "rod"
+
+
+@pytest.fixture
+def rod(monkeypatch):
+    monkeypatch.setitem(METHODS, "rod", ROD)
+    monkeypatch.setitem(CATALOGUE, "rod", Entry(make_rod, Properties(linear=True), MappingProxyType({})))
+
+
+def test_a_method_and_an_entry_are_all_that_a_new_model_needs(rod, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene = pendulum()
+    schema.save("log.npz", generators.uniform(scene, samples=80))
+    options = {"data": tmp_path / "log.npz", "out": tmp_path / "run", "figures": False, "low_latency": False}
+    run(Arguments(**options), "train_delan")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["torque_mse"] < 1e-20 and metrics["verdict"] == 0
+    plant = dln_jax.load(tmp_path / "run").dynamics
+    q, qd, qdd = jnp.array([0.7]), jnp.array([-1.0]), jnp.array([2.0])
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(
+            plant.inverse_dynamics(q, qd, qdd), dln_jax.dynamics(scene.energies).inverse_dynamics(q, qd, qdd), rtol=1e-9
+        )
+
+
+@pytest.mark.parametrize("command", [train_delan, train_hnn], ids=["train_delan", "train_hnn"])
+def test_every_model_of_a_command_has_a_method(command):
+    hint = command.Arguments.__annotations__["model"]
+    names = {name for literal in _literals(hint) for name in literal}
+    assert names - {AUTO} <= set(METHODS) <= set(CATALOGUE) and names
+
+
+def _literals(hint):
+    inner = getattr(hint, "__args__", ())
+    if inner and all(isinstance(each, str) for each in inner):
+        return [inner]
+    return [found for each in inner for found in _literals(each)]
