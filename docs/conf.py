@@ -91,8 +91,8 @@ PACKAGES = {
 PUBLIC = {
     "Basic": {
         "Energies and equations of motion": [
-            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow", "Dynamics", "Flow",
-            "Decomposition",
+            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow", "Dynamics",
+            "Flow", "Decomposition",
         ],
         "Data": ["load_trajectories", "save_trajectories", "Trajectories", "Needs"],
         "Models and training": ["make_delan", "Model", "fit", "GaussNewton", "Adam", "Problem", "Training"],
@@ -159,7 +159,8 @@ def write_api_pages():
     for package, title in PACKAGES.items():
         parts = [title, "=" * len(title), ""]
         for module in modules(package):
-            elsewhere = sorted(original for original in map(defined_name, dln_jax.__all__) if original[0] == module.__name__)
+            defined = map(defined_name, dln_jax.__all__)
+            elsewhere = sorted(names for names in defined if names[0] == module.__name__)
             members = [] if hasattr(module, "__path__") else ["   :members:"]
             if elsewhere:  # each object has one place, so that a reference to it leads there
                 members.append(f"   :exclude-members: {', '.join(name for _, name, _ in elsewhere)}")

@@ -1,7 +1,7 @@
-"""Count the files that a reader follows: from a user's npz to the torque error, and from a URDF and a log to parameters.
+"""Count the files that a reader follows from an npz to the torque error, and from a URDF and a log to parameters.
 
-Runs train_delan and identify on small files, without figures, timings and uncertainty, and counts the library's files that
-are entered and the pairs of calling and called file. Prints both with their bounds, and writes walks.json.
+Runs train_delan and identify on small files, without figures, timings and uncertainty. Counts the files of the library
+that are entered, and the pairs of calling and called file. Prints both with their bounds, and writes walks.json.
 """
 
 import contextlib
@@ -23,8 +23,8 @@ from scripts.reports.walks import Walk, walk_of
 
 BOUNDS = {"npz to torque error": (30, 60), "URDF and log to parameters": (40, None)}
 """Files and arrows to reach."""
-PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
-<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" type="revolute">
+PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/>
+<mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" type="revolute">
 <parent link="base"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
 </robot>"""
 
@@ -58,15 +58,13 @@ def measured() -> dict[str, Walk]:
         schema.save(place / "log.npz", generators.uniform(cart_pole(friction=0.1), samples=60))
         t = np.arange(0, 6, 0.01)
         q = np.stack([np.sin(t) + 0.3 * np.sin(3.1 * t), np.cos(1.3 * t) - 0.4 * np.sin(2.3 * t)])
-        swings = {"t": np.tile(t, 2), "q": q.reshape(-1, 1), "trajectory": np.repeat([0, 1], len(t))}
         qd = np.gradient(q, 0.01, axis=1)
         qdd = np.gradient(qd, 0.01, axis=1)
         tau = 0.35 * qdd + 4.9 * np.sin(q) + 0.1 * qd
-        np.savez(
-            place / "swings.npz",
-            **swings,
-            **{k: v.reshape(-1, 1) for k, v in zip(("qd", "qdd", "tau"), (qd, qdd, tau))},
-        )
+        columns = {"q": q, "qd": qd, "qdd": qdd, "tau": tau}
+        swings = {name: values.reshape(-1, 1) for name, values in columns.items()}
+        trajectory = np.repeat([0, 1], len(t))
+        np.savez(place / "swings.npz", t=np.tile(t, 2), trajectory=trajectory, **swings)  # type: ignore[arg-type]
         (place / "robot.urdf").write_text(PENDULUM)
         bare = {"low_latency": False, "figures": False}
         train = train_delan.Arguments(
