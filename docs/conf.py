@@ -91,8 +91,8 @@ PACKAGES = {
 PUBLIC = {
     "Basic": {
         "Energies and equations of motion": [
-            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow", "Dynamics",
-            "Flow", "Decomposition",
+            "LagrangianSystem", "NaturalSystem", "HamiltonianSystem", "NaturalHamiltonian", "dynamics", "flow",
+            "Dynamics", "Flow", "Decomposition",
         ],
         "Data": ["load_trajectories", "save_trajectories", "Trajectories", "Needs"],
         "Models and training": ["make_delan", "Model", "fit", "GaussNewton", "Adam", "Problem", "Training"],

@@ -32,7 +32,7 @@ from dln_jax.training.dynamics.methods.direct import training_of
 from dln_jax.training.dynamics.methods.learned_tree import needs_of_tree
 from dln_jax.training.dynamics.options import NETWORK, ArmOptions, Options
 from dln_jax.training.dynamics.recorded import Recorded
-from dln_jax.training.dynamics.task import Task
+from dln_jax.training.dynamics.task import Task, planned
 from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
 from dln_jax.zoo.descriptions import Description, build, describe

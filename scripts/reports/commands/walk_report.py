@@ -24,8 +24,9 @@ from scripts.reports.walks import Walk, walk_of
 BOUNDS = {"npz to torque error": (30, 60), "URDF and log to parameters": (40, None)}
 """Files and arrows to reach."""
 PENDULUM = """<robot name="pendulum"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -0.5"/>
-<mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" type="revolute">
-<parent link="base"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
+<mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/>
+<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="9" velocity="9"/></joint>
 </robot>"""
 
 
@@ -66,9 +67,14 @@ def measured() -> dict[str, Walk]:
         trajectory = np.repeat([0, 1], len(t))
         np.savez(place / "swings.npz", t=np.tile(t, 2), trajectory=trajectory, **swings)  # type: ignore[arg-type]
         (place / "robot.urdf").write_text(PENDULUM)
-        bare = {"low_latency": False, "figures": False}
         train = train_delan.Arguments(
-            data=place / "log.npz", model="structured-delan", steps=3, uncertainty=False, out=place / "run", **bare
+            data=place / "log.npz",
+            model="structured-delan",
+            steps=3,
+            uncertainty=False,
+            low_latency=False,
+            figures=False,
+            out=place / "run",
         )
         parameters = identify.Arguments(
             data=place / "swings.npz", robot=place / "robot.urdf", out=place / "tree", figures=False
