@@ -1,4 +1,5 @@
-"""Motions that show a robot's parameters, within its limits: Fourier series whose regressor is well conditioned."""
+"""Excitation: motions within a robot's limits that identify its parameters, as Fourier series with a well-conditioned
+regressor."""
 
 from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import (
