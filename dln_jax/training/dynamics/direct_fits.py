@@ -1,4 +1,4 @@
-"""Models with a fit of their own, without an optimiser: one linear problem, a kernel, or a search for joint frames."""
+"""Models fitted without an optimiser: by linear least squares, a kernel, or a search for joint frames."""
 
 import time
 
@@ -22,23 +22,23 @@ from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 
 REFINEMENTS = 50
-"""Steps of Gauss-Newton from a linear fit, at most: it starts near the minimum."""
+"""Upper limit of Gauss-Newton steps after a linear fit, which starts near the minimum."""
 
 
 def fit_directly(task: Task, given: Options) -> tuple[Task, Training]:
-    """The fit of the task's model, and the task with whatever of the model it has chosen.
+    """Fits the task's model directly; returns the task with everything the fit has chosen, and the training.
 
-    Such fits are to torques; for another objective they are where Gauss-Newton starts.
+    Direct fits are to torques; for another objective they are the starting point of Gauss-Newton.
     """
     task, training = _fitted_to_torques(task, given)
     return task, training if task.objective.of_torques else refined(task, training)
 
 
 def refined(task: Task, start: Training) -> Training:
-    """The fit of the task's objective from the parameters of another; those are kept if validation prefers them.
+    """Refines the parameters for the task's objective; the start is kept unless the validation error decreases.
 
     Raises:
-        InputError: the model has too many parameters for Gauss-Newton, or a type in which that does not work.
+        InputError: the model has too many parameters for Gauss-Newton, or a precision that it does not support.
     """
     model = build(task.description)
     suited, reason = dynamics.suited_optimiser(model, task.sets, task.objective)
@@ -63,7 +63,7 @@ def _fitted_to_torques(task: Task, given: Options) -> tuple[Task, Training]:
 
 
 def fit_learned_tree(task: Task, given: Options) -> tuple[Task, Training]:
-    """Joint frames by Gauss-Newton from random starts, all else by elimination."""
+    """Searches joint frames by Gauss-Newton from random starts and eliminates all other parameters."""
     needs, sketch = needs_of_tree(task.needs), task.recorded.sketch
     near = (
         {}
@@ -86,7 +86,7 @@ def fit_learned_tree(task: Task, given: Options) -> tuple[Task, Training]:
 
 
 def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
-    """One least-squares problem, after those by which validation chooses the degrees if it is to."""
+    """Fits the trigonometric model by least squares; `grown` lets validation choose the degrees first."""
     began = time.perf_counter()
     chosen = None
     if grown:
@@ -101,7 +101,7 @@ def fit_trigonometric(task: Task, *, grown: bool) -> tuple[Task, Training]:
 
 
 def fit_trigonometric_kernel(task: Task) -> tuple[Task, Training]:
-    """Two kernels, a chain of bodies and none assumed, of which validation chooses."""
+    """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
     began = time.perf_counter()
     most, given = task.description["samples"], len(task.sets.train.tau)
     chosen, trials = choose_kernel(task.needs, task.sets.train, task.sets.validation, samples=most)
@@ -123,7 +123,7 @@ def _order(serial: bool) -> str:
 
 
 def training_of(task: Task, parameters: Parameters, loss: float, seconds: float) -> Training:
-    """A fit as if it were a training of one step."""
+    """Wraps a direct fit as a one-step training history."""
     model, dtype = build(task.description), data_type(task.precision)
     parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), parameters)
     errors = dynamics.validation_errors(model, task.sets, parameters, task.objective)

@@ -1,4 +1,4 @@
-"""Training the model of a task with the optimiser that it has, under a checkpoint."""
+"""Trains the model of a task with its optimiser, under a checkpoint."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from dln_jax.training.results import losses
 
 
 def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh | None, fits: int = 1) -> Training:
-    """Trains the task's model, one seed or several, in its share of the time that is left for so many fits."""
+    """Trains the task's model, with one seed or several, in its share of the time left for `fits` fits."""
     total = solver.optimiser.steps
     identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
@@ -31,9 +31,9 @@ def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh 
 
 
 def cross_validated(task: Task, solver: Solver, folder: Path, *, folds: int, resume: bool, mesh: Mesh | None) -> Task:
-    """The task with the seed whose trainings without each fold of the motions predict that fold best.
+    """Selects the seed with the lowest cross-validation error over folds of the motions.
 
-    One or two validation motions often prefer the worse of two seeds; every motion outside the test is in one fold.
+    One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
     """
     rest = merged(task.sets._replace(test=select(task.sets.test, [])))
     motions = np.random.default_rng(np.ravel(task.seeds)[0]).permutation(np.unique(rest.trajectory))

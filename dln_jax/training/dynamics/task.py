@@ -1,4 +1,4 @@
-"""From options to a task of dynamics: the data, what they need, the model, and how it is trained."""
+"""Builds a task of dynamics from options: the data, their `Needs`, the model and its optimiser."""
 
 from typing import Any, NamedTuple
 
@@ -23,77 +23,78 @@ from dln_jax.zoo.descriptions import build, describe_for
 
 
 class Solver(NamedTuple):
-    """How a model is trained."""
+    """Optimiser and problem of a training."""
 
     optimiser: Optimiser
     reason: str
-    """Why it is that one; empty where the user chose."""
+    """Reason for this optimiser; empty if the user chose it."""
     problem: Problem
     samples: int | None
-    """Of training that are drawn for it; `None` for all."""
+    """Number of training samples drawn for it; `None` for all."""
 
 
 class Task(NamedTuple):
-    """What the arguments come to: the data, what they need, and the model to train."""
+    """A resolved task: the data, their `Needs`, and the model to train."""
 
     recorded: Recorded
     kind: str
     description: dict[str, Any]
-    """Of the model, for `dln_jax.zoo.build`."""
+    """Description of the model, for `dln_jax.zoo.build`."""
     objective: Objective
     solver: Solver | None
-    """`None` for models that have a fit of their own."""
+    """`None` for models with a direct fit."""
     seeds: int | tuple[int, ...]
-    """One, or several in one program."""
+    """One seed, or several that train in one program."""
     until: float
-    """Reading of `time.perf_counter` at which training stops, for the command or a rung of the ladder."""
+    """Reading of `time.perf_counter` at which training stops, for the command or one candidate of the model
+    selection."""
     search: TreeFit | None = None
-    """How the joint frames of a learned tree were found."""
+    """Result of the search for the joint frames of a learned tree."""
     best: int | None = None
-    """Index of the seed that cross-validation prefers; `None` where that was not asked."""
+    """Index of the seed selected by cross-validation; `None` without cross-validation."""
 
     @property
     def seconds(self) -> float:
-        """Seconds that are left for fits."""
+        """Seconds left for fits."""
         return seconds_left(self.until)
 
     @property
     def name(self) -> str:
-        """Of the data."""
+        """Name of the data."""
         return self.recorded.name
 
     @property
     def sets(self) -> Split:
-        """The data."""
+        """Training, validation and test data."""
         return self.recorded.sets
 
     @property
     def scene(self) -> Scene | None:
-        """Of the data, where it is known."""
+        """Scene of the data, if known."""
         return self.recorded.scene
 
     @property
     def needs(self) -> Needs:
-        """Of the plant."""
+        """`Needs` of the plant."""
         return self.recorded.needs
 
     @property
     def precision(self) -> str:
-        """f32 or f64, of the model and its training."""
+        """f32 or f64, for the model and its training."""
         return self.description["precision"]
 
 
 def task_of(given: Options, recorded: Recorded, *, checked: bool = False, until: float | None = None) -> Task:
-    """The model that the arguments name, for these data; nothing is written yet.
+    """The task for the model that the arguments name and these data; nothing is written yet.
 
     Args:
         given: the arguments.
         recorded: the data.
-        checked: whether it is known that the model reads the options that are given.
+        checked: whether the options have already been checked against the model.
         until: deadline of the fit by `time.perf_counter` (default: that of the command).
 
     Raises:
-        InputError: options that it does not read, or data that it cannot be fitted to.
+        InputError: options that the model does not use, or data that it cannot be fitted to.
     """
     sets, kind = recorded.sets, str(given.model)
     if not checked:
@@ -116,7 +117,7 @@ def task_of(given: Options, recorded: Recorded, *, checked: bool = False, until:
 def posed(
     description: dict[str, Any], sets: Split, objective: Objective, samples: int | None, seeds: int | tuple[int, ...]
 ) -> Problem:
-    """The fit of a model to training samples, so many of which are drawn, in units of all of them."""
+    """The fitting problem of a model; `samples` training samples are drawn, scaled by the spread of all of them."""
     scale, some = objective.scale(sets.train), sets
     if samples is not None:
         some = sets._replace(train=drawn(sets.train, samples, seeds if isinstance(seeds, int) else seeds[0]))
@@ -124,10 +125,10 @@ def posed(
 
 
 def needs_of_tree(needs: Needs) -> Needs:
-    """The needs as a learned tree states them, whose friction is viscous, dry and an offset of each joint.
+    """Converts the needs to those of a learned tree, whose friction is viscous, dry and an offset per joint.
 
     Raises:
-        InputError: laws of friction that it does not have.
+        InputError: friction laws that a learned tree does not have.
     """
     if others := [law for law in needs.joint_friction if law not in USUAL]:
         raise InputError(f"a learned tree has no {others[0]} friction; leave it out of joint_friction")
@@ -137,7 +138,8 @@ def needs_of_tree(needs: Needs) -> Needs:
 def model_and_optimiser(
     given: Options, kind: str, recorded: Recorded, objective: Objective
 ) -> tuple[dict[str, Any], Optimiser | None, int | None, str]:
-    """Description of the model, its optimiser, how many samples that sees (`None`: all), and why that one."""
+    """Description of the model, its optimiser, its number of samples (`None`: all), and the reason for the
+    optimiser."""
     needs, sets = recorded.needs, recorded.sets
     properties, optimizer = CATALOGUE[kind].properties, given.optimizer
     if properties.searched:
@@ -158,7 +160,7 @@ def model_and_optimiser(
         optimizer = suited.optimizer
     adam = optimizer == "adam"
     precision = given.precision or ("f32" if adam else "f64")
-    # Structure needs fewer units, and first-order training more.
+    # A structured model needs fewer units; first-order training needs more.
     width = 64 if adam else 8 if properties.definite else 16
     keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
     keywords |= {} if suited is None else suited.keywords
