@@ -55,7 +55,7 @@ class Candidate(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Its name, and what tells it from others of that name."""
+        """The name and the settings that distinguish it from candidates of the same name."""
         more = [f"{key} {value}" for key, value in self.keywords.items() if key != "friction_width"]
         return ", ".join([self.name, *more, *(["with friction"] if self.needs.friction else [])])
 
