@@ -39,6 +39,7 @@ UNITS = {
 """Conversion factor to SI for every admissible unit, by key."""
 EXAMPLES = {"t": "t [s]", "qd": "qd1 [rad/s]", "qdd": "qdd1 [rad/s^2]", "tau": "tau1 [N m]", "p": "p1 [N m s]"}
 _SPELLINGS = {"degrees": "deg", "degree": "deg", "°": "deg", "²": "2", "µ": "u", "μ": "u", "sec": "s"}
+# Longest key first, since "tau" would also match the start of "tau_inertial".
 _TITLE = re.compile(rf"({'|'.join(sorted(UNITS, key=len, reverse=True))}|time)(?=$|[\d_ .\[(/])(.*)", re.DOTALL)
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]*)[\])]\s*", re.DOTALL)
 
@@ -234,7 +235,7 @@ def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
 
 def _number(text: str) -> float | None:
     try:
-        return None if "_" in text else float(text)
+        return None if "_" in text else float(text)  # float() reads "1_000" as 1000
     except ValueError:
         return None
 

@@ -34,8 +34,7 @@ def check_limits(path: Path, root: ET.Element, held: Collection[str]) -> None:
 
 
 def velocity_limits(root: ET.Element, names: Sequence[str]) -> np.ndarray:
-    """Velocity limits from <limit velocity="...">, rad/s or m/s; infinite if missing or 0, which some files write for
-    an unknown limit."""
+    """Velocity limits from <limit velocity="...">, rad/s or m/s; infinite if missing or 0 (unknown, in some files)."""
     stated = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")

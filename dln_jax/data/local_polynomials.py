@@ -84,6 +84,7 @@ def smooth_locally(
 
 
 def _sizes(least: int, most: int) -> list[int]:
+    # Odd numbers, which centre the window on its sample.
     sizes = [least + (least % 2 == 0)]
     while (longer := 2 * int(np.ceil((GROWTH * sizes[-1] - 1) / 2)) + 1) <= most:
         sizes.append(longer)

@@ -1,5 +1,4 @@
-"""Mesh files: an npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed
-vertices."""
+"""Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices."""
 
 from pathlib import Path
 from typing import Any, NamedTuple

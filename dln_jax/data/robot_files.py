@@ -33,8 +33,7 @@ def write_robot(
     hold: Mapping[str, float] | Sequence[str] = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
-    """Writes a copy of the file `original` with the inertias and friction of a tree, and its armature if the format has
-    it.
+    """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
 
     Args:
         path: path of the new file.

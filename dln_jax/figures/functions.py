@@ -50,8 +50,7 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figur
 
 
 def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """Maps of a function of two inputs on a square grid, first output: a column per component of truth, model and
-    error."""
+    """Maps of a function of two inputs on a square grid (first output): truth, model and error of every component."""
     places = range(truth.inputs)  # the Hessian is symmetric
     indices = {"y": [()], "dy": [(i,) for i in places], "d2y": [(i, j) for i in places for j in places[i:]]}
     components = [(key, index) for key in _keys(truth) for index in indices[key]]

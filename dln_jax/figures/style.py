@@ -110,8 +110,7 @@ def scale_of(values: Iterable[float | int]) -> str:
 
 
 def prefixed(size: float | int, unit: str) -> tuple[float, str]:
-    """Returns the scale factor and the unit with the SI prefix that suit values of this magnitude: (1e-6, "µN m") for
-    3e-5 N m."""
+    """Returns the scale factor and the prefixed unit that suit values of this size: (1e-6, "µN m") for 3e-5 N m."""
     prefixes = {1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n", 1e-12: "p", 1e-15: "f"}
     factor = next((factor for factor in prefixes if size >= factor), 1.0 if size == 0 else 1e-15)
     return factor, f"{prefixes[factor]}{unit}"

@@ -20,8 +20,7 @@ def torque_bands(
     *,
     model: str = "model",
 ) -> Figure:
-    """Torque errors within their 95 % bands along the first held-out samples, one row per joint, and the coverage
-    beside.
+    """Torque errors in their 95 % bands along the first held-out samples, one row per joint, next to their coverage.
 
     States flagged as out of distribution are shaded. `predicted` and `std` are the model's; its name sets the colour.
     """

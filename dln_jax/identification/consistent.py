@@ -186,6 +186,7 @@ def _minimum(
         if last and decrement <= tolerance * (1 + now):
             return x, done, True
         length = 1.0
+        # Armijo's condition; F is infinite for inconsistent bodies, so a step never leaves the feasible set.
         while problem.value(x + length * step, coefficients, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:

@@ -157,8 +157,7 @@ def parameters_of(found: Float[np.ndarray, " P"], like: Parameters) -> Parameter
 
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
-    """Random states: angles on the full circle, displacements up to 1 m, and normal rates (deviation 2) and
-    accelerations (5)."""
+    """Random states: angles on the full circle, displacements up to 1 m, normal rates (sd 2), accelerations (sd 5)."""
     d, random = len(joints), np.random.default_rng(seed)
     reach = np.where(np.array(joints) == "revolute", np.pi, 1.0)
     arrays = {

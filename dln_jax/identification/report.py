@@ -28,8 +28,7 @@ def base_rows(found: Identification) -> list[dict[str, Any]]:
 
 
 def parameter_rows(found: Identification) -> list[dict[str, Any]]:
-    """One row per parameter: structure, what the data determine, values, and the standard error if identifiable
-    alone."""
+    """One row per parameter: structure, what the data determine, values, and the standard error if there is one."""
     names, errors = found.columns.names, found.fit.standard_errors(np.eye(len(found.columns.names)))
     return [
         {

@@ -70,8 +70,7 @@ def fit_residual(
     seconds: float = math.inf,
     seed: int = 0,
 ) -> ResidualFit:
-    """Fits residual networks to the torques that an identified tree leaves unexplained and selects the smallest
-    sufficient one.
+    """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
 
     Args:
         rigid: such as `models.make_rigid_tree`.

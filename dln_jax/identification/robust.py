@@ -45,6 +45,7 @@ def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) 
     longest = max(len(part) for part in parts)
     products = np.zeros((longest, errors.shape[1]))
     for part in parts:
+        # Zero padding to twice the length keeps the correlation from wrapping round.
         spectrum = abs(np.fft.rfft(part, 2 * len(part), axis=0)) ** 2
         products[: len(part)] += np.fft.irfft(spectrum, 2 * len(part), axis=0)[: len(part)]
     correlations = products / np.where(products[0] > 0, products[0], 1.0)
@@ -52,7 +53,7 @@ def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) 
     for joint, values in enumerate(correlations.T):
         pairs = values[: 2 * (longest // 2)].reshape(-1, 2).sum(axis=1)
         end = np.argmax(pairs <= 0) if (pairs <= 0).any() else len(pairs)
-        times[joint] = max(2 * pairs[:end].sum() - 1, 1.0)
+        times[joint] = max(2 * pairs[:end].sum() - 1, 1.0)  # the pairs include lag 0, which is 1
     return times
 
 

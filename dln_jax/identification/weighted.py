@@ -45,8 +45,7 @@ class WeightedFit(NamedTuple):
     """Lengths of the columns in units of noise; zero for columns without effect."""
 
     def standard_errors(self, combinations: Float[np.ndarray, "B P"]) -> Float[np.ndarray, " B"]:
-        """Standard errors of combinations of parameters; infinite if part of a combination has no effect on the
-        data."""
+        """Standard errors of combinations of parameters; infinite if part of one has no effect on the data."""
         scaled = combinations / np.where(self.lengths > 0, self.lengths, 1.0)
         outside = np.linalg.norm(scaled @ self.without_effect.T, axis=1) > 1e-4 * np.linalg.norm(scaled, axis=1)
         variance = np.einsum("bp,pq,bq->b", combinations, self.covariance, combinations)
@@ -106,8 +105,7 @@ def fit_weighted(
 def _solved(
     given: Equations, sigma: np.ndarray, correlation: np.ndarray | None, rank_tolerance: float
 ) -> tuple[WeightedFit, np.ndarray]:
-    """The fit for these noise levels, and the share of the parameters that each joint determines; shares sum to the
-    rank."""
+    """The fit for these noise levels, and every joint's share in determining the parameters; shares sum to the rank."""
     triangle = equations.weighted(given, sigma)
     A, b = triangle[:, :-1], triangle[:, -1]
     lengths = np.linalg.norm(A, axis=0)

@@ -57,8 +57,7 @@ def low_latency_metrics(
     *,
     function: Literal["inverse_dynamics", "rates"] = "inverse_dynamics",
 ) -> dict[str, float]:
-    """Runs `main` in a process and returns its result as metrics; if it fails, passes a reason to `say` and returns
-    none.
+    """Runs `main` in a process and returns its result as metrics; empty if it fails, with the reason passed to `say`.
 
     `states` are the arguments of the function, [N, d] each.
     """

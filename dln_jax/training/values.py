@@ -147,8 +147,10 @@ def by_equation(
     report: Report,
     mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed; devices share the
-    samples."""
+    """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed.
+
+    Devices of a mesh share the samples.
+    """
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     each = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []

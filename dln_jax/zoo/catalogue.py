@@ -90,8 +90,7 @@ def extending(make: Callable[..., Model], *replaced: str) -> Callable[[Callable[
 
 
 def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
-    """Adds a friction network to the factory of a Hamiltonian: `friction_width` hidden units, with friction depending
-    on q.
+    """Adds friction that may depend on q to a Hamiltonian's factory: a network with `friction_width` hidden units.
 
     With `friction_width` 0 each coordinate has one coefficient, as in `make`. Without friction in the needs, the
     friction keywords have no effect.
@@ -151,8 +150,7 @@ def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model
 
 @extending(make_rigid_tree, "friction")
 def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
-    """`make_rigid_tree` for a tree in the form of `mechanics.trees.tree_to_json`, with the friction named by the
-    needs."""
+    """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(

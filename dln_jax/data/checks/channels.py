@@ -25,8 +25,7 @@ ABRUPT = 0.5
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:
-    """Checks for motionless joints, constant torques, spikes, coarse steps and flat tops; `rates` are qd of the
-    filtered q."""
+    """Checks for still joints, constant torques, spikes, steps and flat tops; `rates` are qd of the filtered q."""
     found = []
     still = np.flatnonzero(np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max()))
     if len(still):

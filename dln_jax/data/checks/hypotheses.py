@@ -33,8 +33,7 @@ LATE = 0.2
 """Smallest delay reported, in samples."""
 MOST_FAULTS = 3
 SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
-"""Ranking of single faults: number of equations, number of iterations, and candidates of a kind that are then tested
-fully."""
+"""Ranking of single faults: equations, iterations, and the number of faults of a kind that are then tested fully."""
 INERTIAS = 8
 """Number of configurations at which the sign of the inertias is tested."""
 NEGATIVE = -5.0

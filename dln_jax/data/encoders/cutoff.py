@@ -198,8 +198,7 @@ def _motion(
 
 
 def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
-    """Geometric mean over a sixth of an octave on either side, so that single gaps between lines do not end a
-    motion."""
+    """Geometric mean over a sixth of an octave on either side, so that a gap between lines does not end a motion."""
     logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
     summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
     place = np.arange(1, len(spectrum) + 1)

@@ -56,6 +56,7 @@ def step_of(values: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
 
 def _step(channel: np.ndarray) -> float:
     size = np.abs(channel).max(initial=0.0)
+    # Twelve significant digits, so that rounding errors do not split a level.
     levels = np.unique(np.round(channel, 12 - int(np.ceil(np.log10(size)))) if size > 0 else channel)
     if len(levels) < 3:
         return 0.0

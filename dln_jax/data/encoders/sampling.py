@@ -53,6 +53,7 @@ def even(
     t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], rate: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
     """One segment at equal steps from its first sample: unchanged if equally spaced, else by a cubic spline."""
+    # The margins keep the last sample if rounding puts it just below a whole step.
     count = int(np.floor((t[-1] - t[0]) * rate * (1 + 1e-9) + 1e-6)) + 1
     uniform = t[0] + np.arange(count) / rate
     if count == len(t) and np.abs(t - uniform).max() * rate < EVEN:

@@ -134,8 +134,7 @@ def smooth(
 
 
 def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
-    """Labels after smoothing: a label whose trajectory was cut is replaced by those of its parts; others stay
-    unchanged."""
+    """Labels after smoothing: the label of a trajectory that was cut becomes those of its parts; others stay."""
     found: list[str] = []
     for label in labels:
         parts = [each for each in data.label if each.rpartition(PART)[0] == label]

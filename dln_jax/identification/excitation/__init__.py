@@ -1,5 +1,4 @@
-"""Excitation: motions within a robot's limits that identify its parameters, as Fourier series with a well-conditioned
-regressor."""
+"""Excitation: Fourier-series motions within a robot's limits that give a well-conditioned regressor."""
 
 from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import (

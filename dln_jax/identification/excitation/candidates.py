@@ -66,8 +66,7 @@ def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
 
 
 def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
-    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if the smallest amplitude breaks them
-    too.
+    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if even the smallest breaks them.
 
     The second result is the limit broken at the smallest amplitude, as text.
     """
@@ -110,8 +109,7 @@ def measured(task: Task, motion: FourierMotion) -> Design:
 
 
 def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
-    """Draws random motions, scaling each joint to its own limits and then the whole motion to those of forces and
-    clearances.
+    """Draws random motions, with every joint scaled to its limits and the whole motion to those of force and clearance.
 
     Raises:
         InputError: too few draws are within the limits (50 failures per motion found); the message names the limit.

@@ -61,8 +61,7 @@ def information(A: Float[Array, "B B"]) -> Scalar:
 
 
 def condition(A: Float[Array, "B B"]) -> Scalar:
-    """Logarithm of the condition of the regressor with unit-length columns, with smooth means in place of extreme
-    eigenvalues."""
+    """Logarithm of the regressor's condition with unit-length columns; smooth means replace extreme eigenvalues."""
     sizes = jnp.log(jnp.maximum(jnp.linalg.eigvalsh(_scaled(A)[0]), jnp.finfo(A.dtype).eps))
     largest, smallest = (jax.nn.logsumexp(sign * SHARPNESS * sizes) / SHARPNESS for sign in (1, -1))
     return 0.5 * (largest + smallest)
@@ -198,8 +197,7 @@ def together(designs: Sequence[Design]) -> tuple[float, float]:
 
 
 def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
-    """Geometric mean over parameters of the standard errors from `designs` over those from `others` (as many
-    motions)."""
+    """Geometric mean over parameters of the standard errors from `designs` over those from `others`, equally many."""
     count = designs[0].information.shape[0]
     return float(np.exp((together(others)[1] - together(designs)[1]) / (2 * count)))
 

@@ -152,8 +152,7 @@ def _listed(names: tuple[str, ...], which: np.ndarray) -> str:
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
-    """Heights of link origins above the plane z = height (m), for links that can move vertically; `None` if none
-    can."""
+    """Heights of the link origins that can move vertically above the plane z = height (m); `None` if there are none."""
     drawn = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
     rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in drawn], axis=0) > 1e-9
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
@@ -192,8 +191,7 @@ def _beyond(bounds: np.ndarray, x: Array) -> Array:
 
 
 def worst(found: Excess) -> tuple[float, str]:
-    """The largest excess over all samples, and the name of that limit; the fields are those of `excess` with sample
-    axes in front."""
+    """The largest excess over all samples, and its limit; fields as of `excess`, with sample axes in front."""
     largest = {kind: float(np.max(each)) for kind, each in found._asdict().items() if each is not None}
     kind = max(largest, key=lambda each: largest[each])
     return largest[kind], kind

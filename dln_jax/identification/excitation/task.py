@@ -141,8 +141,7 @@ def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Ar
 
 
 def independent_columns(A: Float[np.ndarray, "N P"], *, dependent: float = DEPENDENT) -> Int[np.ndarray, " B"]:
-    """Sorted indices of independent columns that span all others, by QR with pivoting of columns scaled to unit
-    length."""
+    """Sorted indices of independent columns that span all others, by QR with pivoting of unit-length columns."""
     from scipy.linalg import qr
 
     lengths = np.linalg.norm(A, axis=0)

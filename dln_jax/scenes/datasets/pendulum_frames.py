@@ -1,5 +1,6 @@
-"""A swinging rod as small images: the renderer, and the dataset of the pixel pendulum (Greydanus, Dzamba and Yosinski
-2019, "Hamiltonian Neural Networks", after the pendulum of OpenAI's gym).
+"""A swinging rod as small images: the renderer, and the dataset of the pixel pendulum.
+
+The task is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks", after OpenAI gym's pendulum.
 
 The body is gym's: a uniform rod of 1 kg and 1 m that hangs from its end, in g = 10 m/s². It moves like a point mass of
 3/4 kg on 2/3 m, so H = qd²/6 + 5 (1 - cos q), in J, with q = 0 hanging. There is no torque. Frames are 0.05 s apart.

@@ -150,8 +150,7 @@ def latency_states(task: Task) -> tuple[np.ndarray, ...]:
 
 
 def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
-    """Definiteness of the mass matrices at the states of the data; `None` for a model without energy or definite by
-    structure."""
+    """Definiteness of the mass matrices along the data; `None` for a model without energy or definite by structure."""
     properties = CATALOGUE[task.kind].properties
     if properties.definite or not properties.energy:
         return None
@@ -166,8 +165,7 @@ def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dic
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
-    """Test motions under interpolated torques, and valid prediction times with those of the true plant as the upper
-    bound.
+    """Test rollouts under interpolated torques, and valid prediction times with the true plant's as the upper bound.
 
     Empty for independent states, which are no motion.
     """

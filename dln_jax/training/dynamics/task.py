@@ -46,8 +46,7 @@ class Task(NamedTuple):
     seeds: int | tuple[int, ...]
     """One seed, or several that train in one program."""
     until: float
-    """Reading of `time.perf_counter` at which training stops, for the command or one candidate of the model
-    selection."""
+    """Reading of `time.perf_counter` at which training stops, for the command or one candidate in model selection."""
     search: TreeFit | None = None
     """Result of the search for the joint frames of a learned tree."""
     best: int | None = None
@@ -138,8 +137,7 @@ def needs_of_tree(needs: Needs) -> Needs:
 def model_and_optimiser(
     given: Options, kind: str, recorded: Recorded, objective: Objective
 ) -> tuple[dict[str, Any], Optimiser | None, int | None, str]:
-    """Description of the model, its optimiser, its number of samples (`None`: all), and the reason for the
-    optimiser."""
+    """Description of the model, its optimiser, its number of samples (`None`: all), and why that optimiser."""
     needs, sets = recorded.needs, recorded.sets
     properties, optimizer = CATALOGUE[kind].properties, given.optimizer
     if properties.searched:

@@ -24,8 +24,7 @@ from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 
 def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -> None:
-    """Estimates the uncertainty from training and validation trajectories and stores it, for models fitted to torques
-    alone.
+    """Estimates and stores the uncertainty of a model fitted to torques alone, from training and validation data.
 
     `model` is the task's model in float64.
     """
@@ -57,8 +56,7 @@ def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -
 def uncertainty_metrics(
     folder: Path, run: Run, task: Task, programs: Programs, predicted: np.ndarray, *, figures: bool
 ) -> dict[str, float]:
-    """Coverage of the 95 % bands on test torques, mean and worst joint, and the fraction of test states out of
-    distribution.
+    """Coverage of the 95 % bands on test torques (mean, worst joint), and the share of test states out of distribution.
 
     Draws `uncertainty.png`. Empty for a run without uncertainty.
     """

@@ -99,8 +99,7 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
 def searched(
     losses: np.ndarray, agreeing: int, agreement: int, found: HeldOut
 ) -> tuple[Verdict | None, dict[str, float | int]]:
-    """Verdict and metrics of a search for joint frames: whether descents agree, and how close their errors are to the
-    noise.
+    """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise.
 
     Args:
         losses: losses of all descents.

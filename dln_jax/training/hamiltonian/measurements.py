@@ -33,8 +33,8 @@ FREE_OF_NOISE = 1e-3
 LEAST_RATE_NOISE = 0.01
 """Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
 ANCHOR = 30.0
-"""Noise assigned to estimated momenta, in units of their spread. They are noisy, but without any a model is free to
-choose its own momentum."""
+"""Noise assigned to estimated momenta, in units of their spread. They are noisy, but without any weight a model is free
+to choose its own momentum."""
 SURVEYED = 1_500
 """Approximate number of samples used to estimate noise; this gives its standard deviation to 2 %."""
 WINDOW = {REAL: 30, MEASURED: 30}
@@ -93,8 +93,7 @@ def forces_of(data: Trajectories) -> np.ndarray:
 
 
 def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[Trajectories, Trajectories]:
-    """Training and test trajectories; `InputError` if a part is missing or too short, or the test has copies of
-    training data."""
+    """Training and test trajectories; `InputError` if one is missing or too short, or the test copies training data."""
     present = np.unique(data.trajectory)
     if test is not None and test.endswith(".npz"):
         other = schema.load(test)
@@ -191,8 +190,7 @@ def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
 
 
 def to_predict(test: Trajectories) -> MeasuredWindows | None:
-    """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if no segment is longer than a
-    window."""
+    """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if all segments are shorter than one."""
     parts = stretches(test.t, test.trajectory)
     if max(map(len, parts)) <= WINDOW[MEASURED]:
         return None
@@ -220,8 +218,7 @@ def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
 
 
 def pieces(data: Trajectories, length: int) -> Trajectories:
-    """Segments cut to the length of two windows, as trajectories of their own, some of which can serve for
-    validation."""
+    """Segments cut to the length of two windows, as trajectories of their own, so that some can be held out."""
     parts = [
         each[at : at + 2 * length]
         for each in stretches(data.t, data.trajectory)

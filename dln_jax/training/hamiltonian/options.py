@@ -89,8 +89,7 @@ class Options(Checked, Limited, Resumable, Drawn, SingleCalls, Scaled):
 
 
 def prepare(given: Options, until: float) -> tuple[Problem, dict[str, Any], dict[str, Any], list[str]]:
-    """Resolves the options into the problem, the model's description, the keywords of `train`, and findings about the
-    log.
+    """Resolves the options into the problem, the model's description, the keywords of `train`, and findings on the log.
 
     Everything is checked before anything is written, and the log before models are compared on it.
 

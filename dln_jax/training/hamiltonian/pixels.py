@@ -114,8 +114,10 @@ def measure_pixels(
 
 
 def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
-    """Writes `pixels.gif` (the truth and the frames of every model) and, for an energy, `pixels-injection.png`; returns
-    paths."""
+    """Writes `pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`.
+
+    Returns the paths of the files.
+    """
     times = data.test.frames.shape[1] - 1
     frames = {TRUTH: data.test.frames[shown, :times]}
     frames |= {name: each.motions.frames[shown] for name, each in seen.items()}

@@ -51,8 +51,7 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
 
 
 def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
-    """Predicts the problem's motions from their first states; p is the velocity for models with momenta of their
-    own."""
+    """Predicts the problem's motions from their first states; p is the velocity for models with their own momenta."""
     model, parameters = build(trained.description), trained.result.parameters
     if in_velocities(problem, trained.description):
         given = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])

@@ -63,7 +63,7 @@ class Problem(NamedTuple):
     """Training data with the exact field; `None` for measurements."""
     test: Part | None
     truth: tuple[Motions, ...]
-    """Motions to predict, each entry with its own times."""
+    """Motions to predict; the motions of an entry share their times."""
     energy: Hamiltonian | None
     """The true energy; `None` if unknown."""
     published_energy: Hamiltonian | None

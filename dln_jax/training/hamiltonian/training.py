@@ -2,8 +2,8 @@
 
 Spring and pendulum have noise on the states and none on the rates: models are fitted to rates first and then to
 trajectories with free starts, which removes the bias due to the noise. The other generated tasks have no noise and are
-fitted to rates alone. Measurements have no exact rates: finite differences or local polynomials serve for a first fit,
-and the result is the fit to trajectories.
+fitted to rates alone. Measured rates are usually noisy or estimated and serve for a first fit; the result is then the
+fit to trajectories.
 """
 
 import math
@@ -110,8 +110,7 @@ def train(
     keep: Callable[[Trained], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Trained:
-    """Fits a model to rates and then, if the recipe says so, to trajectories, with `steps` or the recipe's number of
-    steps.
+    """Fits a model to rates and then, if the recipe says so, to trajectories, by `steps` or the recipe's steps.
 
     `seconds` limits both fits together, compilation included. The fit of rates is the result if the time left is too
     short to compile the next program, or if the fit of motions is not finite at its start. `keep` is called with it

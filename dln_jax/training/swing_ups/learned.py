@@ -37,8 +37,7 @@ class Obtained(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Errors of a model along unseen true motions: sum of squared errors, relative to the sum of squares of the
-    truth."""
+    """Errors of a model along unseen true motions: sums of squared errors over sums of squares of the truth."""
 
     torque_nmse: float
     acceleration_nmse: float
@@ -72,8 +71,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
 
 
 def errors_along(plant: DesktopPlant, model: Dynamics, runs: Run) -> Errors:
-    """Errors of a model's inverse and forward dynamics along true runs [E, N], with the plant's own states and
-    forces."""
+    """Errors of a model's inverse and forward dynamics along true runs [E, N], at the plant's own states and forces."""
     B = np.asarray(plant.scene.needs.actuation)
     x, u = (jnp.asarray(each.reshape(-1, each.shape[-1])) for each in (runs.x[:, :-1], runs.u))
     truth = field_of(model_of_plant(plant), B)
