@@ -39,13 +39,13 @@ class Identification(NamedTuple):
     known: Float[np.ndarray, " P"]
     """Prior values."""
     structure: tuple[Determinacy, ...]
-    """What arbitrary motions could determine of every parameter."""
+    """Structural identifiability: how arbitrary motions could determine every parameter."""
     base: BaseParameters
     """Combinations that arbitrary motions could determine."""
     fit: WeightedFit
     """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
-    """What the data determine of every parameter."""
+    """How these data determine every parameter."""
     statistics: ResidualStatistics
     """Statistics of the residuals of `fit`."""
     consistent: ConsistentFit | None
@@ -132,7 +132,7 @@ def identify(
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
-    """Classifies what the data determine of every parameter, relative to what motions could determine."""
+    """Classifies how the data determine every parameter, relative to what motions could determine."""
     scaled = base.combinations / np.where(fit.lengths > 0, fit.lengths, np.inf)
     lengths = np.linalg.norm(scaled, axis=1)
     _, sizes, right = np.linalg.svd(scaled[lengths > 0] / lengths[lengths > 0, None], full_matrices=False)

@@ -31,7 +31,7 @@ class ResidualStatistics(NamedTuple):
 def residual_statistics(
     errors: Float[np.ndarray, "N d"], trajectory: np.ndarray, noise: Float[np.ndarray, " d"]
 ) -> ResidualStatistics:
-    """Computes the statistics of residuals, trajectory by trajectory, against a noise level [d]."""
+    """Statistics of residuals relative to a noise level; they are correlated within trajectories only."""
     square = np.mean(errors**2, axis=0)
     kurtosis = np.mean(errors**4, axis=0) / np.where(square > 0, square, 1.0) ** 2 - 3
     beyond = np.mean(abs(errors) > 3 * noise, axis=0)
@@ -68,7 +68,7 @@ def fit_robust(
 ) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
     """Huber's estimate: the loss grows linearly instead of quadratically beyond `threshold` times the noise.
 
-    Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned beside the fit; the
+    Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the
     noise is estimated from the median absolute error.
 
     Args:

@@ -13,7 +13,7 @@ def with_friction(
     coefficients: FrictionCoefficients,
     shape: FrictionShape = FrictionShape(),  # noqa: B008
 ) -> Scene:
-    """Adds friction to the joints of a scene, beside any it already has.
+    """Adds friction to the joints of a scene, in addition to any it already has.
 
     Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint "at rest" creeps more slowly than v.
     An explicit integrator is stable for steps below some 2.8 m v / c, where m is the smallest inertia at the joint.

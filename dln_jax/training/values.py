@@ -42,7 +42,7 @@ Report = Callable[[int, int, str], None]
 
 
 class Family(NamedTuple):
-    """Arguments of `value_network` beside the problem, as JSON values."""
+    """Arguments of `value_network` other than the problem, as JSON values."""
 
     widths: tuple[int, ...]
     members: int

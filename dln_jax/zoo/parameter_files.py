@@ -33,7 +33,7 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
         directory: an existing folder.
         name: stem of the pair.
         tree: any pytree of arrays.
-        facts: JSON values to store in the manifest beside versions, shapes and digest.
+        facts: JSON values to store in the manifest with versions, shapes and digest.
         number: distinguishes successive states of one run.
     """
     # safetensors writes the raw memory, which must be in row-major order for the numbers to be read back correctly.

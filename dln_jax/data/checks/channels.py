@@ -92,7 +92,7 @@ def _spiky(data: Trajectories) -> list[Finding]:
 
 
 def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
-    """Mask of samples [N, k] that leave a channel and return at once, by far more than it ever changes otherwise.
+    """Mask of samples [N, k] that leave a channel and return at once, by much more than it ever changes otherwise.
 
     A sample is compared with the median of the two neighbours on either side. Upper quartiles of that error and of the
     neighbours' range over all samples give the usual change.

@@ -76,7 +76,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
 
 
 def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Whether every column, up to a factor, follows the other rate far better than its own."""
+    """Whether every column, up to a factor, follows the other rate much better than its own."""
     inside = away_from_ends(part, 2)
 
     def left(reference: np.ndarray) -> np.ndarray:

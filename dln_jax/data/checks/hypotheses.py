@@ -1,6 +1,6 @@
 """Tests hypotheses about faults in torques: a wrong sign, exchanged columns, a delay and others.
 
-A hypothesis is accepted if it predicts left-out blocks of time far better than the log as recorded, in nearly all
+A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
 blocks. Without a robot the prior of the torques is that of an arbitrary energy with friction (`energies`), valid for
 arms of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the
 search is repeated.

@@ -88,7 +88,7 @@ def better_order(
     samples: tuple[np.ndarray, ...],
     friction: list[np.ndarray],
 ) -> list[Finding]:
-    """Searches for a joint order that explains the torques far better: two joints exchanged, all reversed or rotated.
+    """Searches for a joint order that explains the torques much better: two joints exchanged, all reversed or rotated.
 
     `samples` are q, qd, qdd and tau [n, d], `friction` the friction columns [n, 3] of every joint.
     """

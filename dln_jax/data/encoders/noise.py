@@ -40,7 +40,7 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
 def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
     """Standard deviation of the white noise of every torque, N m or N; `None` if the sampling is too slow to tell.
 
-    The noise of the positions, which are measured far better than torques, shows whether it is.
+    The noise of the positions, which are measured much better than torques, shows whether it is.
     """
     spread = data.q.std(axis=0)
     moving = spread > 0

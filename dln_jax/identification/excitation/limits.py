@@ -152,7 +152,7 @@ def _listed(names: tuple[str, ...], which: np.ndarray) -> str:
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
-    """Heights of the link origins that can move vertically above the plane z = height (m); `None` if there are none."""
+    """Heights above the plane z = height (m) of all link origins that can move vertically; `None` if none can."""
     drawn = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
     rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in drawn], axis=0) > 1e-9
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None

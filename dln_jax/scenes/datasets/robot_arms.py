@@ -100,7 +100,7 @@ def lip_trajectories(
         seeds: seeds of the motions and their noise.
         friction: whether the arm's friction acts.
         noise: standard deviation of the torques' noise, N m or N; drawn for all samples, also those not kept.
-        every: keep one of so many samples of 10 ms.
+        every: keep every `every`-th sample (10 ms apart).
         duration: s.
         span: fraction of the joints' limits that the motions use.
 

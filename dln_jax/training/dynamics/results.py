@@ -199,7 +199,7 @@ def draw(folder: Path, task: Task, training: Training, motions: list[Motion], pr
 
 
 def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
-    """Prints the metrics with units, and beside rollout metrics the values of the true plant."""
+    """Prints the metrics with units, and next to rollout metrics the true plant's values."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
     units |= {key: "1" for key in metrics if key.endswith("_nmse")}

@@ -42,7 +42,7 @@ WINDOW = {REAL: 30, MEASURED: 30}
 
 
 class Stated(NamedTuple):
-    """What the user states about measurements beside their file."""
+    """Facts about measurements that the user states in addition to their file."""
 
     needs: Needs | None = None
     """`Needs` of the plant. Default: those in the file, else bodies whose forces balance, else revolute joints with a

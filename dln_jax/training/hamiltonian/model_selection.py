@@ -26,7 +26,7 @@ from dln_jax.zoo.catalogue import CATALOGUE, entry_of
 from dln_jax.zoo.descriptions import build, describe_for
 
 MODELS = ("black-box-hnn", "phase-network")
-"""Models of every task in the table, beside the one that suits the scene."""
+"""Models of every task in the table, in addition to the one that suits the scene."""
 PAIRWISE, HELMHOLTZ = "pairwise-hnn", "helmholtz-hnn"
 POLYNOMIAL = "polynomial-hamiltonian"
 """Additional model for tasks with one coordinate and without friction."""
@@ -184,7 +184,7 @@ def choose_model(
 
 
 def rates_are_biased(problem: Problem) -> bool:
-    """Whether states beside measured rates are so noisy that a fit of the rates is biased."""
+    """Whether rates were measured with states so noisy that a fit of the rates is biased."""
     return problem.noise is None and problem.trust is not None and not problem.trust.free_of_noise
 
 

@@ -24,7 +24,7 @@ SUBSTEPS = 4
 
 
 class Seen(NamedTuple):
-    """What a figure shows of a model."""
+    """Content of a figure for one model."""
 
     motions: Motions
     """Prediction of the problem's first entry."""

@@ -70,7 +70,7 @@ def weights_of(problem: Problem, data: Trajectories) -> Weights:
 
 
 def substeps_of(windows: Windows, weights: Weights) -> int:
-    """RK4 steps between samples that keep the error over a window small beside the noise, at most `MOST_SUBSTEPS`.
+    """RK4 steps between samples that keep the error over a window well below the noise, at most `MOST_SUBSTEPS`.
 
     For an oscillation of angular frequency w, a step h has an error of (w h)⁵ / 120 times the amplitude.
     """

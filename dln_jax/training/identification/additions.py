@@ -81,7 +81,7 @@ def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | in
 
 
 def shape_lines(case: Case) -> list[str]:
-    """Fitted shape parameters of friction, beside its coefficients."""
+    """Fitted shape parameters of friction, in addition to its coefficients."""
     found = {name: case.description[name] for name in shape_of(case.laws) if isinstance(case.description[name], list)}
     units = {"sigmoid_slope": "s"}
     return [
