@@ -190,7 +190,7 @@ def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
 
 
 def to_predict(test: Trajectories) -> MeasuredWindows | None:
-    """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if all segments are shorter than one."""
+    """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if no segment exceeds one."""
     parts = stretches(test.t, test.trajectory)
     if max(map(len, parts)) <= WINDOW[MEASURED]:
         return None
