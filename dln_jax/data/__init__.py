@@ -1,4 +1,4 @@
-"""What a user's file is: the schema, its reading and its splits."""
+"""Data: the file schema, readers and splits."""
 
 from dln_jax.data import functions
 from dln_jax.data.functions import FunctionSamples, SampleSplit

@@ -1,7 +1,7 @@
-"""Reading npz archives of plain numbers and strings: nothing is unpickled, and every refusal names its key.
+"""Reads npz archives of plain numbers and strings without unpickling; every error names its key.
 
-A file is read only as far as it is needed: the arrays that somebody reads, each no larger than its archive says and
-than its header states, all of them together at most `MOST_BYTES`.
+Only the arrays requested are read. Each must match the sizes stated in the archive and in its header, and together they
+may hold at most `MOST_BYTES`.
 """
 
 import math
@@ -20,9 +20,9 @@ from dln_jax.types import InputError
 Data = TypeVar("Data")
 
 MOST_BYTES = 4 * 2**30
-"""Of the arrays of one file: a small archive may expand a thousandfold."""
+"""Limit on all arrays of one file, since a small archive may expand a thousandfold."""
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-"""Of the versions in which NumPy writes numbers and strings."""
+"""Header readers for the format versions in which NumPy writes numbers and strings."""
 
 
 def load(
@@ -32,17 +32,17 @@ def load(
     *,
     table: Callable[[Path], tuple[dict[str, Any], list[str]]] | None = None,
 ) -> Data:
-    """Reads the arrays of these keys, where the file has them, and hands them to `from_arrays`, which checks them.
+    """Reads the arrays with these keys, if present, and passes them to `from_arrays`, which checks them.
 
     Args:
-        path: of an npz file.
-        from_arrays: arrays by key -> what they are.
-        keys: those that are read.
-        table: reads a file whose name ends in .csv: the arrays by key, and what it does not read.
+        path: path of an npz file.
+        from_arrays: converts arrays by key into the result.
+        keys: keys to read.
+        table: reader for files whose name ends in .csv; returns the arrays by key and the columns it does not read.
 
     Raises:
         InputError: the file is missing, is no npz, is damaged, holds pickled objects or more than `MOST_BYTES`, or
-            `from_arrays` or `table` refuses what it holds (the message then starts with the path).
+            `from_arrays` or `table` rejects its contents (the message then starts with the path).
     """
     path = Path(path)
     if not is_file(path):
@@ -58,7 +58,7 @@ def load(
 
 
 def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """The arrays of these keys, and the names of the others."""
+    """The arrays with these keys, and the names of all others."""
     arrays, room, key = {}, MOST_BYTES, None
     try:
         with zipfile.ZipFile(path) as archive:
@@ -70,7 +70,7 @@ def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
                 room -= arrays[key].nbytes
     except InputError as error:
         raise InputError(f"{key} {error}") from None
-    except Exception as error:  # zipfile, its decoders and NumPy's parser of headers raise whatever they come across
+    except Exception as error:  # zipfile, its decoders and NumPy's header parser raise many types
         where = "" if key is None else f" in '{key}'"
         raise InputError(
             f"not a readable npz file without pickled objects ({type(error).__name__}{where}); "
@@ -80,7 +80,7 @@ def _read(path: Path, keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _array(file: Any, size: int, room: int) -> np.ndarray:
-    """One array of an archive, whose entry has `size` bytes; at most `room` of them are read."""
+    """Reads one array of an archive, whose entry has `size` bytes; more than `room` bytes are refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about headers that Python 2 wrote
         shape, by_columns, dtype = HEADERS[np.lib.format.read_magic(file)](file)
@@ -107,10 +107,11 @@ def numeric(
     to_match: str = "q",
     most: float = LARGEST,
 ) -> np.ndarray:
-    """The array of that key as float64, which must hold finite real numbers.
+    """The array with this key as float64, checked to hold finite real numbers.
 
     Raises:
-        InputError: the key is missing, not numeric, not finite, or of another shape than the one that is to match.
+        InputError: the key is missing, not numeric, not finite, has the wrong shape, or its largest number is so large
+            or small that squares overflow or vanish.
     """
     if key not in arrays:
         raise InputError(f"key '{key}' is missing (found: {', '.join(sorted(arrays)) or 'nothing'}); add it")

@@ -1,7 +1,7 @@
-"""How a file orders the coordinates of bodies that act on one another, from the balance of their forces.
+"""Detects the coordinate order of interacting bodies from the balance of their forces.
 
-Forces between bodies sum to zero along every axis, whatever the law (translation invariance, Newton's third law). Sums
-over the wrong columns mix axes and do not vanish, so that the order that a file does not state can be read off:
+Internal forces sum to zero along every axis, whatever the law (translation invariance, Newton's third law). Sums over
+the wrong columns mix axes and do not vanish, so an order that the file does not state can be inferred:
 
     imbalance = rms over samples and axes of |sum_i F_i| / (sqrt(bodies) rms F)      0 if balanced, about 1 by chance
 """
@@ -12,24 +12,24 @@ import numpy as np
 from jaxtyping import Float
 
 Order = Literal["bodies", "axes"]
-"""x1, y1, x2, y2, or x1, x2, y1, y2."""
+""""bodies" is x1, y1, x2, y2; "axes" is x1, x2, y1, y2."""
 ORDERS: tuple[Order, ...] = ("bodies", "axes")
 MOST_IMBALANCE = 0.2
-"""At which forces still count as balanced: rates that were estimated are noisy."""
+"""Forces with at most this imbalance count as balanced; estimated rates are noisy."""
 LEAST_CONTRAST = 3.0
-"""Times that imbalance, below which another order is not ruled out."""
+"""Other orders are ruled out if their imbalance exceeds the best one's by this factor."""
 
 
 class Bodies(NamedTuple):
-    """What the columns of q are."""
+    """Arrangement of the columns of q."""
 
     dimension: int
-    """Axes of each body: 2 or 3."""
+    """Axes per body: 2 or 3."""
     order: Order
 
 
 def imbalance(forces: Float[np.ndarray, "N d"], bodies: Bodies) -> float:
-    """How far the forces are from summing to zero along each axis; 0 if they do, about 1 by chance."""
+    """How far the forces are from summing to zero along every axis: 0 if balanced, about 1 by chance."""
     size = np.sqrt(np.mean(forces**2))
     if not size > 0:
         return 0.0
@@ -42,14 +42,14 @@ def imbalance(forces: Float[np.ndarray, "N d"], bodies: Bodies) -> float:
 
 
 def arrangements(d: int) -> list[Bodies]:
-    """Every way in which d coordinates may be those of at least two bodies in a plane or in space."""
+    """All arrangements of d coordinates as at least two bodies in a plane or in space."""
     return [Bodies(axes, order) for axes in (2, 3) if d % axes == 0 and d >= 2 * axes for order in ORDERS]
 
 
 def find_bodies(forces: Float[np.ndarray, "N d"], *, order: Order | None = None) -> Bodies | None:
-    """The one arrangement in which the forces on bodies balance; `None` where none does, or several.
+    """The only arrangement in which the forces on the bodies balance, or `None` if there is none or more than one.
 
-    With an `order` that is known only the dimension is looked for, and the answer is what balances best.
+    With a known `order` only the dimension is determined, as the one that balances best.
     """
     ways = [each for each in arrangements(forces.shape[1]) if order in (None, each.order)]
     ranked = sorted((imbalance(forces, each), each) for each in ways)

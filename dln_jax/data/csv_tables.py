@@ -1,10 +1,10 @@
-"""Logs as CSV: one row a sample, and a header that names every column and its unit.
+"""Reads logs in CSV format: one row per sample and a header that names every column and its unit.
 
     t [s],q1 [deg],q2 [deg],tau1 [N m],tau2 [N m]        or        t_s,q_elbow_rad,tau_elbow_Nm
 
-A title is a key of the schema, the joint (a number or a name; none where there is one joint) and a unit, which is
+A title consists of a schema key, the joint (a number or a name; omitted for a single joint) and a unit, which is
 converted to SI. Units are never guessed: a title without one is refused unless the caller states `units`. Columns may
-come in any order, and others stand beside them unread.
+come in any order, and other columns are ignored.
 """
 
 import csv
@@ -21,9 +21,9 @@ import numpy as np
 from dln_jax.types import InputError
 
 MOST_BYTES = 2**30
-"""Size of a file that is read; larger ones are quicker and smaller as npz."""
+"""Largest file read; larger data are faster and smaller as npz."""
 STATED = {"si": {}, "degrees": {"q": "deg", "qd": "deg/s", "qdd": "deg/s2"}}
-"""Units that a caller may state for titles without one: by key, SI for the rest."""
+"""Units that a caller may state for titles without one: by key, SI for all others."""
 TURN = math.pi / 180
 POSITIONS = {"rad": 1.0, "deg": TURN, "m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FORCES = {"nm": 1.0, "n": 1.0, "mnm": 1e-3, "mn": 1e-3, "knm": 1e3, "kn": 1e3}
@@ -36,35 +36,36 @@ UNITS = {
     "p": {"nms": 1.0, "ns": 1.0, "kgm2/s": 1.0, "kgm/s": 1.0},
     "trajectory": {},
 }
-"""Factor to SI of each unit that a column may have, by key."""
+"""Conversion factor to SI for every admissible unit, by key."""
 EXAMPLES = {"t": "t [s]", "qd": "qd1 [rad/s]", "qdd": "qdd1 [rad/s^2]", "tau": "tau1 [N m]", "p": "p1 [N m s]"}
 _SPELLINGS = {"degrees": "deg", "degree": "deg", "°": "deg", "²": "2", "µ": "u", "μ": "u", "sec": "s"}
+# Longest key first, since "tau" would also match the start of "tau_inertial".
 _TITLE = re.compile(rf"({'|'.join(sorted(UNITS, key=len, reverse=True))}|time)(?=$|[\d_ .\[(/])(.*)", re.DOTALL)
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\])]*)[\])]\s*", re.DOTALL)
 
 
 class Column(NamedTuple):
-    """A column that is read."""
+    """A column to read."""
 
     title: str
     key: str
-    """Of the schema."""
+    """Key of the schema."""
     joint: str
-    """Empty where the title names none."""
+    """Number or name of the joint; empty if the title has none."""
     unit: str | None
-    """Spelled as in `UNITS`; `None` where the title states none."""
+    """Spelled as in `UNITS`; `None` if the title has none."""
 
 
 def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[str]]:
-    """The arrays of a CSV file by the keys of the schema, in SI units, and the titles of columns that are not read.
+    """Reads a CSV file: the arrays by schema key, in SI units, and the titles of ignored columns.
 
     Args:
-        path: of the file.
-        units: what titles without a unit have: "si", or "degrees" for angles in degrees and all else in SI.
+        path: path of the file.
+        units: units of titles without one: "si", or "degrees" for angles in degrees and all else in SI.
 
     Raises:
-        InputError: no header, a title that is there twice, a unit that is unknown or not stated, joints that differ
-            between q and another key, rows of different lengths, cells without a number, or more than `MOST_BYTES`.
+        InputError: a missing header, a duplicate title, an unknown or missing unit, joints that differ between q and
+            another key, rows of different lengths, cells that are not numbers, or more than `MOST_BYTES`.
     """
     if units is not None and units not in STATED:
         raise InputError(f"units is {units!r:.40}; expected one of {', '.join(STATED)}")
@@ -92,7 +93,7 @@ def read(path: Path, *, units: str | None = None) -> tuple[dict[str, Any], list[
 
 
 def _header(path: Path) -> list[str]:
-    """The titles of all columns, which are different and not empty."""
+    """Titles of all columns, checked to be non-empty and unique."""
     rows = _rows(path)
     titles = [title.strip() for title in next(rows, (0, []))[1]]
     if not titles:
@@ -112,7 +113,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number of the line and its cells, blank lines apart."""
+    """Line number and cells of every row, without blank lines."""
     with path.open(encoding="utf-8-sig", newline="") as file:
         reader = csv.reader(file)
         try:
@@ -124,7 +125,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _column(title: str) -> Column | None:
-    """What a title names; `None` where that is no key of the schema."""
+    """Parses a title; `None` if it names no key of the schema."""
     match = _TITLE.fullmatch(title)
     if match is None:
         return None
@@ -136,7 +137,7 @@ def _column(title: str) -> Column | None:
         return Column(title, key, "", _spelled(unit) if unit else None)
     unit = None
     while inside := _BRACKETS.fullmatch(rest):
-        # q[2] is a joint, q2 [rad] a unit.
+        # q[2] names a joint, q2 [rad] a unit.
         rest = f"{inside[1]} {inside[2]}" if inside[2].strip().isdecimal() else inside[1]
         unit = unit if inside[2].strip().isdecimal() else _spelled(inside[2])
     words = [word for word in re.split(r"[_ ]+", rest.strip("_ ./")) if word]
@@ -149,7 +150,7 @@ def _column(title: str) -> Column | None:
 
 
 def _spelled(unit: str) -> str:
-    """A unit as `UNITS` spells it."""
+    """Normalises a unit to its spelling in `UNITS`."""
     found = re.sub(r"[\s/]+per[\s/]+", "/", unit.lower())
     found = re.sub(r"[\s*·.^]", "", found)
     for spelling, ours in _SPELLINGS.items():
@@ -158,7 +159,7 @@ def _spelled(unit: str) -> str:
 
 
 def _factor(column: Column, stated: str | None) -> float:
-    """To SI."""
+    """Conversion factor to SI."""
     known = UNITS[column.key]
     if not known:
         return 1.0
@@ -176,7 +177,7 @@ def _factor(column: Column, stated: str | None) -> float:
 
 
 def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
-    """Places of each key's columns in the order of joints, which are those of q: by number, or as they come."""
+    """Column indices per key in the joint order of q: by number if all joints are numbers, else as in the file."""
     found: dict[str, dict[str, int]] = {}
     for place, column in columns.items():
         own = found.setdefault(column.key, {})
@@ -199,7 +200,7 @@ def _by_key(columns: dict[int, Column]) -> dict[str, list[int]]:
 
 
 def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.ndarray:
-    """All rows below the header [N, columns], with zeros where columns are not read."""
+    """All rows below the header [N, columns], with zeros in ignored columns."""
     unread = {place: _zero for place in range(len(titles)) if place not in read_places}
     with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about files without samples
@@ -218,7 +219,7 @@ def _numbers(path: Path, titles: Sequence[str], read_places: set[int]) -> np.nda
 
 
 def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
-    """The first line that is wrong, and how."""
+    """Describes the first invalid line."""
     rows = _rows(path)
     next(rows)
     for line, cells in rows:
@@ -234,7 +235,7 @@ def _complaint(path: Path, titles: Sequence[str], read_places: set[int]) -> str:
 
 def _number(text: str) -> float | None:
     try:
-        return None if "_" in text else float(text)
+        return None if "_" in text else float(text)  # float() reads "1_000" as 1000
     except ValueError:
         return None
 

@@ -1,11 +1,11 @@
-"""Samples of functions with their derivatives, for regression: read from npz, or drawn from two textbook functions.
+"""Samples of functions and their derivatives for regression: read from npz, or drawn from two textbook functions.
 
 | key | shape | |
 |---|---|---|
 | `x` | [N, n] | inputs |
 | `y` | [N, m] | values |
-| `dy` | [N, m, n] | optional Jacobians dy/dx; [N, n] will do when m = 1 |
-| `d2y` | [N, m, n, n] | optional Hessians d²y/dx²; [N, n, n] will do when m = 1 |
+| `dy` | [N, m, n] | optional Jacobians dy/dx; [N, n] is accepted if m = 1 |
+| `d2y` | [N, m, n, n] | optional Hessians d²y/dx²; [N, n, n] is accepted if m = 1 |
 
 Units are the user's own.
 """
@@ -47,7 +47,7 @@ class FunctionSamples(NamedTuple):
 
 
 class SampleSplit(NamedTuple):
-    """Disjoint samples: fitted to, and selected by."""
+    """Disjoint samples for training and validation."""
 
     train: FunctionSamples
     validation: FunctionSamples
@@ -81,9 +81,9 @@ def from_arrays(arrays: dict[str, Any]) -> FunctionSamples:
 
 
 def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0) -> SampleSplit:
-    """Draws validation samples by the seed; at least one, and at least one is left to train on.
+    """Draws validation samples by the seed, leaving at least one sample in either set.
 
-    For samples that are independent of each other. Raises InputError for a share outside (0, 1), or a single sample.
+    Use it for independent samples. Raises InputError for a share outside (0, 1), or fewer than two samples.
     """
     samples = len(data.x)
     count = held_out(samples, validation_share, "samples")
@@ -92,18 +92,18 @@ def split(data: FunctionSamples, *, validation_share: float = 0.1, seed: int = 0
 
 
 def select(data: FunctionSamples, indices: np.ndarray) -> FunctionSamples:
-    """The samples with these indices, or where this mask is true."""
+    """Selects samples by indices or a mask."""
     dy, d2y = (None if array is None else array[indices] for array in (data.dy, data.d2y))
     return FunctionSamples(data.x[indices], data.y[indices], dy, d2y)
 
 
 def sine(*, samples: int = 25_600, noise: float = 1e-3, bound: float = np.pi, seed: int = 0) -> FunctionSamples:
-    """f(x) = sin x at x uniform in [-bound, bound], with independent Gaussian noise on everything that is stored.
+    """f(x) = sin x at x uniform in [-bound, bound], with independent Gaussian noise on all stored arrays.
 
-    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'; the
-    stored x is the noisy one, so that even the true function leaves residuals. The Hessian, which the published
-    losses do not read, has the same noise.
-    Raises InputError for samples or a bound that are not positive, or negative noise.
+    The published protocol has 25,600 samples, bound π, and noise of standard deviation 1e-3 on x, f and f'. The stored
+    x is the noisy one, so even the true function leaves residuals. The Hessian, which the published losses do not use,
+    has the same noise.
+    Raises InputError if samples or bound are not positive, or the noise is negative.
     """
     return _noisy_samples(_exact_sine, 1, samples, noise, bound, seed)
 

@@ -1,7 +1,7 @@
-"""Limits of joints as a URDF or MJCF file states them, refused where they are no limits.
+"""Reads joint limits of URDF and MJCF files and refuses malformed ones.
 
-MuJoCo reads a range that is NaN, equal, swapped or half stated as no range at all. A motion that is designed from that
-drives the joint into its stop, so such a file is refused before MuJoCo sees it.
+MuJoCo treats a range that is NaN, empty, swapped or half stated as no range. A motion designed from such a file would
+drive the joint into its stop, so the file is refused before MuJoCo reads it.
 """
 
 import xml.etree.ElementTree as ET
@@ -14,13 +14,13 @@ from dln_jax.types import InputError
 
 REMEDY = "correct the file, or hold the joint"
 LIMITED = {"range": "limited", "actuatorfrcrange": "actuatorfrclimited"}
-"""Attributes of an MJCF joint that hold two numbers, and those that can switch them off."""
+"""Attributes of an MJCF joint that hold two numbers, and the attributes that disable them."""
 KINDS = {"range": "position", "actuatorfrcrange": "torque"}
 
 
 def check_limits(path: Path, root: ET.Element, held: Collection[str]) -> None:
-    """Raises `InputError` that names the first joint whose stated limits are not two finite numbers, the lower first,
-    or whose velocity or effort in a URDF is negative or no number. Joints that are `held` may state anything."""
+    """Raises `InputError` that names the first joint whose limits are not two finite numbers, lower < upper, or whose
+    velocity or effort in a URDF is negative or not a number. Locked joints (`held`) are not checked."""
     if root.tag == "robot":
         for joint in root.findall("joint"):
             if joint.get("name") not in held and joint.get("type") in ("revolute", "prismatic", "continuous"):
@@ -34,8 +34,7 @@ def check_limits(path: Path, root: ET.Element, held: Collection[str]) -> None:
 
 
 def velocity_limits(root: ET.Element, names: Sequence[str]) -> np.ndarray:
-    """What <limit velocity="..."> of each joint says, rad/s or m/s; infinite where it says nothing, or 0, which some
-    files write for what nobody knows."""
+    """Velocity limits from <limit velocity="...">, rad/s or m/s; infinite if missing or 0 (unknown, in some files)."""
     stated = {}
     for joint in root.findall("joint"):
         limit = joint.find("limit")
@@ -76,7 +75,7 @@ def _number(text: str) -> float:
 
 
 def _with_included(path: Path, root: ET.Element) -> Iterator[ET.Element]:
-    """The outer element, and those of the files that it includes; MuJoCo says which of them cannot be read."""
+    """The root element and those of included files; unreadable ones are skipped, since MuJoCo reports them."""
     yield root
     for include in root.iter("include"):
         file = path.parent / include.get("file", "")

@@ -1,4 +1,4 @@
-"""Joints of data and of a robot are the same, in the same order: by their names where the data have them."""
+"""Matches the joints of a dataset with those of a robot, by name if the data have names."""
 
 import reprlib
 from collections.abc import Sequence
@@ -8,10 +8,10 @@ from dln_jax.types import InputError
 
 
 def with_joints(data: Trajectories, names: Sequence[str]) -> Trajectories:
-    """The data with their columns in the order of these joints; as they are where neither has names.
+    """Reorders the columns of the data to these joints; data without joint names stay unchanged.
 
     Raises:
-        InputError: another number of joints, or names that are not the same.
+        InputError: the number of joints differs, or the names do.
     """
     d = data.degrees_of_freedom
     if len(names) != d:

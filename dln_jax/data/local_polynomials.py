@@ -1,9 +1,8 @@
-"""Velocities and accelerations of measured coordinates by local polynomials, and how large their noise is.
+"""Velocities, accelerations and noise of measured coordinates by local polynomials.
 
-Around each sample a polynomial in time is fitted to its neighbours by least squares, whatever their spacing (Savitzky
-and Golay 1964). How many neighbours is decided for each coordinate by the error at samples that are left out of their
-own fit, e_i / (1 - H_ii) (Allen 1974): few where a motion bends, many where it is noisy. That supposes that the noise
-of samples is independent; where it is not, state `points`.
+A polynomial in time is fitted by least squares to the neighbours of every sample, at any spacing (Savitzky and Golay
+1964). The number of neighbours is chosen per coordinate by leave-one-out error, e_i / (1 - H_ii) (Allen 1974): few for
+a strongly curved motion, many for a noisy one. This assumes independent noise; otherwise state `points`.
 """
 
 from typing import NamedTuple
@@ -17,22 +16,22 @@ from dln_jax.data.stretches import GAP, stretches
 from dln_jax.types import InputError
 
 DEGREE = 4
-"""Of the polynomials: an acceleration has a slope and a bend."""
+"""Degree of the polynomials: high enough for the acceleration itself to have slope and curvature."""
 GROWTH = 1.3
-"""From one number of neighbours that is tried to the next."""
+"""Ratio of successive numbers of neighbours tried."""
 MOST_POINTS = 401
 
 
 class Smoothed(NamedTuple):
-    """Trajectories with q, qd and qdd of local polynomials; all else is as it was."""
+    """Trajectories with q, qd and qdd from local polynomials; all else is unchanged."""
 
     data: Trajectories
     noise: Float[np.ndarray, " d"]
     """Standard deviation of the noise of q, rad or m."""
     points: tuple[int, ...]
-    """Neighbours that each coordinate was smoothed over, itself among them."""
+    """Neighbours used for each coordinate, the sample itself included."""
     rows: np.ndarray
-    """Of the samples that were kept."""
+    """Rows of the samples kept."""
 
 
 class _Fits(NamedTuple):
@@ -40,24 +39,24 @@ class _Fits(NamedTuple):
     qd: np.ndarray
     qdd: np.ndarray
     left_out: np.ndarray
-    """Errors at samples that are left out."""
+    """Leave-one-out errors."""
     variance: np.ndarray
-    """Of the noise, by the residual of each sample."""
+    """Noise variance estimated from the residual of every sample."""
 
 
 def smooth_locally(
     data: Trajectories, *, points: int | None = None, degree: int = DEGREE, gap: float = GAP
 ) -> Smoothed:
-    """Smoothed coordinates with their rates; stretches without a gap that have too few samples are left out.
+    """Smooths coordinates and estimates their rates; segments (without a gap) that have too few samples are left out.
 
     Args:
-        data: whose q and t are read.
-        points: neighbours of each sample, itself among them (default: chosen for each coordinate).
-        degree: of the polynomials, at least 2.
+        data: trajectories; only q and t enter the fit.
+        points: neighbours of every sample, itself included (default: chosen per coordinate).
+        degree: degree of the polynomials, at least 2.
         gap: as for `data.stretches.stretches`.
 
     Raises:
-        InputError: a degree below 2, no more points than that, or no stretch that is long enough.
+        InputError: the degree is below 2, `points` is below degree + 2, or no segment is long enough.
     """
     spread("q", data.q)
     least = degree + 2
@@ -85,6 +84,7 @@ def smooth_locally(
 
 
 def _sizes(least: int, most: int) -> list[int]:
+    # Odd numbers, which centre the window on its sample.
     sizes = [least + (least % 2 == 0)]
     while (longer := 2 * int(np.ceil((GROWTH * sizes[-1] - 1) / 2)) + 1) <= most:
         sizes.append(longer)
@@ -101,7 +101,7 @@ def _stretch(t: np.ndarray, q: np.ndarray, size: int, degree: int) -> _Fits:
     around = first[:, None] + np.arange(size)
     unit = 0.5 * (t[-1] - t[0]) * size / len(t)
     powers = ((t[around] - t[:, None]) / unit)[..., None] ** np.arange(degree + 1)
-    # Rows of the pseudo-inverse; the matrices are small, and their times scaled.
+    # The normal equations are safe here: the matrices are small and times are scaled.
     inverse = np.linalg.solve(powers.transpose(0, 2, 1) @ powers, powers.transpose(0, 2, 1))
     value, slope, bend = (inverse[:, order] for order in range(3))
     smooth = np.einsum("ns,ns->n", value, q[around])

@@ -1,7 +1,7 @@
-"""Whether numbers are of a size that can be computed with, before anything rests on them.
+"""Checks that numbers are of a magnitude that losses can square.
 
-Losses square what they read. Marks of missing values such as 1e308, and units far from the data's size, give scales and
-losses that are infinite or zero without any single number being so.
+Markers of missing values such as 1e308, and unsuitable units, give infinite or zero scales and losses although every
+single number is finite.
 """
 
 from typing import Any
@@ -14,14 +14,14 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 MOST_TIMES_TYPICAL = 1e20
-"""A number so many times the median one is no measurement beside the others: rounding leaves 16 digits."""
+"""A number larger than the median by this factor is no measurement: float64 has 16 digits."""
 
 
 def on_device(name: str, array: np.ndarray, dtype: Any) -> Array:
-    """An array of samples in a precision.
+    """Converts an array of samples to a dtype on the device.
 
     Raises:
-        InputError: the sum of its squares is not finite there.
+        InputError: the sum of its squares overflows in that dtype.
     """
     _require_squares(name, array, dtype)
     return jnp.asarray(array, dtype)
@@ -31,8 +31,8 @@ def spread(name: str, array: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"
     """Standard deviation of each column, in float64.
 
     Raises:
-        InputError: it is not finite, numbers other than zero are so small that their squares vanish, or some are
-            beyond `MOST_TIMES_TYPICAL` of the others.
+        InputError: squares overflow, nonzero numbers are so small that all squares vanish, or some exceed the median by
+            `MOST_TIMES_TYPICAL`.
     """
     _require_squares(name, array, np.float64)
     sizes = np.abs(array[array != 0])

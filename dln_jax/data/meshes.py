@@ -1,4 +1,4 @@
-"""Mesh files: an npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], vertices."""
+"""Mesh files: npz with `vertices` [n, dim] in m, `elements` [m, dim + 1] and optionally `held` [k], fixed vertices."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,24 +14,24 @@ KEYS = ("vertices", "elements", "held")
 
 
 class StoredMesh(NamedTuple):
-    """What a file has."""
+    """Contents of a mesh file."""
 
     mesh: Mesh
     held: Int[np.ndarray, " k"] | None
-    """Vertices that are held; `None` where the file names none."""
+    """Indices of fixed vertices; `None` if the file has none."""
 
 
 def load(path: str | Path) -> StoredMesh:
     """Reads and checks a file; never unpickles.
 
     Raises:
-        InputError: the file is missing or no npz, or its arrays are no mesh, or hold all or none of its vertices.
+        InputError: the file is missing or no npz, its arrays are no mesh, or `held` is malformed.
     """
     return archive.load(path, from_arrays, KEYS)
 
 
 def from_arrays(arrays: dict[str, Any]) -> StoredMesh:
-    """Checks arrays against the table above; errors as `load`."""
+    """Checks the arrays of a mesh file; errors as `load`."""
     for name in ("vertices", "elements"):
         if name not in arrays:
             found = ", ".join(arrays) or "nothing"

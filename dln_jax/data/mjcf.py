@@ -1,4 +1,4 @@
-"""A robot as the text of an MJCF file, which MuJoCo simulates and `read_robot` reads back."""
+"""Writes a robot as MJCF text, which MuJoCo simulates and `read_robot` reads back."""
 
 import xml.etree.ElementTree as ET
 from typing import Any
@@ -11,14 +11,14 @@ from dln_jax.types import InputError, require_positive
 
 
 def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
-    """The text of an MJCF file of a robot, a body for each link and a motor for each joint; nothing collides.
+    """MJCF text of a robot, with one body per link, one motor per joint and contacts disabled.
 
     Args:
-        robot: whose limits may be infinite.
-        time_step: of a simulation, s.
+        robot: robot to write; infinite limits are left out.
+        time_step: time step of the simulation, s.
 
     Raises:
-        InputError: a link that has no mass, which MuJoCo refuses, or a time step that is not positive.
+        InputError: a link has no mass, which MuJoCo refuses, or the time step is not positive.
     """
     require_positive(time_step=time_step)
     tree = robot.tree
@@ -49,7 +49,7 @@ def mjcf(robot: Robot, *, time_step: float = 0.001) -> str:
 
 
 def _inertial(name: str, theta: Any) -> dict[str, str]:
-    """Mass, centre, and moments about it."""
+    """Mass, centre of mass, and moments of inertia about it."""
     m, h, moments = parts(np.asarray(theta, float))
     if not m > 0:
         raise InputError(f"the link of joint '{name}' has a mass of {m:.3g} kg; expected a positive one in MJCF")
@@ -59,7 +59,7 @@ def _inertial(name: str, theta: Any) -> dict[str, str]:
 
 
 def _turn(rotation: Any) -> dict[str, str]:
-    """A rotation by its first two columns, which lose no digits; nothing where there is none."""
+    """A rotation as its first two columns, which keep all digits; empty for the identity."""
     return {} if np.array_equal(rotation, np.eye(3)) else {"xyaxes": _text(np.asarray(rotation)[:, :2].T)}
 
 

@@ -1,4 +1,4 @@
-"""Motions as text tables for a robot's controller: one CSV file each, time first, a column for each joint's number."""
+"""Writes motions as CSV tables for a robot controller: time first, then the positions and velocities of the joints."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from dln_jax.files import write_bytes
 from dln_jax.types import InputError, JointKind
 
 DECIMALS = 10
-"""Written of each number."""
+"""Significant digits written, and decimals to which numbers are rounded."""
 _UNITS = {"revolute": "rad", "prismatic": "m"}
 
 
@@ -26,7 +26,7 @@ def write_motion(
     """Writes t, q and qd; the header is like `t [s],q elbow [rad],..,qd elbow [rad/s]`.
 
     Raises:
-        InputError: a name with a comma, a quote or a new line, or a place where nothing can be written.
+        InputError: a name contains a comma, a quote or a line break, or the file cannot be written.
     """
     if broken := [name for name in names if set(name) & set(',"\r\n')]:
         raise InputError(f"joint {broken[0]!r} cannot be a title in CSV; rename it without commas, quotes and lines")

@@ -1,7 +1,7 @@
-"""Robots as files: the URDF or MJCF file that was read, with other inertias, armature and friction put in.
+"""Writes URDF and MJCF files with identified inertias, armature and friction in place of the original ones.
 
-Bodies that are fixed to a link move with it, and what is known is the whole: it is written into the link that the joint
-moves, and the inertias of what is fixed to it are taken out. What a format has no place for, a comment says.
+Bodies fixed to a link move with it, and only their sum is known. It is written into the link that the joint moves, and
+the inertias of bodies fixed to that link are removed. Quantities that the format cannot store go into a comment.
 """
 
 import copy
@@ -33,21 +33,21 @@ def write_robot(
     hold: Mapping[str, float] | Sequence[str] = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
-    """Writes the file `original` with the inertias of a tree, its armature where the format has it, and friction.
+    """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
 
     Args:
-        path: of the new file.
-        original: URDF or MJCF file that the tree's structure was read from; it is not changed.
-        tree: with the joints of that file, by name.
-        damping: viscous friction of each joint [d], N m s or N s/m; by default as it was.
-        coulomb: dry friction [d], N m or N; by default as it was.
-        hold: joints that the tree was read without, as `read_robot` has it. What hangs on them counts to the link
-            before them, where it is while they are held.
-        remarks: lines of the comment at the file's top.
+        path: path of the new file.
+        original: URDF or MJCF file from which the tree's structure was read; it stays unchanged.
+        tree: tree with the joints of that file, by name.
+        damping: viscous friction of each joint [d], N m s or N s/m; by default unchanged.
+        coulomb: dry friction [d], N m or N; by default unchanged.
+        hold: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
+            count towards the link before it, in the position in which the joint is locked.
+        remarks: lines of the comment at the top of the file.
 
     Raises:
-        InputError: another robot's tree, a link that no body can be, a file that includes or repeats others, or what
-            `read_robot` refuses; or `path` is `original`.
+        InputError: the tree has other joints, a link is not physically consistent, an MJCF file includes or repeats
+            elements or has locked joints, `path` is `original`, or as `read_robot`.
     """
     path, original = Path(path), Path(original)
     if path.exists() and original.exists() and path.samefile(original):
@@ -116,7 +116,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
                 f"{original} has <{element.tag}>, with bodies that are elsewhere; expected one file, as MuJoCo saves it"
             )
     for compiler in root.findall("compiler"):
-        # They would change what is written.
+        # These settings would alter the inertias written below.
         for name in ("inertiafromgeom", "settotalmass", "boundmass", "boundinertia", "balanceinertia"):
             compiler.attrib.pop(name, None)
     k = 0
@@ -130,7 +130,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
         for joint in joints:
             theta = np.asarray(tree.inertias[k], float)
             if theta.any():
-                # From the joint's anchor, where the link's frame is, to the body's.
+                # Move the parameters from the joint's anchor, the origin of the link's frame, to the body's frame.
                 mass, centre, about = _about_centre(np.asarray(moved(theta, np.eye(3), model.jnt_pos[k])))
                 entries = [about[place] for place in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
                 inertial = ET.Element("inertial", pos=_text(centre), mass=repr(mass), fullinertia=_text(entries))
@@ -143,7 +143,7 @@ def _into_mjcf(original: Path, root: ET.Element, model: Any, tree: Tree, *, damp
 
 
 def _bodies(root: ET.Element) -> Iterator[tuple[ET.Element, bool]]:
-    """Bodies in the order in which MuJoCo counts them, and whether a joint moves what each is fixed to."""
+    """Bodies in MuJoCo's order, and whether a joint moves the parent of each."""
 
     def below(element: ET.Element, moves: bool) -> Iterator[tuple[ET.Element, bool]]:
         for child in element:
@@ -158,7 +158,7 @@ def _bodies(root: ET.Element) -> Iterator[tuple[ET.Element, bool]]:
 
 
 def _own(body: ET.Element, tag: str) -> Iterator[ET.Element]:
-    """Elements of a body itself, frames within it included."""
+    """Child elements of a body, including those in its frames."""
     for child in body:
         if child.tag == tag:
             yield child
@@ -167,7 +167,7 @@ def _own(body: ET.Element, tag: str) -> Iterator[ET.Element]:
 
 
 def _below(fixed: dict[Any, list[Any]], link: Any) -> list[Any]:
-    """A link, and all that is fixed to it."""
+    """A link and all links fixed to it."""
     found = [link]
     for each in found:
         found.extend(fixed.get(each, ()))
@@ -180,7 +180,7 @@ def _link(joint: ET.Element, which: str) -> str | None:
 
 
 def _about_centre(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass, and moments about it."""
+    """Mass, centre of mass, and moments of inertia about it."""
     m, h, moments = parts(theta)
     centre = h / m
     return float(m), centre, moments - m * (centre @ centre * np.eye(3) - centre[:, None] * centre)

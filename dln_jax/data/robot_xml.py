@@ -1,4 +1,4 @@
-"""XML of robots' files, refused where it is no URDF or MJCF file or larger than any robot's."""
+"""Parses the XML of robot files; refuses other formats and files larger than any robot's."""
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -10,17 +10,17 @@ from dln_jax.files import is_file
 from dln_jax.types import InputError
 
 LARGEST = 64 * 2**20
-"""Bytes of a file."""
+"""Largest file, bytes."""
 MOST_JOINTS = 200
 MOST_ELEMENTS = 20_000
 DEEPEST = 3 * MOST_JOINTS
-"""Elements within each other: an MJCF file nests a body, perhaps in a frame, for each joint."""
+"""Deepest nesting of elements: per joint, MJCF nests a body and perhaps a frame."""
 REPEATING = ("replicate", "composite", "flexcomp")
-"""Elements of MJCF that stand for many."""
+"""MJCF elements that stand for many."""
 
 
 class _Elements(ET.TreeBuilder):
-    """Builds elements, and refuses more of them than any robot has, which MuJoCo would compile for minutes."""
+    """Builds elements, and refuses more than any robot has, since MuJoCo would compile such a file for minutes."""
 
     depth = count = 0
 
@@ -40,7 +40,7 @@ class _Elements(ET.TreeBuilder):
 
 
 def _whole(text: str) -> float:
-    """The largest of the whole numbers in an attribute, infinite where they are none."""
+    """The largest number in an attribute; infinite if it is not numeric."""
     try:
         return max(map(float, text.split()), default=0.0)
     except ValueError:
@@ -48,7 +48,7 @@ def _whole(text: str) -> float:
 
 
 def parsed(path: Path) -> ET.Element:
-    """The outer element of a URDF or MJCF file, comments included; errors as `read_robot`."""
+    """The root element of a URDF or MJCF file, comments included; errors as `read_robot`."""
     if not is_file(path):
         raise InputError(f"{path}: no such file; give the URDF or MJCF file of a robot")
     try:
@@ -66,7 +66,7 @@ def parsed(path: Path) -> ET.Element:
         root = ET.fromstring(content, ET.XMLParser(target=_Elements(insert_comments=True)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (ET.ParseError, LookupError, ValueError) as error:  # the last two of encodings that Python does not know
+    except (ET.ParseError, LookupError, ValueError) as error:  # the last two for unknown encodings
         raise InputError(f"{path}: no XML ({error}); expected a URDF or MJCF file, in UTF-8") from None
     if root.tag not in ("robot", "mujoco"):
         raise InputError(f"{path}: its outer element is <{root.tag}>; expected <robot> (URDF) or <mujoco> (MJCF)")

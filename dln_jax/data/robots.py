@@ -1,6 +1,6 @@
-"""Robots from URDF and MJCF files, read by MuJoCo's compiler (extra `[robot]`): a tree, limits and friction.
+"""Reads robots from URDF and MJCF files with MuJoCo's compiler (extra `[robot]`): a tree, limits and friction.
 
-What is seen or collides is not read: meshes need not be there, unless a body's mass comes from its shapes alone.
+Visual and collision geometry is ignored, so meshes may be missing unless a body's mass is derived from its shapes.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from dln_jax.types import InputError
 
 INSTALL = "pip install 'dln-jax[robot]'"
 LARGEST_NUMBER = 1e20
-"""In SI units."""
+"""Largest admissible number, in SI units."""
 
 
 class Robot(NamedTuple):
-    """A tree, and what else its file states of each joint; what it does not state is infinite, or zero for friction."""
+    """A tree and the other joint data of its file; limits that are not stated are infinite, friction zero."""
 
     tree: Tree
     damping: Float[np.ndarray, " d"]
@@ -38,9 +38,9 @@ class Robot(NamedTuple):
     position_limits: Float[np.ndarray, "d 2"]
     """rad or m."""
     force_limits: Float[np.ndarray, "d 2"]
-    """N m or N, of the motors."""
+    """Limits of the motors, N m or N."""
     velocity_limits: Any = np.inf
-    """[d], 1/s or m/s, or one for all; a URDF states them, MJCF cannot."""
+    """[d], 1/s or m/s, or one for all; stated in URDF only, since MJCF has no such limit."""
 
 
 class _Link(NamedTuple):
@@ -52,19 +52,19 @@ class _Link(NamedTuple):
 
 
 def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = ()) -> Robot:
-    """The robot of a URDF or MJCF file.
+    """Reads a robot from a URDF or MJCF file.
 
-    Inertias of a URDF are taken as they are stated, also those that no body could have.
+    URDF inertias are read as stated, even if they are not physically consistent.
 
     Args:
-        path: of the file.
-        hold: joints that do not move, such as those of a gripper: names, where they are at zero, or positions by name,
-            rad or m. "*finger*" names all that have finger in their name. What hangs on them is fixed.
+        path: path of the file.
+        hold: joints to lock, such as those of a gripper: names (locked at zero), or positions by name, rad or m.
+            "*finger*" matches all names that contain finger. Bodies behind a locked joint become fixed.
 
     Raises:
-        InputError: MuJoCo is missing; the file is not there, broken or cyclic; a joint that is not held is of another
-            kind than revolute, continuous or prismatic, follows another, or states limits that are NaN, equal, swapped
-            or half stated; one that is held is not there; nothing moves; or a link that moves has no mass.
+        InputError: MuJoCo is missing; the file is missing, malformed or cyclic; a joint that is not locked is neither
+            revolute, continuous nor prismatic, mimics another, or has limits that are NaN, equal, swapped or half
+            stated; a joint to lock does not exist; no joint moves; or a moving link has no mass.
     """
     path, root = Path(path), parsed(Path(path))
     try:
@@ -81,9 +81,9 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
 def opened(
     path: Path, root: ET.Element, hold: Mapping[str, float] | Sequence[str]
 ) -> tuple[Any, Any, dict[str, float]]:
-    """MuJoCo, its model of a file with this outer element, and the positions of joints that are held, by name.
+    """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
-    Of a URDF without shapes and inertias; errors as `read_robot`.
+    For a URDF, shapes and inertias are left out. Errors as `read_robot`.
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())
@@ -96,12 +96,12 @@ def opened(
 
 
 def joint_names(model: Any) -> list[str]:
-    """Of MuJoCo's joints."""
+    """Names of MuJoCo's joints."""
     return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
 
 
 def _matching(hold: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
-    """Positions of the joints that are held, by their whole names."""
+    """Positions of the locked joints by full name."""
     positions = hold if isinstance(hold, Mapping) else dict.fromkeys(hold, 0.0)
     found: dict[str, float] = {}
     for pattern, position in positions.items():
@@ -131,7 +131,7 @@ def _compiled(path: Path, root: ET.Element, held: Collection[str]) -> tuple[Any,
 
 @contextlib.contextmanager
 def quiet(mujoco: Any) -> Iterator[None]:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder; its data still count the warnings."""
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the working folder; its data still count warnings."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -155,7 +155,7 @@ def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> 
 
 
 def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[str]) -> None:
-    """Raises `InputError` unless joints that are not held move freely, about or along one axis each."""
+    """Raises `InputError` unless every joint that is not locked moves freely about or along one axis."""
     others = {int(mujoco.mjtJoint.mjJNT_BALL): "a ball", int(mujoco.mjtJoint.mjJNT_FREE): "free"}
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind in others and name not in held:
@@ -163,7 +163,7 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[st
                 f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: hold it, if so"
             )
     moving = {k for k, name in enumerate(names) if name not in held}
-    # Equal joints, and tendons over joints, tie nothing where all of those are held.
+    # Equality constraints and tendons between locked joints have no effect.
     joints, over = int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtWrap.mjWRAP_JOINT)
     tied = {int(k) for each in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in each}
     if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
@@ -181,14 +181,14 @@ def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[s
     links: list[_Link] = []
     inertias: list[np.ndarray] = []
     moving: list[int] = []
-    # Frame of each body in that of the link that it moves with, -1 for the ground.
+    # Frame of each body relative to the link it moves with; -1 is the ground.
     carried: list[tuple[int, np.ndarray, np.ndarray]] = [(-1, np.eye(3), np.zeros(3))]
     for body in range(1, model.nbody):
         parent, R, p = carried[model.body_parentid[body]]
         p = p + R @ model.body_pos[body]
         R = R @ _matrix(mujoco, model.body_quat[body])
         for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-            # The link's frame is at the joint; the body's is behind it.
+            # The link's frame is at the joint's anchor, the body's frame behind it.
             anchor = model.jnt_pos[joint]
             axis = np.array(model.jnt_axis[joint])
             if names[joint] in held:
@@ -219,7 +219,7 @@ def _robot(mujoco: Any, model: Any, held: Mapping[str, float], stated: Mapping[s
 
 
 def _require_numbers(robot: Robot) -> None:
-    """Raises `InputError` for numbers that no robot has."""
+    """Raises `InputError` for numbers out of the range of real robots."""
     tree = robot.tree
     frames = {"inertia": tree.inertias, "position": tree.positions, "rotation": tree.rotations, "axis": tree.axes}
     losses = {"damping": robot.damping, "dry friction": robot.coulomb, "armature": tree.armature}
@@ -233,7 +233,7 @@ def _require_numbers(robot: Robot) -> None:
 
 
 def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
-    """The inertial parameters of a body of MuJoCo's in its frame."""
+    """Inertial parameters of one of MuJoCo's bodies in the frame of the body."""
     turn = _matrix(mujoco, model.body_iquat[body])
     about = turn @ np.diag(model.body_inertia[body]) @ turn.T
     return np.asarray(inertial_parameters(model.body_mass[body], model.body_ipos[body], about))
@@ -242,7 +242,7 @@ def _body(mujoco: Any, model: Any, body: int) -> np.ndarray:
 def _held(
     mujoco: Any, kind: str | None, anchor: np.ndarray, axis: np.ndarray, position: float, R: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The frame of a body behind a joint that is held, as that of one fixed."""
+    """Frame of the body behind a locked joint, relative to the link it moves with."""
     if kind == "prismatic":
         return R, p + R @ axis * position
     if kind is None or position == 0:
@@ -254,7 +254,7 @@ def _held(
 
 
 def _moves_mass(links: list[_Link], inertias: list[np.ndarray], link: int) -> bool:
-    """Whether a link or one that hangs on it has mass."""
+    """Whether a link or one of its descendants has mass."""
     behind = {link}
     for other, each in enumerate(links):
         if each.parent in behind:

@@ -1,17 +1,17 @@
-"""The one schema of trajectory files: what is in an npz or a CSV file, how it is read, checked and written.
+"""Schema of trajectory files (npz or CSV): how they are read, checked and written.
 
 Samples of all trajectories are concatenated on axis 0.
 
 | key | shape | unit | |
 |---|---|---|---|
 | `t` | [N] | s | time within its trajectory |
-| `q`, `qd`, `qdd` | [N, d] | rad or m, 1/s, 1/s² | rates that are absent are estimated from `q` |
+| `q`, `qd`, `qdd` | [N, d] | rad or m, 1/s, 1/s² | missing rates are estimated from `q` |
 | `tau` | [N, d] | N m or N | zero if absent |
 | `p`, `pd` | [N, d] | | optional canonical momentum and its rate |
 | `tau_inertial`, `tau_coriolis`, `tau_gravity` | [N, d] | N m or N | optional true decomposition |
 | `trajectory` | [N] int | | index of a sample's trajectory; any number >= 0 without `label`; one recording if absent |
-| `label` | [K] str | | a name for each trajectory; their numbers if absent, which are then counted from 0 |
-| `joint_names` | [d] str | | optional, the joint of each column |
+| `label` | [K] str | | name of each trajectory; if absent, its number, and trajectories are renumbered from 0 |
+| `joint_names` | [d] str | | optional, joint of each column |
 | `needs` | str | | optional JSON of `dln_jax.types.Needs` |
 """
 
@@ -33,7 +33,7 @@ RATES = ("qd", "qdd")
 OPTIONAL = ("tau", "p", "pd", "tau_inertial", "tau_coriolis", "tau_gravity")
 KEYS = ("t", "q", *RATES, *OPTIONAL, "trajectory", "label", "joint_names", "needs")
 LARGEST_INDEX = 2**53
-"""Up to which float64 tells whole numbers apart."""
+"""Largest integer up to which float64 is exact."""
 
 
 class Trajectories(NamedTuple):
@@ -54,7 +54,7 @@ class Trajectories(NamedTuple):
     needs: Needs | None = None
     joint_names: np.ndarray | None = None
     estimated: tuple[str, ...] = ()
-    """Keys that were absent: rates estimated by finite differences, torques taken as zero."""
+    """Keys that were absent: rates estimated by finite differences, torques set to zero."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -66,9 +66,9 @@ def load(path: str | Path, *, rate: float | int | None = None, units: str | None
     """Reads and checks an npz or CSV file; never unpickles.
 
     Args:
-        path: of the file; CSV if its name ends in .csv (see `data.csv_tables`).
-        rate: Hz, at which every trajectory was sampled, for a file without t.
-        units: of a CSV file's titles without a unit, "si" or "degrees".
+        path: path of the file; CSV if its name ends in .csv (see `data.csv_tables`).
+        rate: sampling rate of all trajectories, Hz, for a file without t.
+        units: units of CSV titles without one, "si" or "degrees".
 
     Raises:
         InputError: the file is missing, is no npz, holds pickled objects, is malformed CSV, or breaks the schema.
@@ -79,7 +79,7 @@ def load(path: str | Path, *, rate: float | int | None = None, units: str | None
 def load_arrays(
     path: str | Path, from_arrays: Callable[[dict[str, Any]], Data], *, rate: float | int | None, units: str | None
 ) -> Data:
-    """What `from_arrays` makes of a file's arrays, which have t and trajectory; arguments and errors as `load`."""
+    """Result of `from_arrays` on a file's arrays, completed with t and trajectory; arguments and errors as `load`."""
     if units is not None and Path(path).suffix.lower() != ".csv":
         raise InputError(f"{path!s:.200}: units are for CSV; the arrays of an npz file are in SI units")
     return archive.load(
@@ -91,13 +91,13 @@ def load_arrays(
 
 
 def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, Any]:
-    """The arrays with t, by the rate where it is absent, and with trajectory, one recording where that is.
+    """Completes the arrays with t, from the rate, and with trajectory, as one recording, if they are absent.
 
     Raises:
-        InputError: neither t nor a rate, both, or a rate that is not positive.
+        InputError: there is neither t nor a rate, there are both, or the rate is not positive.
     """
     if "q" not in arrays:
-        return arrays  # which `from_arrays` refuses
+        return arrays  # `from_arrays` refuses them
     samples = len(np.atleast_1d(np.asarray(arrays["q"])))
     if rate is None and "t" not in arrays:
         raise InputError("key 't' is missing; add the time of each sample in seconds, or say --rate HZ")
@@ -112,7 +112,7 @@ def with_times(arrays: dict[str, Any], rate: float | int | None) -> dict[str, An
 
 
 def column(data: Trajectories, key: str) -> np.ndarray:
-    """One of the arrays that data may lack; `InputError` where they do."""
+    """One of the optional arrays; raises `InputError` if it is absent."""
     array = getattr(data, key)
     if array is None:
         raise InputError(f"the data have no {key}, which is needed here; add it")
@@ -161,10 +161,11 @@ def from_arrays(arrays: dict[str, Any]) -> Trajectories:
 
 
 def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> None:
-    """Writes a file that `load` reads; keys that were estimated are left out, so that the file says only what is known.
+    """Writes a file that `load` reads; estimated keys are left out, so the file holds only measured data.
 
     Raises:
-        InputError: the file exists and `overwrite` is false, its folder does not exist, or the data break the schema.
+        InputError: the name does not end in .npz, the file exists and `overwrite` is false, its folder does not exist,
+            or the data break the schema.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -190,7 +191,7 @@ def save(path: str | Path, data: Trajectories, *, overwrite: bool = False) -> No
 
 
 def momenta(data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """p and pd of data that must have them. Raises InputError where they have not."""
+    """p and pd; raises `InputError` if the data have none."""
     if data.p is None or data.pd is None:
         raise InputError("the data have no p and pd, which a field is fitted to; add them, or match trajectories")
     return data.p, data.pd
@@ -246,7 +247,7 @@ def time_derivative(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, *
     Central inside, one-sided at the ends, any spacing; differences never reach across trajectories.
 
     Raises:
-        InputError: a trajectory has fewer than three samples; `name` is the key that was to be estimated.
+        InputError: a trajectory has fewer than three samples; the message names `name`, the key to be estimated.
     """
     result = np.empty_like(values)
     for index in np.unique(trajectory):

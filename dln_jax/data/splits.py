@@ -1,4 +1,4 @@
-"""Splits by trajectory, never by sample: neighbouring samples of one trajectory are almost copies."""
+"""Splits by trajectory, never by sample, since neighbouring samples of a trajectory are almost copies."""
 
 import hashlib
 from collections.abc import Sequence
@@ -13,13 +13,13 @@ PER_SAMPLE = ("t", "q", "qd", "qdd", "tau", "trajectory", "p", "pd", "tau_inerti
 
 
 LEAST_TRAJECTORIES = 3
-"""That can be split: one to train on, one to validate by and one for the test."""
+"""Fewest trajectories for a split: one each for training, validation and test."""
 BLOCKS = 10
-"""Of time, into which each trajectory is cut where there are fewer."""
+"""Number of time blocks per trajectory if there are too few trajectories."""
 
 
 class Split(NamedTuple):
-    """Three disjoint sets of trajectories: fitted to, selected by, and reported on."""
+    """Three disjoint sets of trajectories: for training, for model selection and for the final test."""
 
     train: Trajectories
     validation: Trajectories
@@ -27,25 +27,25 @@ class Split(NamedTuple):
 
 
 def select_samples(data: Trajectories, samples: np.ndarray | slice) -> Trajectories:
-    """The samples of a mask, of indices or of a slice; labels stay as they are."""
+    """Selects samples by a mask, indices or a slice; labels stay unchanged."""
     return data._replace(**{key: getattr(data, key)[samples] for key in PER_SAMPLE if getattr(data, key) is not None})
 
 
 def select(data: Trajectories, indices: Sequence[int] | np.ndarray) -> Trajectories:
-    """The trajectories with these indices; indices and labels stay as they are."""
+    """Selects trajectories by their indices; indices and labels stay unchanged."""
     return select_samples(data, np.isin(data.trajectory, indices))
 
 
 def every(data: Trajectories, step: int) -> Trajectories:
-    """Every so manyth sample."""
+    """Keeps every `step`-th sample."""
     return select_samples(data, slice(None, None, step))
 
 
 def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
-    """All samples, or so many that are drawn, in their order.
+    """At most `most` samples, drawn by the seed and kept in their order.
 
     Raises:
-        InputError: no samples to be drawn, or a seed out of range.
+        InputError: `most` is not positive, or the seed is out of range.
     """
     require_positive(samples=most)
     require_seed(seed)
@@ -57,12 +57,12 @@ def drawn(data: Trajectories, most: int, seed: int) -> Trajectories:
 
 
 def in_blocks(data: Trajectories, blocks: int) -> Trajectories:
-    """Each trajectory cut into so many blocks of time, which are trajectories of their own, "LABEL[0]" and so on.
+    """Cuts every trajectory into blocks of time that become trajectories of their own: "LABEL[0]" and so on.
 
-    Rates that were estimated stay as they are. Neighbouring blocks are nearly alike at their common end.
+    Estimated rates stay unchanged. Neighbouring blocks are nearly identical at their common end.
 
     Raises:
-        InputError: a trajectory with fewer samples than blocks.
+        InputError: a trajectory has fewer samples than blocks.
     """
     require_positive(blocks=blocks)
     numbers, labels = np.empty_like(data.trajectory), []
@@ -93,14 +93,14 @@ def label_indices(data: Trajectories, labels: Sequence[str]) -> np.ndarray:
 def split(
     data: Trajectories, *, test: Sequence[str] | None = None, validation_share: float = 0.1, seed: int = 0
 ) -> Split:
-    """Splits off the test trajectories, and validation trajectories from the rest.
+    """Splits trajectories into test, validation and training sets.
 
     Without test labels every sixth trajectory is a test. The validation trajectories (at least one) are drawn by the
-    seed from the rest, so that no choice made by validation has seen the test.
+    seed from the rest, so model selection never sees the test.
 
     Raises:
-        InputError: an unknown label or one without samples, fewer than one trajectory left for training, a test
-            trajectory that is also among the rest, or a seed out of range.
+        InputError: a label is unknown or has no samples, fewer than two trajectories remain for training and
+            validation, a test trajectory is a copy of another one, or the seed is out of range.
     """
     require_seed(seed)
     present = np.unique(data.trajectory)
@@ -136,10 +136,10 @@ def hold_out(data: Trajectories, share: float, seed: int) -> tuple[Trajectories,
 
 
 def held_out(count: int, share: float, what: str) -> int:
-    """How many of so many are held out for validation: at least one, and at least one is left to train on.
+    """Number of items held out for validation; at least one is held out and one left for training.
 
     Raises:
-        InputError: fewer than two, or a share outside (0, 1).
+        InputError: fewer than two items, or a share outside (0, 1).
     """
     if count < 2:
         raise InputError(f"there are {count} {what} to train on and to validate by; expected at least 2: add {what}")
@@ -149,9 +149,9 @@ def held_out(count: int, share: float, what: str) -> int:
 
 
 def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[list[str]]:
-    """The labels of the trajectories in groups of nearly equal size, for as many splits: each is a test once.
+    """Labels in groups of nearly equal size for cross-validation: every trajectory is in one test set.
 
-    The sorted labels are permuted by the seed and cut, so that their order in a file decides nothing.
+    The sorted labels are permuted by the seed before they are cut, so the order in the file has no influence.
 
     Raises:
         InputError: fewer than two parts, or more than there are trajectories.
@@ -164,9 +164,9 @@ def partition_labels(data: Trajectories, parts: int, *, seed: int = 0) -> list[l
 
 
 def require_no_copies(seen: Trajectories, test: Trajectories) -> None:
-    """Raises `InputError` if a trajectory of the test is a copy of one that is trained on: the test would be none.
+    """Raises `InputError` if a test trajectory is a copy of one in the training data, which would void the test.
 
-    States that do not change, such as single samples, may be alike without being copies.
+    Trajectories of constant state, such as single samples, are not compared.
     """
 
     def contents(data: Trajectories) -> dict[bytes, int]:

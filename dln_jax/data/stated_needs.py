@@ -1,4 +1,4 @@
-"""`Needs` as users state them: JSON in a data file, on the command line, and in a stored model."""
+"""Reads `Needs` from JSON, as stated in a data file, on the command line or in a stored model."""
 
 import json
 import reprlib
@@ -14,7 +14,7 @@ JOINTS = get_args(JointKind)
 
 
 def needs_from_text(text: str) -> Needs:
-    """`Needs` from their JSON; errors as `needs_from_json`, and text that is no JSON."""
+    """`Needs` from JSON text; errors as `needs_from_json`, also for text that is not JSON."""
     try:
         stated = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -24,7 +24,7 @@ def needs_from_text(text: str) -> Needs:
 
 
 def needs_from_json(stated: Any) -> Needs:
-    """`Needs` from the plain values of its JSON.
+    """`Needs` from parsed JSON.
 
     Raises:
         InputError: unknown or missing fields, or values of the wrong kind.
@@ -57,7 +57,7 @@ def needs_from_json(stated: Any) -> Needs:
 
 
 def _rows(key: str, stated: Any, joints: int) -> tuple[tuple[float, ...], ...] | None:
-    """A matrix with a row for each joint."""
+    """Reads a matrix with one row per joint."""
     if stated is None:
         return None
     rows = stated if isinstance(stated, list | tuple) else ()

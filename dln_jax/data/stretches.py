@@ -1,4 +1,4 @@
-"""Stretches of a trajectory without a gap, a time step much longer than the others, and windows within them."""
+"""Segments of a trajectory without a gap (a time step much longer than the others), and windows within them."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -7,16 +7,16 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
 GAP = 1.5
-"""Times the median time step of its trajectory: a longer step is a gap."""
+"""A step longer than this multiple of its trajectory's median step is a gap."""
 
 
 def stretches(
     t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
 ) -> list[Int[np.ndarray, " n"]]:
-    """Indices of the samples of each stretch of one trajectory without a step above `gap` times its median step.
+    """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
 
     Raises:
-        InputError: a gap that is not longer than the median step, or no trajectory with two samples.
+        InputError: `gap` is not above 1, or no trajectory has two samples.
     """
     if not gap > 1:
         raise InputError(f"gap is {gap}; expected a multiple of the median time step above 1")
@@ -31,10 +31,10 @@ def stretches(
 
 
 def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tuple[np.ndarray, np.ndarray]:
-    """Samples of consecutive windows [W, T], each of which begins with the last one of that before; and their weight.
+    """Sample indices [W, T] of consecutive windows, which share their end samples, and the weights of the samples.
 
-    Windows lie within stretches without a gap. What remains of a stretch is a shorter window, which repeats its last
-    sample with weight 0.
+    Windows lie within segments. The remainder of a segment is a shorter window, padded with its last sample at weight
+    0.
 
     Raises:
         InputError: a length below 2, or no two samples without a gap between them.

@@ -1,4 +1,4 @@
-"""What a URDF file says of inertias, in the frames of its links, whether or not a body could have them."""
+"""Reads inertias from a URDF file in the frames of its links, physically consistent or not."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Collection
@@ -9,17 +9,17 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters, moved
 from dln_jax.types import InputError
 
 MOVING = ("revolute", "continuous", "prismatic")
-"""Types of joints that move."""
+"""Joint types that move."""
 NUMBERS = {"limit": ("lower", "upper", "effort", "velocity"), "dynamics": ("damping", "friction")}
-"""Attributes of a joint's elements that are numbers."""
+"""Numeric attributes of a joint's child elements."""
 MOMENTS = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
 
 
 def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
-    """The ten inertial parameters of each link that states them, by name.
+    """Inertial parameters [10] of every link that states them, by name.
 
     Raises:
-        InputError: one that is incomplete, no number, or has a mass below zero.
+        InputError: an <inertial> is incomplete, not numeric or has a negative mass.
     """
     found = {}
     for link in root.findall("link"):
@@ -37,7 +37,7 @@ def link_inertias(root: ET.Element) -> dict[str, np.ndarray]:
 
 
 def require_joints(root: ET.Element, held: Collection[str], most: int) -> None:
-    """Raises `InputError` for joints that MuJoCo would make something else of, or for more than `most` that move."""
+    """Raises `InputError` for joints that MuJoCo would misread, or for more than `most` moving joints."""
     moving = [joint for joint in root.findall("joint") if joint.get("name", "") not in held]
     moving = [joint for joint in moving if joint.get("type") != "fixed"]
     if len(moving) > most:
@@ -64,7 +64,7 @@ def require_joints(root: ET.Element, held: Collection[str], most: int) -> None:
 
 
 def without_inertias(root: ET.Element) -> ET.Element:
-    """The file as MuJoCo is to have it: no shapes, every link a body of its own, with an inertia that it takes."""
+    """Prepares the file for MuJoCo: no shapes, every link a body of its own, and unit inertias that MuJoCo accepts."""
     for link in root.iter("link"):
         for part in [*link.findall("visual"), *link.findall("collision"), *link.findall("inertial")]:
             link.remove(part)
@@ -95,7 +95,7 @@ def _vector(origin: ET.Element | None, key: str) -> np.ndarray:
 
 
 def _turned(rpy: np.ndarray) -> np.ndarray:
-    """About the fixed axes x, y, z in turn."""
+    """Rotation matrix of roll, pitch and yaw about the fixed axes x, y, z, in this order."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])

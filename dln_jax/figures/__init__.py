@@ -1,4 +1,4 @@
-"""Pictures of data, models and motions; each function returns a Matplotlib figure or writes a GIF."""
+"""Figures of data, models and motions; every function returns a Matplotlib figure or writes a GIF."""
 
 from dln_jax.figures.animations import write_frame_gif, write_motion_gif
 from dln_jax.figures.benchmarks import call_times, cost_curves, cost_panels, cost_points, error_against_time

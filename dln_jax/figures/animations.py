@@ -1,4 +1,4 @@
-"""Animated GIFs: written frame by frame; films of systems, and motions in the plane, the model's over the truth's."""
+"""Animated GIFs, written frame by frame: image sequences, and motions in the plane over the truth."""
 
 import tempfile
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from dln_jax.types import InputError, require_positive
 
 DPI = 100
 ONLY_TRUTH, ONLY_MODEL = np.array([0.0, 0.45, 0.7]), np.array([1.0, 0.55, 0.3])
-"""Colours of what a film has and the other has not; together they are white."""
+"""Colours of pixels present in only one of two films; their sum is white."""
 
 
 def write_gif(
@@ -32,21 +32,21 @@ def write_gif(
     frames_per_second: float,
     title: str = "",
 ) -> None:
-    """Writes what `show(frame)` draws into the figure, for each frame, under a title with the time t[frame] in s.
+    """Writes a GIF by calling `show(frame)` for every frame, with the title and the time t[frame] in s above.
 
     Raises:
-        InputError: the file cannot be written; it is written whole or not at all.
+        InputError: the file cannot be written; it is written completely or not at all.
     """
     heading = figure.suptitle("", fontsize=style.TEXT, family="monospace")
     writer = PillowWriter(fps=frames_per_second)  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as folder:
-        written = Path(folder) / "drawn.gif"  # Pillow knows the format by the ending
+        written = Path(folder) / "drawn.gif"  # Pillow takes the format from the suffix
         with writer.saving(figure, str(written), DPI):
             for frame in frames:
                 show(frame)
                 heading.set_text(f"{title}  t = {t[frame]:5.2f} s".strip())
                 writer.grab_frame()
-                # The axes keep the places that the first frame gave them.
+                # Fix the axes at the positions of the first frame.
                 figure.set_layout_engine("none")
         write_bytes(path, written.read_bytes())
 
@@ -58,12 +58,12 @@ def write_frame_gif(
     *,
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes square pictures of systems, each over the truth's where "truth" is among them: what both have is white.
+    """Writes square images of systems as a GIF, each over the truth if "truth" is among them: white pixels agree.
 
-    Pictures are intensities in [0, 1], row by row; what lies outside is drawn as the nearest. Times are in s.
+    Images are intensities in [0, 1], row by row; values beyond are clipped. Times are in s.
 
     Raises:
-        InputError: no system, or pictures that are not square or not as many as times.
+        InputError: no system, images that are not square, or another number of images than times.
     """
     require_positive(frames_per_second=frames_per_second)
     _require_common_length(t, {name: pictures.shape[0] for name, pictures in frames.items()})
@@ -102,15 +102,15 @@ def write_motion_gif(
     units: tuple[str, str] = ("", ""),
     frames_per_second: float = 20.0,
 ) -> None:
-    """Writes one motion as each system has it, a panel each, over the truth's in black where "truth" is among them.
+    """Writes one motion of every system in a panel of its own, over the truth in black if "truth" is among them.
 
     With one coordinate a panel is the phase plane; with 2 n coordinates it shows n bodies in a plane.
 
-    `tail` are the samples that a body leaves behind it, `stride` those between two frames of the GIF; `units` are those
-    of q and of p, of one coordinate, empty where they have none.
+    `tail` is the number of samples in the trace behind a body, `stride` the number of samples between two frames;
+    `units` are those of one coordinate of q and of p, empty for none.
 
     Raises:
-        InputError: no motion, or motions of several lengths.
+        InputError: no motion, or motions of different lengths.
     """
     require_positive(tail=tail, stride=stride, frames_per_second=frames_per_second)
     t = next(iter(motions.values())).t if motions else np.zeros(0)

@@ -1,4 +1,4 @@
-"""Figures of costs: growing costs as lines, errors against costs as lines and as points, and error against seconds."""
+"""Figures of costs: cost against size, errors against cost as lines or points, and errors against training time."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,12 +14,12 @@ Numbers = Sequence[float | int] | np.ndarray
 Line = tuple[Numbers, Numbers]
 """(x, y)."""
 EXACT = 1e-15
-"""Squared errors below are those of rounding: they are drawn in a band of their own at the lower edge."""
+"""Squared errors below this are rounding errors and drawn in a separate band at the lower edge."""
 FRONT = "front: nothing as cheap is more accurate"
 
 
 def cost_curves(lines: Mapping[str, Line], *, x: str, y: str, title: str) -> Figure:
-    """Lines in a plane with a logarithmic axis wherever values span a decade, named at their ends."""
+    """Lines labelled at their ends, with logarithmic axes if values span a decade."""
     figure, [[axis]] = style.figure(height=3.4)
     colours = style.colours_of(lines)
     for number, (name, line) in enumerate(lines.items()):
@@ -35,9 +35,9 @@ def cost_curves(lines: Mapping[str, Line], *, x: str, y: str, title: str) -> Fig
 
 
 def cost_panels(lines: Mapping[str, Mapping[str, Line]], *, x: str, y: str | Sequence[str], columns: int = 2) -> Figure:
-    """A panel of lines for each title, with one legend; a line "NAME, learned" has the colour of NAME and is dashed.
+    """One panel of lines per title, with one legend; a line "NAME, learned" has the colour of NAME and is dashed.
 
-    `y` names the axis of all panels, or of each.
+    `y` labels the axis of all panels, or of each.
     """
     columns = min(columns, len(lines))
     rows = -(-len(lines) // columns)
@@ -82,9 +82,10 @@ def cost_points(
     front: bool = False,
     exact: float | None = None,
 ) -> Figure:
-    """Points named "MODEL, VARIANT": the model's colour, named at the right, and a marker for each variant.
+    """Points named "MODEL, VARIANT": a colour per model, named at the right, and a marker per variant.
 
-    Low and left is good where a `front` is drawn. Heights below `exact` are drawn in a band of their own.
+    With `front`, low and left is good, and the Pareto front is drawn. Heights below `exact` are drawn in a separate
+    band.
     """
     figure, [[axis]] = style.figure(height=4.0)
     models, variants = (list(dict.fromkeys(name.split(", ")[half] for name in places)) for half in range(2))
@@ -113,9 +114,9 @@ def cost_points(
 
 
 def call_times(panels: Mapping[str, Mapping[str, Mapping[str, Mapping[str, float]]]], *, x: str) -> Figure:
-    """Times by title, model, whose code and way to call it: a line for each model, which rivals stand below.
+    """Call times by title, model, owner of the code and way to call it: one line per model, with rivals below our own.
 
-    The first owner is ours; each has a colour, and each way a marker.
+    The first owner is ours. Colours show owners, markers ways.
     """
     sizes = [len(models) for models in panels.values()]
     height = 0.42 * sum(sizes) + 0.55 * len(sizes) + 0.9
@@ -148,10 +149,10 @@ def call_times(panels: Mapping[str, Mapping[str, Mapping[str, Mapping[str, float
 
 
 def error_against_time(curves: Mapping[str, Line]) -> Figure:
-    """Error against seconds of training, a curve or a point for each name, and the Pareto front: a panel per data set.
+    """Error against training time, one curve or point per name, with the Pareto front; one panel per dataset.
 
-    Names are `model/data` or `model/data/optimiser`. Adam is dashed, and hollow at its end. A point is on the front if
-    nothing as quick has a lower error; what is exact to rounding is left out of it.
+    Names are `model/data` or `model/data/optimiser`. Adam is dashed with a hollow end marker. A point is on the front
+    if nothing as fast has a lower error; results exact to rounding are left out of it.
     """
     parts = {name: name.split("/") for name in curves}
     datasets = list(dict.fromkeys(part[1] for part in parts.values()))
@@ -186,7 +187,7 @@ def error_against_time(curves: Mapping[str, Line]) -> Figure:
 
 
 def _look(name: str, names: Sequence[str]) -> tuple[str, str]:
-    """Colour and marker: a model's own, else by the place among the names."""
+    """Colour and marker: those of a known model, else by the position among the names."""
     if name in style.MODELS:
         return style.MODELS[name]
     number = names.index(name) % len(style.MARKERS)
@@ -194,7 +195,7 @@ def _look(name: str, names: Sequence[str]) -> tuple[str, str]:
 
 
 def _scale(axis: Axes, lines) -> None:
-    """Logarithmic where values span a decade; a few places of x are ticks themselves."""
+    """Logarithmic axes if values span a decade; a few distinct x values become the ticks."""
     lines = list(lines)
     places = sorted({float(place) for x, _ in lines for place in x})
     axis.set_xscale(style.scale_of(places))
@@ -212,7 +213,7 @@ def _front(axis: Axes, points: list[tuple[float, float]]) -> None:
 
 
 def exact_ground(heights: Sequence[float], exact: float | None) -> float:
-    """Where exact heights are drawn: two decades below the least of the others."""
+    """Height at which exact results are drawn: two decades below the lowest other one."""
     if exact is None:
         return 0.0
     inexact = [height for height in heights if height >= exact]
@@ -220,7 +221,7 @@ def exact_ground(heights: Sequence[float], exact: float | None) -> float:
 
 
 def exact_band(axis: Axes, ground: float) -> None:
-    """Shades the strip around the ground, and names it in the place of the ticks that would lie in it."""
+    """Shades the band around the ground and labels it "exact" in place of its ticks."""
     bottom, top = ground / 10, ground * 10
     axis.axhspan(bottom, top, color="0.95", zorder=-1, linewidth=0)
     axis.set_ylim(bottom=bottom)

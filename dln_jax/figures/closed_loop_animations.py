@@ -1,4 +1,4 @@
-"""Animated GIFs of closed loops: the machine as it moves, and its control between the limits beside it."""
+"""Animated GIFs of closed loops: the moving machine beside its control and limits."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,16 +14,16 @@ from dln_jax.figures.animations import DPI, write_gif
 from dln_jax.types import InputError, require_positive
 
 Drawing = Callable[[Axes, Float[np.ndarray, "T d"], int], Callable[[int], None]]
-"""(axis, q of all samples, how many of them the tip leaves a trace of) -> what draws a sample."""
+"""(axis, q of all samples, number of samples in the tip's trace) -> function that draws a sample."""
 BODY, POLE, TIP, GROUND = "#3b4252", "#2e6fa7", style.VERMILLION, "0.72"
 TRACE = 0.8
-"""s, for which the tip leaves a trace."""
+"""Duration of the tip's trace, s."""
 VIEW = np.deg2rad([35.0, 22.0])
-"""Azimuth and elevation of what is in space."""
+"""Azimuth and elevation of the view of machines in space, rad."""
 
 
 def cart_pole_drawing(length: float) -> Drawing:
-    """Of q = (cart, pole from upright), m and rad; `length` of the pole in m."""
+    """Drawing of a cart-pole with q = (cart, pole from upright), m and rad; `length` of the pole in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
         wide, high = 0.55 * length, 0.28 * length
@@ -51,7 +51,7 @@ def cart_pole_drawing(length: float) -> Drawing:
 
 
 def rotary_pendulum_drawing(arm: float, pole: float) -> Drawing:
-    """Of q = (arm, pole from upright), rad, seen at an angle from above; lengths in m."""
+    """Drawing of a rotary pendulum with q = (arm, pole from upright), rad, seen obliquely from above; lengths in m."""
 
     def prepare(axis: Axes, q: np.ndarray, trail: int) -> Callable[[int], None]:
         out = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0]), 0 * q[:, 0]], axis=1)
@@ -98,21 +98,21 @@ def write_closed_loop_gif(
     title: str = "",
     frames_per_second: float = 25.0,
 ) -> None:
-    """Writes a run in real time, as the machine moves and as its control goes.
+    """Writes a run in real time: the moving machine and its control.
 
     Args:
-        path: of the GIF.
-        drawing: of the machine, such as `cart_pole_drawing(length)`.
-        t: times [T], s, of any spacing below that of the frames.
+        path: path of the GIF.
+        drawing: drawing of the machine, such as `cart_pole_drawing(length)`.
+        t: times [T], s, at any spacing below that of the frames.
         q: coordinates [T, d].
-        u: the control [T], held from each time on.
-        limits: of the control, in red.
-        unit: of the control.
-        title: above the picture.
-        frames_per_second: of the GIF, and of the run.
+        u: control [T], held constant from each time on.
+        limits: limits of the control, in red.
+        unit: unit of the control.
+        title: title above the drawing.
+        frames_per_second: frame rate of the GIF, which plays the run in real time.
 
     Raises:
-        InputError: arrays of other lengths, or a run that is not finite.
+        InputError: arrays of different lengths, or coordinates that are not finite.
     """
     require_positive(frames_per_second=frames_per_second)
     t, q, u = (np.asarray(each) for each in (t, q, u))
@@ -143,7 +143,7 @@ def write_closed_loop_gif(
 
 
 def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray], None]:
-    """A pole with a bob and its trace; what draws it at a sample, from a foot."""
+    """A pole with a bob and its trace; returns the function that draws a sample from the position of the foot."""
     (trace,) = axis.plot([], [], color=TIP, linewidth=1.2, alpha=0.45, zorder=1.5)
     (pole,) = axis.plot([], [], color=POLE, linewidth=5, solid_capstyle="round", zorder=4)
     (bob,) = axis.plot([], [], "o", color=TIP, markersize=9, zorder=5)
@@ -159,7 +159,7 @@ def _rod(axis: Axes, tip: np.ndarray, trail: int) -> Callable[[int, np.ndarray],
 
 
 def _seen(points: Any) -> np.ndarray:
-    """Points of space [..., 3] as a distant eye sees them [..., 2]."""
+    """Orthographic projection of points in space [..., 3] to the drawing plane [..., 2]."""
     azimuth, elevation = VIEW
     x, y, z = np.moveaxis(np.asarray(points), -1, 0)
     right = x * np.cos(azimuth) + y * np.sin(azimuth)

@@ -1,4 +1,4 @@
-"""Figures of closed loops: traces with limits, the phase plane with what a regulator catches, and where they work."""
+"""Figures of closed loops: traces with limits, the phase plane with a regulator's region, and success over starts."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from dln_jax.types import InputError, JointKind
 
 LIMIT = style.VERMILLION
 MOST_SHOWN = 30
-"""Runs whose traces are drawn."""
+"""Largest number of runs whose traces are drawn."""
 
 
 def closed_loop_traces(
@@ -29,20 +29,20 @@ def closed_loop_traces(
     energy: Any = None,
     goal_energy: float | None = None,
 ) -> Figure:
-    """Coordinates and energy of some runs over time, the first in front, and its controls between their limits.
+    """Coordinates and energy of some runs over time, with the first in front and its controls between their limits.
 
     Args:
-        runs: K of them, along a leading axis, such as `vmap` of `simulate` gives.
-        joints: kinds; angles are shown as they are off the goal, the short way round.
-        names: of the coordinates.
-        goal: state [2 d], dashed; none by default.
-        limits: of the controls, [m] or one for all, in red.
-        unit: of the controls.
-        energy: along the runs [K, T], J.
+        runs: K runs along a leading axis, such as from `vmap` of `simulate`.
+        joints: kinds of the joints; angles are shown relative to the goal, in (-pi, pi].
+        names: names of the coordinates.
+        goal: state [2 d], dashed; zero by default.
+        limits: limits of the controls, [m] or one for all, in red.
+        unit: unit of the controls.
+        energy: energy along the runs [K, T], J.
         goal_energy: J, dashed.
 
     Raises:
-        InputError: runs without the leading axis, or names that are not as many as coordinates.
+        InputError: runs without the leading axis, or another number of names than coordinates.
     """
     x, u, d = np.asarray(runs.x), np.asarray(runs.u), len(joints)
     if x.ndim != 3 or x.shape[2] != 2 * d or (names is not None and len(names) != d):
@@ -63,7 +63,7 @@ def closed_loop_traces(
         axis.set_ylabel(f"{name}, {'rad' if kind == 'revolute' else 'm'}")
     for control in range(m):
         axis = axes[d + control, 0]
-        _curves(axis, t[:-1], u[:1, :, control], steps=True)  # of many runs one sees none
+        _curves(axis, t[:-1], u[:1, :, control], steps=True)  # many runs would hide each other
         for limit in limits:
             level = float(np.broadcast_to(limit, m)[control])
             if np.isfinite(level):
@@ -89,13 +89,13 @@ def phase_portrait(
     goal_energy: float | None = None,
     caught: tuple[Any, float] | None = None,
 ) -> Figure:
-    """Closed loops in the plane of an angle off upright and its rate, over the energy, with what a regulator catches.
+    """Closed loops in the plane of an angle from upright and its rate, over energy levels, with the regulator's region.
 
     Args:
-        angle: of the runs [K, T], rad; drawn from -pi to pi.
-        rate: likewise, rad/s.
-        energy: angles [a], rates [b] and the energy [b, a] there, whose levels are drawn.
-        goal_energy: whose level, on which the pole comes up by itself, is dashed.
+        angle: angles of the runs [K, T], rad; drawn from -pi to pi.
+        rate: their rates [K, T], rad/s.
+        energy: angles [a], rates [b] and the energy [b, a] on that grid, drawn as levels.
+        goal_energy: energy whose level, on which the pole swings up by itself, is dashed.
         caught: S [2, 2] and the level of xᵀ S x below which the regulator takes over.
     """
     figure, [[axis]] = style.figure(height=4.2)
@@ -130,9 +130,9 @@ def success_over_starts(
     *,
     labels: tuple[str, str] = ("angle from upright, rad", "rate, rad/s"),
 ) -> Figure:
-    """Starts [K, 2] in the plane of two of their coordinates, coloured by the time to the goal; a cross failed.
+    """Starts [K, 2] in the plane of two coordinates, coloured by the time to the goal; crosses failed.
 
-    `seconds` [K] are infinite, or no number, where the goal was not reached.
+    `seconds` [K] are infinite or NaN if the goal was not reached.
     """
     starts, seconds = np.asarray(starts), np.asarray(seconds)
     good = np.isfinite(seconds)
@@ -153,7 +153,7 @@ def success_over_starts(
 
 
 def _curves(axis: Axes, t: np.ndarray, values: np.ndarray, *, turning: bool = False, steps: bool = False) -> None:
-    """The first in front; gaps where an angle goes round."""
+    """Draws curves with the first in front; angles have gaps where they wrap."""
     for number, each in reversed(list(enumerate(values))):
         broken = np.concatenate([[False], np.abs(np.diff(each)) > np.pi]) & turning
         colour, width = (style.BLUE, 1.6) if number == 0 else (style.SKY, 0.6)
@@ -166,7 +166,7 @@ def _short_way(angle: np.ndarray) -> np.ndarray:
 
 
 def _angles(axis: Axes, side: Any = None) -> None:
-    """Ticks at halves of pi, the whole circle in view."""
+    """Ticks at multiples of pi / 2 over the full circle."""
     side = axis.yaxis if side is None else side
     side.set_major_locator(FixedLocator([-np.pi, -np.pi / 2, 0.0, np.pi / 2, np.pi]))
     names = {-2: "-π", -1: "-π/2", 0: "0", 1: "π/2", 2: "π"}

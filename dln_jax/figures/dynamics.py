@@ -1,4 +1,4 @@
-"""Figures of a trained model of dynamics: forces with their errors, and the paths of an arm's tip."""
+"""Figures of a trained model of dynamics: forces with their errors, and paths of an arm's tip."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,11 +13,11 @@ from dln_jax.metrics.rollouts import Motion, valid_prediction_times
 
 PARTS = {"tau": "torque", "tau_inertial": "inertial", "tau_coriolis": "Coriolis", "tau_gravity": "gravity"}
 MOST_JOINTS, MOST_MOTIONS = 4, 6
-"""Whose forces are shown."""
+"""Largest numbers of joints and motions shown."""
 MOST_PATHS = 24
-"""That are shown."""
+"""Largest number of paths shown."""
 HIGH, LOW = 0.8, 0.36
-"""Inches of a panel of forces, and of one of errors."""
+"""Height of a panel of forces and of one of errors, inches."""
 
 
 def force_decomposition(
@@ -26,11 +26,11 @@ def force_decomposition(
     *,
     model: str = "model",
 ) -> Figure:
-    """Torque and its parts over the first test motions, a column per joint: truth, model, and below the error.
+    """Torque and its parts over the first test motions, one column per joint: truth and model, with the error below.
 
-    All errors have one scale. Motions follow each other in time; single states are compared point by point.
+    All errors share one scale. Motions are joined in time; single states are compared point by point.
 
-    `data` are the test's, `predicted` [N, d] by the keys of `PARTS`; the colour is that of the model's name.
+    `data` is the test set, `predicted` [N, d] by the keys of `PARTS`; the model's name sets the colour.
     """
     shown = np.unique(data.trajectory)[:MOST_MOTIONS]
     samples = np.flatnonzero(np.isin(data.trajectory, shown))
@@ -79,7 +79,7 @@ def force_decomposition(
 
 
 def _running_time(t: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Time of motions that follow each other at the spacing of their samples."""
+    """Continuous time of motions joined at the median spacing of their samples."""
     steps = np.diff(t, prepend=t[0])
     steps[starts[1:]] = np.median(np.delete(steps, starts))
     return np.cumsum(steps)
@@ -100,15 +100,15 @@ def tip_paths(
     motions: Sequence[Motion],
     model: str = "model",
 ) -> Figure:
-    """The paths that an arm's tip draws, a panel each: the test's first, and over them the model's own.
+    """Paths of an arm's tip, one panel each, test paths first with the model's rollouts over them.
 
     Args:
-        data: all trajectories, of which those of `test` the model was not fitted to.
+        data: all trajectories, including those of `test`.
         tip: q -> position [2] in m.
-        test: as in `data`, with the same indices.
-        motions: of the model from the test's first states under its torques, as `recorded_motions`, or none; a path
-            ends where the prediction is no longer valid.
-        model: name, of which the colour is taken.
+        test: test trajectories with the same indices as in `data`.
+        motions: rollouts of the model from the test's first states under its torques, as `recorded_motions`, or none; a
+            path ends when the prediction is no longer valid.
+        model: name of the model, which sets the colour.
     """
     tested = list(np.unique(test.trajectory))
     others = [index for index in np.unique(data.trajectory) if index not in tested]

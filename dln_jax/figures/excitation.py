@@ -1,4 +1,4 @@
-"""Figure of motions that show a model's parameters: each joint's numbers within their limits, and what it was for."""
+"""Figure of excitation motions: positions, velocities and forces within limits, and the resulting condition."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,20 +10,20 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 
 MOST_JOINTS = 8
-"""That are shown."""
+"""Largest number of joints shown."""
 ROWS = {"q": "position", "qd": "velocity", "tau": "force"}
 
 
 def excitation_figure(
     data: Trajectories, limits: Mapping[str, Any], *, names: Sequence[str], conditions: Mapping[str, Sequence[float]]
 ) -> Figure:
-    """A column for each joint: q, qd and tau of every motion, dashed where its limits are; below it the conditions.
+    """One column per joint with q, qd and tau of every motion and dashed limits; conditions of the regressor below.
 
     Args:
-        data: the motions, of the same length.
-        limits: by "q", "qd" and "tau", lower and upper [d, 2]; infinite ones are not drawn.
-        names: of the joints.
-        conditions: of the regressor, by what the motions are called that have them.
+        data: the motions, of equal length.
+        limits: by "q", "qd" and "tau", lower and upper [d, 2]; infinite limits are not drawn.
+        names: names of the joints.
+        conditions: conditions of the regressor, by the name of the set of motions.
     """
     joints = min(data.degrees_of_freedom, MOST_JOINTS)
     figure = style.blank(height=5.6)

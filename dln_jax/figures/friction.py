@@ -1,4 +1,4 @@
-"""Friction of joints against their rates: curves of fits, with measured points behind, and the laws side by side."""
+"""Friction of joints against their rates: fitted curves over measured points, and the friction laws side by side."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from dln_jax.mechanics.friction import FrictionShape, unit_force
 from dln_jax.mechanics.loaded import Load, carrying
 
 MOST_POINTS = 4000
-"""Of a joint that are drawn."""
+"""Largest number of points drawn per joint."""
 MOST_COLUMNS = 4
 
 
@@ -24,14 +24,14 @@ def friction_curves(
     rate_unit: str | Sequence[str] = "rad/s",
     force_unit: str | Sequence[str] = "N m",
 ) -> Figure:
-    """A panel for each joint.
+    """Friction curves, one panel per joint.
 
     Args:
-        curves: by name, rates [N, d] of joints, in any order, and forces [N, d].
-        names: of the joints; by default their numbers.
-        measured: rates and forces [N, d], such as torque less that of the links, drawn as points, the most distant
-            hundredth of which may be out of sight.
-        rate_unit: of all, or of each.
+        curves: by name, rates [N, d] of the joints, in any order, and forces [N, d].
+        names: names of the joints; by default their numbers.
+        measured: rates and forces [N, d], such as torque minus that of the links, drawn as points; the most extreme
+            hundredth may lie out of view.
+        rate_unit: one unit for all joints, or one each.
         force_unit: likewise.
     """
     arrays = {name: tuple(np.atleast_2d(np.asarray(each, float)) for each in pair) for name, pair in curves.items()}
@@ -79,7 +79,7 @@ def _with_room(values: np.ndarray) -> tuple[float, float]:
 
 
 def friction_laws() -> Figure:
-    """Each law with typical numbers, over the rate of one joint: `docs/friction.png`."""
+    """Every law with typical coefficients, over the rate of one joint: `docs/friction.png`."""
     shape = FrictionShape(velocity_scale=0.02, stribeck_velocity=0.15, sigmoid_slope=12.0, sigmoid_shift=0.05)
     rates = jnp.linspace(-0.6, 0.6, 1201)
     sums: dict[str, dict[str, float]] = {

@@ -1,4 +1,4 @@
-"""Figures of learned functions: value, gradient and Hessian, truth beside model and error, or an ensemble's spread."""
+"""Figures of learned functions: value, gradient and Hessian of truth and model with errors, and ensembles' spread."""
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -11,10 +11,10 @@ from dln_jax.figures import style
 
 MODEL = style.colour("differential-network")
 HALO = {"color": "black", "linewidth": 3.0, "alpha": 0.3}
-"""Of the truth behind a model's curve."""
+"""Line style of the truth behind a model's curve."""
 SIGNED, POSITIVE = "RdBu_r", "viridis"
 MOST_OUTPUTS = 4
-"""Whose curves are shown."""
+"""Largest number of outputs shown."""
 TITLES = {"y": "value", "dy": "gradient", "d2y": "Hessian"}
 
 
@@ -23,7 +23,7 @@ def _keys(data: FunctionSamples) -> list[str]:
 
 
 def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """A function of one input: a column each for value, slope and curvature; below each output, its error."""
+    """A function of one input: a column each for value, slope and curvature, with the error below every output."""
     order = np.argsort(truth.x[:, 0])
     x = truth.x[order, 0]
     keys = _keys(truth)
@@ -50,8 +50,8 @@ def function_curves(truth: FunctionSamples, predicted: FunctionSamples) -> Figur
 
 
 def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """A function of two inputs on a square grid, its first output: a column per component of truth, model and error."""
-    places = range(truth.inputs)  # a component of the Hessian and its mirror image are one
+    """Maps of a function of two inputs on a square grid (first output): truth, model and error of every component."""
+    places = range(truth.inputs)  # the Hessian is symmetric
     indices = {"y": [()], "dy": [(i,) for i in places], "d2y": [(i, j) for i in places for j in places[i:]]}
     components = [(key, index) for key in _keys(truth) for index in indices[key]]
     figure, axes = style.figure(
@@ -81,7 +81,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
 
 def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """The same as surfaces: rows for value, length of the gradient and trace of the Hessian."""
+    """Surfaces of a function of two inputs: rows for value, norm of the gradient and trace of the Hessian."""
     keys = _keys(truth)
     names = {"y": "$f$", "dy": r"$|\nabla f|$", "d2y": r"trace $\nabla^2 f$"}
     scalars = {"y": np.asarray, "dy": lambda dy: np.linalg.norm(dy, axis=1), "d2y": lambda d2y: d2y.trace(0, 1, 2)}
@@ -108,9 +108,9 @@ def surfaces(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
 
 def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
-    """Model against truth for any number of inputs and outputs, all components in one cloud per quantity.
+    """Model against truth for any number of inputs and outputs, with all components of a quantity in one panel.
 
-    Give both in standard units, in which components are of comparable size.
+    Pass both in standard units, in which components are of comparable size.
     """
     keys = _keys(truth)
     figure, axes = style.figure(1, len(keys), height=7.0 / max(len(keys), 2) + 0.3)
@@ -126,16 +126,17 @@ def parity(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
 
 
 def ensemble(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
-    """An ensemble of functions of one or two inputs, inside and outside the data in [-bound, bound]."""
+    """An ensemble of functions of one or two inputs, inside and outside the training data in [-bound, bound]."""
     if truth.inputs == 1:
         return _ensemble_curves(truth, mean, spread, bound=bound)
     return _ensemble_maps(spread, bound=bound)
 
 
 def _ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: FunctionSamples, *, bound: float) -> Figure:
-    """Mean and twice the spread of an ensemble over one input, inside and outside the data in [-bound, bound].
+    """Mean and two standard deviations of an ensemble over one input, inside and outside the data in [-bound, bound].
 
-    Below, logarithmic, the spread beside the error: of a well-trained ensemble the band above is a line.
+    The lower panels compare spread and error on a logarithmic scale; for a well-trained ensemble the band above is a
+    line.
     """
     figure, axes = style.figure(2, 3, height=4.4, sharex=True, height_ratios=(3, 2))
     x = truth.x[:, 0]
@@ -164,9 +165,9 @@ def _ensemble_curves(truth: FunctionSamples, mean: FunctionSamples, spread: Func
 
 
 def _ensemble_maps(spread: FunctionSamples, *, bound: float) -> Figure:
-    """Spread of value, gradient and Hessian (root of the sum over components) over two inputs.
+    """Spread of value, gradient and Hessian (root of the sum of squares over components) over two inputs.
 
-    Logarithmic where it spans a decade. The frame is the box of the training data, [-bound, bound]².
+    Logarithmic if it spans a decade. The frame is the box of the training data, [-bound, bound]².
     """
     figure, axes = style.figure(1, 3, height=3.4, sharey=True)
     grid = [_square(spread.x[:, axis]) for axis in range(2)]
@@ -195,13 +196,13 @@ def _symbol(key: str, index: tuple[int, ...], data: FunctionSamples) -> str:
 
 
 def _square(column: np.ndarray) -> np.ndarray:
-    """The values of a square grid [N²] as [N, N]."""
+    """Reshapes the values of a square grid [N²] to [N, N]."""
     side = round(len(column) ** 0.5)
     return column.reshape(side, side)
 
 
 def _power_of_ten(values: np.ndarray) -> tuple[float, str]:
-    """What the values are to be divided by, and how a label says so; nothing for values near one."""
+    """Power of ten that scales the values, and its label; 1 and no label for values near one."""
     size = float(np.abs(values).max())
     exponent = int(np.floor(np.log10(size))) if size > 0 and np.isfinite(size) else 0
     return (1.0, "") if -2 <= exponent <= 2 else (10.0**exponent, rf", $10^{{{exponent}}}$")

@@ -1,4 +1,4 @@
-"""Torques of each joint of an identified robot, with their errors; `friction` has the curves of its friction."""
+"""Torques of an identified robot, joint by joint, with their errors; `friction` has the friction curves."""
 
 from collections.abc import Sequence
 
@@ -10,19 +10,19 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.figures import style
 
 MOST_SAMPLES = 4000
-"""That are drawn."""
+"""Largest number of samples drawn."""
 
 
 def torque_by_joint(
     data: Trajectories, predicted: Float[np.ndarray, "N d"], names: Sequence[str], units: Sequence[str]
 ) -> Figure:
-    """Measured and predicted torque and the residual, a row for each joint, over the first motion of the data.
+    """Measured and predicted torque and the residual over the first motion, one row per joint.
 
     Args:
-        data: held out.
-        predicted: torque of each sample.
-        names: of the joints.
-        units: of their forces, "N m" or "N".
+        data: held-out data.
+        predicted: predicted torque of every sample.
+        names: names of the joints.
+        units: units of their forces, "N m" or "N".
     """
     shown = np.flatnonzero(data.trajectory == data.trajectory[0])[:MOST_SAMPLES]
     t = data.t[shown]

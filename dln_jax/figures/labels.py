@@ -1,4 +1,4 @@
-"""Names written into a picture, beside what they name: at the ends of curves, and beside points where there is room."""
+"""Places labels in a figure without overlap: at the ends of curves, and beside points."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -10,14 +10,14 @@ from matplotlib.transforms import Bbox, BboxBase
 from dln_jax.figures.style import SMALL
 
 LINE = {"arrowstyle": "-", "linewidth": 0.5, "shrinkB": 3}
-"""From a label to what it names."""
+"""Style of the line from a label to its point."""
 
 
 def label_ends(axis: Axes, ends: Mapping[str, tuple[float, float]], *, colours: Mapping[str, str]) -> None:
-    """Names curves at the right edge, each at the height of its end (x, y), moved apart where they would overlap.
+    """Labels curves at the right edge, at the height of their ends (x, y), moved apart if they would overlap.
 
-    A curve whose end is not finite is named on top, with these words. Call it when the limits of the axis and the size
-    of the figure are settled.
+    A curve with a non-finite end is labelled as such at the top. Call it after the axis limits and the figure size are
+    final.
     """
     drawn = axis.figure.get_figure(root=True)
     fractions = axis.transData + axis.transAxes.inverted()
@@ -44,10 +44,11 @@ def label_ends(axis: Axes, ends: Mapping[str, tuple[float, float]], *, colours: 
 
 
 def spread(heights: Mapping[str, float], *, gap: float) -> dict[str, float]:
-    """The same heights in the same order, moved as little as leaves a gap between neighbours, and within [0, 1]."""
+    """Moves heights by the least amount that leaves a gap between neighbours, keeping their order and within [0, 1]."""
     names = sorted(heights, key=lambda name: heights[name])
     gap = min(gap, 1.0 / max(len(names) - 1, 1))
-    # Relative to a ladder of gaps, heights in order need only be nondecreasing: their isotonic regression.
+    # After k gaps are subtracted from the k-th height, the order only requires nondecreasing values: isotonic
+    # regression.
     blocks: list[tuple[float, int]] = []
     for rung, name in enumerate(names):
         blocks.append((heights[name] - rung * gap, 1))
@@ -60,26 +61,26 @@ def spread(heights: Mapping[str, float], *, gap: float) -> dict[str, float]:
 
 
 class Place(NamedTuple):
-    """Where a label stands, relative to its point."""
+    """Position of a label relative to its point."""
 
     x: int
     """-1, 0 or 1: to the left, above or below, to the right."""
     y: int
     """-1, 0 or 1: below, beside, above."""
     distance: float
-    """In points."""
+    """Distance in points."""
 
     def box(self, at: np.ndarray, width: float, height: float, pixels: float) -> Bbox:
-        """What a text of this size covers, in pixels; `pixels` are those of a point."""
+        """Bounding box of a text of this size, in pixels; `pixels` is the number of pixels per point."""
         left, bottom = at + pixels * self.distance * np.array([self.x, self.y])
         corner = left + (self.x - 1) / 2 * width, bottom + (self.y - 1) / 2 * height
         return Bbox.from_bounds(*corner, width, height)
 
 
 BESIDE = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
-"""Directions from a point in which its label may stand, the best first."""
+"""Directions in which a label may be placed, the best first."""
 NEAR, FAR = 4.0, (12.0, 22.0, 34.0)
-"""Points from a point to its label; from far a line leads back."""
+"""Distances of a label from its point, in points; a far label gets a connecting line."""
 
 
 def label_points(
@@ -90,16 +91,16 @@ def label_points(
     first: tuple[int, int] = (1, 0),
     size: float = SMALL,
 ) -> None:
-    """Writes (text, (x, y)) beside each point, where it covers least: no obstacle, no label, no edge of the axes.
+    """Places (text, (x, y)) labels beside their points, where they cover the fewest obstacles, labels and edges.
 
-    Call it when the figure is complete, since the labels take the free places of the picture that is there.
+    Call it when the figure is complete, since labels take the space that is still free.
 
     Args:
-        axis: of the points, which are in data units.
-        points: texts and places.
+        axis: axes of the points, which are in data units.
+        points: texts and positions.
         obstacles: points [n, 2] that labels should not cover.
-        first: direction from a point in which its label stands if there is room.
-        size: of the text in points.
+        first: preferred direction from a point to its label.
+        size: text size in points.
     """
     colour = "0.25"
     drawn = axis.figure.get_figure(root=True)
@@ -109,7 +110,7 @@ def label_points(
     places = [Place(*way, distance) for distance in (NEAR, *FAR) for way in dict.fromkeys((first, *BESIDE))]
     for text, point in points:
         label = axis.annotate(text, point, (0, 0), textcoords="offset points", fontsize=size, color=colour, zorder=100)
-        # Labels move nothing: their places are found in the picture without them.
+        # Labels must not change the layout, since their positions are computed without them.
         label.set_in_layout(False)
         extent = label.get_window_extent()
         at = axis.transData.transform(point)
@@ -129,6 +130,6 @@ def label_points(
 
 
 def _common(one: BboxBase, other: BboxBase) -> float:
-    """Area in square pixels."""
+    """Intersection area, square pixels."""
     both = Bbox.intersection(one, other)
     return 0.0 if both is None else both.width * both.height

@@ -1,4 +1,4 @@
-"""Pictures of a log: its spectra with the cut-off, the delay of its torques, and torque against velocity."""
+"""Figures of a log: spectra with the cut-off, the delay of torques, and torque against velocity."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,16 +10,16 @@ from dln_jax.data.encoders import Smoothed
 from dln_jax.figures import style
 
 MOST_JOINTS = 9
-"""Whose friction is shown."""
+"""Largest number of joints whose friction is shown."""
 COLUMNS = 3
 MOST_POINTS = 3000
-"""Of a joint."""
+"""Largest number of points per joint."""
 
 
 def cutoff_figure(smoothed: Smoothed) -> Figure:
-    """Spectra of q above their floors of noise, and below them the error that each cut-off is expected to leave.
+    """Spectra of q above their noise floors, and below them the expected error at every cut-off.
 
-    `smoothed` is what `data.encoders.smooth` gave without a cut-off of one's own.
+    `smoothed` comes from `data.encoders.smooth` with an automatic cut-off.
     """
     figure, axes = style.figure(2, 1, height=4.6, sharex=True, height_ratios=[1.4, 1.0])
     _spectra(axes[0, 0], smoothed)
@@ -29,7 +29,7 @@ def cutoff_figure(smoothed: Smoothed) -> Figure:
 
 
 def log_figure(examined: Examination) -> Figure:
-    """One page: spectra and cut-off, time steps or delay, and the torque that friction has part in, joint by joint."""
+    """One page: spectra and cut-off, time steps or delay, and friction against velocity for every joint."""
     smoothed = examined.smoothed
     seen = examined.on_tree.torques if examined.on_tree is not None else examined.regression
     joints = 0 if seen is None else min(examined.recording.data.degrees_of_freedom, MOST_JOINTS)

@@ -1,4 +1,4 @@
-"""Figures of motions in phase space: what each model makes of a motion, over the truth, and what its energy does."""
+"""Figures of motions in phase space: predictions over the truth, and their energy."""
 
 from collections.abc import Callable, Mapping
 
@@ -17,9 +17,9 @@ from dln_jax.types import require_positive
 Field = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(q [N, 1], p [N, 1]) -> (qd, pd)."""
 ROOM = 0.15
-"""Of the largest true value, that an axis shows above and below the truth at least."""
+"""Smallest margin of an axis above and below the truth, relative to the largest true value."""
 LEAST = 1e-17
-"""Relative errors below are not drawn apart."""
+"""Relative errors below this are drawn at this value."""
 
 
 def motion_figure(
@@ -31,13 +31,13 @@ def motion_figure(
     units: tuple[str, str, str] = ("", "", ""),
     shown: int = 0,
 ) -> Figure:
-    """One motion as each model has it over the truth, a panel each; below, its energy or another quantity over time.
+    """One motion as predicted by every model, over the truth, with its energy or another quantity over time below.
 
-    With one coordinate a panel is the phase plane, with arrows where `fields` give the rates; with 2 n coordinates it
-    shows the orbits of n bodies in a plane. The quantity stands beside its error relative to the largest true value.
+    With one coordinate a panel is the phase plane, with arrows if `fields` give the rates; with 2 n coordinates it
+    shows the orbits of n bodies in a plane. The quantity is drawn beside its error relative to the largest true value.
 
-    Of the motions by name, "truth" is drawn behind each of the others. `energies` are the `quantity` along them;
-    `units` are those of q, of p and of the quantity, empty where they have none.
+    Among the motions, "truth" is drawn behind every other one. `energies` holds the `quantity` along the motions;
+    `units` are those of q, of p and of the quantity, empty for none.
     """
     models = [name for name in motions if name != TRUTH]
     truth, plane = plane_paths(motions[TRUTH], shown), motions[TRUTH].q.shape[2] == 1
@@ -67,7 +67,7 @@ def motion_figure(
 
 
 def _over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    """The truth is dashed above the models; one that runs away leaves the picture."""
+    """The truth is dashed in front of the models; a diverging model leaves the panel."""
     for name, each in values.items():
         dash, order = ("--", 3) if name == TRUTH else ("-", 2)
         axis.plot(t, each, dash, color=style.colour(name), linewidth=1.4, zorder=order, label=name)
@@ -79,7 +79,7 @@ def _over_time(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> N
 
 
 def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    """Logarithmic, as errors of models differ by orders; a value that is exact is drawn at rounding."""
+    """Logarithmic, since errors differ by orders of magnitude; exact values are drawn at rounding level."""
     truth = values[TRUTH]
     size = float(np.abs(truth).max()) or 1.0
     relative = {name: np.maximum(abs(each - truth) / size, LEAST) for name, each in values.items() if name != TRUTH}
@@ -93,7 +93,7 @@ def _relative_errors(axis: Axes, t: np.ndarray, values: Mapping[str, np.ndarray]
 
 
 def plane_paths(motions: Motions, shown: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Curves of one motion: (q, p), or (x, y) of each body; gaps where it is not finite."""
+    """Curves of one motion: (q, p), or (x, y) of every body; gaps for non-finite values."""
     q, p = motions.q[shown], motions.p[shown]
     q, p = (np.where(np.isfinite(each), each, np.nan) for each in (q, p))
     if q.shape[1] == 1:
@@ -109,7 +109,7 @@ def _arrows(axis: Axes, field: Field, corner: float) -> None:
 
 
 def injection_figure(injection: Injection, *, shown: int = 7) -> Figure:
-    """Decoded frames before and after, the latent path, and the energies against time."""
+    """Decoded frames before and after the injection, the latent path, and the energies against time."""
     require_positive(shown=shown)
     total = len(injection.level)
     half = total // 2

@@ -1,4 +1,4 @@
-"""Figures of soft bodies in motion: their energies against time, and pictures of a few moments."""
+"""Figures of soft bodies in motion: energies against time, and snapshots."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -25,34 +25,34 @@ COLOURS = {
     TOTAL: "black",
 }
 _HIGHEST = 3.6
-"""Inches of a panel."""
+"""Largest height of a panel, inches."""
 _FADED = 0.75
-"""How much of the background an earlier picture takes on."""
+"""How far the earliest snapshot fades towards the background."""
 
 
 class Moments(NamedTuple):
-    """Pictures of one body, drawn into one panel."""
+    """Snapshots of one body, drawn into one panel."""
 
     title: str
     mesh: Mesh
     positions: Float[np.ndarray, "k n dim"]
-    """In m, of each moment."""
+    """Positions of every snapshot, m."""
     t: Float[np.ndarray, " k"]
-    """In s."""
+    """Times of the snapshots, s."""
     ground: float | None = None
-    """Rise of the ground over its run; it passes through the origin."""
+    """Slope of the ground, which passes through the origin."""
     stacked: bool = False
-    """Below each other and not in place: for bodies that move less than their own size."""
+    """Whether snapshots are drawn one below the other, for bodies that move less than their own size."""
     labelled: int | None = None
-    """Vertex beside which the times stand; above the body if `None`."""
+    """Vertex beside which times are written; above the body if `None`."""
 
 
 def energies_against_time(
     t: Float[np.ndarray, " T"], energies: dict[str, Float[np.ndarray, " T"]], *, taken: str | None = None, title: str
 ) -> Figure:
-    """Energies of `motion_energies`; the gravitational one counts from its value at the start.
+    """Energies from `motion_energies` over time; gravity and total count from the initial gravitational energy.
 
-    Where nothing feeds energy in, `taken` says what takes it away, and the difference to the start is shaded.
+    If nothing feeds energy in, `taken` names what dissipates it, and the loss since the start is shaded.
     """
     power, unit = style.prefixed(max(float(np.abs(values - values[0]).max()) for values in energies.values()), "J")
     start = energies["gravity"][0] if "gravity" in energies else 0.0
@@ -61,7 +61,7 @@ def energies_against_time(
     for name, values in energies.items():
         line = (values - (start if name in ("gravity", TOTAL) else 0.0)) / power
         label = "gravity (from start)" if name == "gravity" else name
-        # What the total coincides with stays visible.
+        # The total is drawn wider and behind, so that a curve coinciding with it stays visible.
         width, order = (3.0, 1.9) if name == TOTAL else (1.4, 2.0)
         colours[label] = COLOURS.get(name, "0.4")
         axis.plot(t, line, color=colours[label], linewidth=width, label=name, zorder=order)
@@ -78,7 +78,7 @@ def energies_against_time(
 
 
 def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float = style.WIDTH) -> Figure:
-    """A panel per body, each with its moments, the earlier ones paler.
+    """Snapshots of bodies, one panel per body, earlier ones paler.
 
     Raises:
         InputError: no panel, or a panel whose positions, times and mesh do not fit.
@@ -87,7 +87,7 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
         raise InputError("there is no panel; give at least one")
     pictures = [_shapes(panel) for panel in panels]
     columns = min(columns, len(panels))
-    # Every row is as high as its highest panel needs.
+    # The height of a row is that of its highest panel.
     rows = [range(i, min(i + columns, len(pictures))) for i in range(0, len(pictures), columns)]
     each = width / columns
     aspects = [np.divide(*np.diff(extent, axis=0)[0, ::-1]) for _, extent in pictures]
@@ -100,7 +100,7 @@ def moments_figure(panels: Sequence[Moments], *, columns: int = 2, width: float 
     axes = []
     for number, row in enumerate(rows):
         for place, i in enumerate(row):
-            # The last panel takes what is left of its row.
+            # The last panel fills the rest of its row.
             axes.append(figure.add_subplot(grid[number, place : columns if i == row[-1] else place + 1]))
             _draw(axes[-1], panels[i], *pictures[i])
     for axis, panel, (shapes_of, _) in zip(axes, panels, pictures, strict=True):
@@ -117,14 +117,14 @@ class _Shape(NamedTuple):
     outline: np.ndarray
     """Colour of the skin."""
     level: np.ndarray
-    """Where the origin is drawn."""
+    """Position of the origin in the drawing."""
     label: str
     corner: np.ndarray
-    """Where the label stands."""
+    """Position of the label."""
 
 
 def _shapes(panel: Moments) -> tuple[list[_Shape], np.ndarray]:
-    """The pictures in the plane of drawing, and their extent [[x, y] low, [x, y] high]."""
+    """The snapshots in the drawing plane, and their extent [[x, y] low, [x, y] high]."""
     positions = np.asarray(panel.positions)
     if positions.ndim != 3 or positions.shape[1:] != panel.mesh.vertices.shape or len(positions) != len(panel.t):
         raise InputError(
@@ -149,7 +149,7 @@ def _shapes(panel: Moments) -> tuple[list[_Shape], np.ndarray]:
     if panel.ground is not None and not panel.stacked:
         low[1] = min(low[1], panel.ground * low[0])
     margin = 0.05 * float((high - low).max())
-    # Room for the labels.
+    # Margins leave room for the labels.
     left, right = (1.0, 5.0) if panel.labelled is not None else (1.0, 1.0) if panel.stacked else (4.0, 2.0)
     return shapes, np.stack([low - margin * np.array([left, 1.0]), high + margin * np.array([right, 3.0])])
 
@@ -185,7 +185,7 @@ def _draw(axis: Axes, panel: Moments, shapes: list[_Shape], extent: np.ndarray) 
 
 
 def _label_times(axis: Axes, panel: Moments, shapes: list[_Shape]) -> None:
-    """Beside or above each body, where the pictures leave room."""
+    """Places times beside or above the bodies, where there is room."""
     filled = [_inside(shape.polygons) for shape in shapes]
     ground = np.zeros((0, 2))
     if panel.ground is not None and panel.mesh.dimension == 2:
@@ -196,7 +196,7 @@ def _label_times(axis: Axes, panel: Moments, shapes: list[_Shape]) -> None:
         for number, shape in enumerate(shapes):
             others = np.concatenate([ground, *filled[:number], *filled[number + 1 :]])
             skin = shape.skin.reshape(-1, 2)
-            # Where a label has most room: the point farthest from the others.
+            # A label has most room at the skin vertex farthest from all other bodies.
             corners[number] = skin[np.linalg.norm(skin[:, None] - others, axis=-1).min(axis=1).argmax()]
     points = [(shape.label, (float(x), float(y))) for shape, (x, y) in zip(shapes, corners, strict=True)]
     first = (1, 0) if panel.labelled is not None else (0, 1)
@@ -204,6 +204,6 @@ def _label_times(axis: Axes, panel: Moments, shapes: list[_Shape]) -> None:
 
 
 def _inside(triangles: np.ndarray) -> np.ndarray:
-    """Points all over the triangles."""
+    """Points spread over the triangles."""
     weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
     return np.einsum("kci,wc->kwi", triangles, weights).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Animated GIFs of soft bodies: triangles of the plane, or the skin of a body in space, seen from above at an angle."""
+"""Animated GIFs of soft bodies: triangles in the plane, or the skin of a body in space seen obliquely from above."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -36,19 +36,19 @@ def write_soft_body_gif(
     stride: int = 1,
     frames_per_second: float = 15.0,
 ) -> None:
-    """Writes a motion with the outline of its first frame, the ground, metres and the time.
+    """Writes a motion with the outline of its first frame, the ground, axes in m, and the time.
 
     Args:
-        path: of the GIF.
-        mesh: whose elements are drawn; in space only its skin is, and axis 2 points up.
-        positions: of the vertices in m.
-        t: time of each frame in s.
+        path: path of the GIF.
+        mesh: mesh to draw; in space only its skin, with axis 2 pointing up.
+        positions: positions of the vertices, m.
+        t: time of every frame, s.
         muscles: pairs of vertices [k, 2], drawn as lines (in the plane).
-        actuation: of the muscles in each frame, relative to their rest length: red is short.
-        ground: its height in m; `None` draws none.
-        title: above the picture.
-        stride: frames of the motion between two of the GIF.
-        frames_per_second: of the GIF.
+        actuation: length of the muscles in every frame relative to their rest length; red is short.
+        ground: height of the ground, m; `None` draws none.
+        title: title above the drawing.
+        stride: frames of the motion per frame of the GIF.
+        frames_per_second: frame rate of the GIF.
 
     Raises:
         InputError: times, vertices or muscles that do not fit the positions, or no frame.
@@ -68,7 +68,7 @@ def soft_body_frame(
     actuation: Float[np.ndarray, " k"] | None = None,
     ground: float | None = 0.0,
 ) -> Figure:
-    """One frame of `write_soft_body_gif`, as a figure."""
+    """One frame of `write_soft_body_gif` as a figure."""
     state = np.asarray(positions)[None]
     driven = None if actuation is None else np.asarray(actuation)[None]
     _require_fitting(mesh, state, np.zeros(1), muscles, driven)
@@ -80,7 +80,7 @@ def soft_body_frame(
 def _prepared(
     mesh: Mesh, positions: np.ndarray, muscles: Any, actuation: np.ndarray | None, ground: float | None
 ) -> tuple[Figure, Callable[[int], None]]:
-    """The empty picture, and what draws a frame into it."""
+    """The empty figure, and the function that draws a frame into it."""
     skin, seen, plane = boundary(mesh), flattened(positions), mesh.dimension == 2
     below = None if plane or ground is None else floor(positions, ground)
     figure, axis = _axes(seen if below is None else np.concatenate([seen.reshape(-1, 2), below]), plane, ground)
@@ -115,7 +115,7 @@ def _prepared(
 
 
 def _axes(points: np.ndarray, plane: bool, ground: float | None) -> tuple[Figure, Axes]:
-    """Equal scales on both axes, with everything in view from the first frame to the last."""
+    """Axes of equal scale that contain all frames."""
     flat = points.reshape(-1, 2)
     low, high = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
     if plane and ground is not None:

@@ -1,7 +1,7 @@
-"""What all figures have in common: width, sizes of text, a light grid, and one colour and marker for each model.
+"""Common style of all figures: width, text sizes, a light grid, and one colour and marker per model.
 
-Nothing here reads or sets Matplotlib's global state: figures are made without pyplot, and what Matplotlib would take
-from its settings later, when it makes ticks, is given to each axis.
+Matplotlib's global state is neither read nor set: figures are made without pyplot, and settings that Matplotlib would
+apply later, when it makes ticks, are set on each axis.
 """
 
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
 WIDTH, DPI = 7.2, 150
-"""In inches, and pixels per inch: 1,080 pixels, the width of a page."""
+"""Inches, and pixels per inch: 1,080 pixels, the width of a page."""
 TEXT, SMALL = 9.0, 8.0
-"""Points."""
+"""Text sizes in points."""
 TRUTH = "truth"
 REFERENCE = "0.55"
 """Colour of published and other reference values."""
 
 BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, "#555555", "#882255")
-"""Colours of things that are no models (Okabe and Ito 2008, told apart by the colour-blind)."""
+"""Colours for everything but models (Okabe and Ito 2008, safe for colour-blind readers)."""
 MARKERS = "osv^Ddp*"
 
 MODELS: dict[str, tuple[str, str]] = {
@@ -48,12 +48,12 @@ UNKNOWN = ("#555555", "h")
 
 
 def colour(name: str) -> str:
-    """Colour of a model, or of a variant "MODEL-..." of it; grey for a name that is not known."""
+    """Colour of a model or of its variant "MODEL-..."; grey for an unknown name."""
     return _look(name)[0]
 
 
 def marker(name: str) -> str:
-    """Marker of a model, likewise."""
+    """Marker of a model or of its variant; a default for an unknown name."""
     return _look(name)[1]
 
 
@@ -65,7 +65,7 @@ def _look(name: str) -> tuple[str, str]:
 def figure(
     rows: int = 1, columns: int = 1, *, height: float, width: float = WIDTH, dpi: int = DPI, **options
 ) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes [rows, columns], drawn by Agg; sizes in inches, `options` as `Figure.subplots`."""
+    """A figure and its axes [rows, columns], drawn by Agg; sizes in inches, `options` as for `Figure.subplots`."""
     drawn = blank(height=height, width=width, dpi=dpi)
     axes = drawn.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
@@ -81,7 +81,7 @@ def blank(*, height: float, width: float = WIDTH, dpi: int = DPI) -> Figure:
 
 
 def prepare(axis: Axes) -> None:
-    """Gives axes that were added to a figure their sizes of text and their grid."""
+    """Sets text sizes and the grid of axes that were added to a figure."""
     axis.tick_params(which="both", labelsize=SMALL)
     for side in (axis.xaxis, axis.yaxis):
         side.label.set_fontsize(TEXT)
@@ -93,12 +93,12 @@ def prepare(axis: Axes) -> None:
 
 
 def title(axis: Axes, text: str, **options) -> None:
-    """A title in the size of the text, which `set_title` would take from Matplotlib's settings."""
+    """Sets a title with an explicit text size, which `set_title` would take from Matplotlib's settings."""
     axis.set_title(text, **{"fontsize": TEXT, **options})
 
 
 def legend(of: Axes | Figure, *args, **options) -> Legend:
-    """A legend without a frame, in the small text."""
+    """Adds a legend without a frame, in small text."""
     return of.legend(*args, **{"frameon": False, "fontsize": SMALL, **options})
 
 
@@ -110,17 +110,17 @@ def scale_of(values: Iterable[float | int]) -> str:
 
 
 def prefixed(size: float | int, unit: str) -> tuple[float, str]:
-    """What a unit is to be multiplied with for numbers of this size, and its name: (1e-6, "µN m") for 3e-5 N m."""
+    """Returns the scale factor and the prefixed unit that suit values of this size: (1e-6, "µN m") for 3e-5 N m."""
     prefixes = {1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n", 1e-12: "p", 1e-15: "f"}
     factor = next((factor for factor in prefixes if size >= factor), 1.0 if size == 0 else 1e-15)
     return factor, f"{prefixes[factor]}{unit}"
 
 
 def colours_of(names: Iterable[str]) -> dict[str, str]:
-    """Colours in turn, for things that are no models."""
+    """Assigns colours in sequence, for everything but models."""
     return {name: CYCLE[number % len(CYCLE)] for number, name in enumerate(names)}
 
 
 def with_unit(name: str, unit: str) -> str:
-    """The label of an axis, whose quantity may have no unit."""
+    """Axis label of a quantity, with its unit if it has one."""
     return f"{name}, {unit}" if unit else name

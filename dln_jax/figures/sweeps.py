@@ -1,4 +1,4 @@
-"""Error against seconds over a grid of runs: a point for each, medians over seeds, the best in validation ringed."""
+"""Error against time over a grid of runs: one point per run, medians over seeds, the best by validation ringed."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,14 +14,14 @@ MOST_COLOURS = len(style.CYCLE)
 
 
 class Point(NamedTuple):
-    """A run, or the median of several."""
+    """A run, or the median of several runs."""
 
     seconds: float
     error: float
     colour: str = ""
-    """Value of the option that colours show."""
+    """Value of the option shown by colours."""
     marker: str = ""
-    """Value of the option that markers show."""
+    """Value of the option shown by markers."""
     problem: str = ""
     """Title of its panel."""
     median: bool = False
@@ -31,13 +31,14 @@ class Point(NamedTuple):
 def error_against_seconds(
     points: Sequence[Point], *, x: str, y: str, colour: str = "", marker: str = "", note: str = ""
 ) -> Figure:
-    """A panel for each problem; runs are faint where there are medians.
+    """Error against time, one panel per problem; runs are faint if there are medians.
 
     Args:
         points: runs and medians.
         x, y: labels of the axes.
-        colour, marker: names of the options that these show; empty for none. Of many colours some are named.
-        note: below the axes, for example which runs are missing.
+        colour, marker: names of the options shown by colours and markers; empty for none. The legend lists at most
+            `MOST_COLOURS` colours.
+        note: text below the axes, for example on missing runs.
     """
     problems = list(dict.fromkeys(point.problem for point in points)) or [""]
     wide = len(problems) > 1
@@ -89,7 +90,7 @@ def _handle(marker: str, label: str, colour, *, size: float | int = 6) -> Line2D
 
 
 def _colours(values: Sequence[str]) -> dict[str, Any]:
-    """In turn, or along a scale where there are more values than colours."""
+    """Colours in sequence, or along a colour map if there are more values than colours."""
     if len(values) <= MOST_COLOURS:
         return {value: style.CYCLE[number] for number, value in enumerate(values)}
     return dict(zip(values, map(tuple, colormaps["viridis"](np.linspace(0, 0.95, len(values)))), strict=True))

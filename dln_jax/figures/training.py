@@ -1,4 +1,4 @@
-"""The figure of a training: its loss and errors against steps."""
+"""Figure of a training: loss and errors against steps."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from dln_jax.figures import style
 from dln_jax.learning.engine.problem import Progress
 
 LEAST_SHARE = 0.2
-"""Of the steps, from which a stage's name is written above it, else upright."""
+"""Stages shorter than this fraction of the steps make the stage names vertical."""
 
 
 def training_curve(
@@ -21,10 +21,10 @@ def training_curve(
     loss: str = "training loss (normalised)",
     unit: str = "loss, or MSE in (N m)²",
 ) -> Figure:
-    """Training loss, validation error and test error against steps; the test error decided nothing.
+    """Training loss, validation error and test error against steps; the test error has no influence on the training.
 
-    Of several seeds the medians. `error` and `loss` name what is measured, `unit` the axis. Stages are set apart by
-    lines and have their names; their curves are not connected, for what they measure may differ.
+    For several seeds medians are shown. `error` and `loss` name the quantities, `unit` the axis. Stages are named and
+    separated by lines; their curves are not connected, since their quantities may differ.
     """
     figure, [[axis]] = style.figure(height=3.6)
     stages = [list(ats) for _, ats in itertools.groupby(history, key=lambda at: at.stage)]

@@ -1,4 +1,4 @@
-"""Figures of what a model does not know: torques in their bands, and how often they are in them."""
+"""Figures of model uncertainty: torques in their bands, and the coverage of the bands."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from dln_jax.figures import style
 from dln_jax.metrics.coverage import LEVEL, coverage, half_width
 
 MOST_JOINTS, MOST_SAMPLES = 7, 400
-"""That are shown."""
+"""Largest numbers of joints and samples shown."""
 
 
 def torque_bands(
@@ -20,10 +20,9 @@ def torque_bands(
     *,
     model: str = "model",
 ) -> Figure:
-    """Errors of the torque in their 95 % bands along the first held-out samples, a row a joint, and coverage beside it.
+    """Torque errors in their 95 % bands along the first held-out samples, one row per joint, next to their coverage.
 
-    States that are flagged as outside the data are shaded. `predicted` and `std` are of the model, whose name gives the
-    colour.
+    States flagged as out of distribution are shaded. `predicted` and `std` are the model's; its name sets the colour.
     """
     d = min(data.degrees_of_freedom, MOST_JOINTS)
     shown = np.arange(min(len(data.t), MOST_SAMPLES))
@@ -66,6 +65,6 @@ def torque_bands(
 
 
 def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
-    """First and last place of each run of true values."""
+    """First and last index of every run of true values."""
     edges = np.diff(np.r_[0, np.asarray(flags, int), 0])
     return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))

@@ -1,6 +1,6 @@
-"""Identification: what data of a robot determine of its parameters, and what these are.
+"""Identification: estimate the parameters of a robot and say which of them its data determine.
 
-`identify(model, known, data)` does all of it for a model that is linear in its parameters, as `models.make_rigid_tree`.
+`identify(model, known, data)` does both for a model that is linear in its parameters, such as `models.make_rigid_tree`.
 """
 
 from dln_jax.identification.base import BaseParameters, base_parameters, determinacy, null_directions

@@ -1,9 +1,9 @@
-"""Which parameters forces depend on: alone, in combination, or not at all.
+"""Base parameters: which parameters are identifiable alone, which only in combination, and which not at all.
 
 Forces depend on P parameters through fewer combinations, the base parameters (Gautier and Khalil 1990; numerically
-Gautier 1991). With columns in an order of preference, those that are no combination of earlier ones stay, Phi_1, and
-the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 (theta_1 + K theta_2). Bodies nearer to the ground come first,
-and of a body what is usually kept; its mass, h_z and I_yy are what is usually regrouped.
+Gautier 1991). The columns are visited in an order of preference. A column that is linearly independent of those before
+it is kept, in Phi_1; the others are Phi_2 = Phi_1 K, so that Phi theta = Phi_1 (theta_1 + K theta_2). Bodies nearer to
+the ground come first. Within a body, mass, h_z and I_yy come last: these are the parameters usually regrouped.
 """
 
 from collections.abc import Sequence
@@ -16,37 +16,37 @@ from dln_jax.identification.columns import Columns
 
 Determinacy = Literal["alone", "in combination", "not at all"]
 PREFERRED = ("I_zz", "h_x", "h_y", "I_xx", "I_xy", "I_xz", "I_yz", "I_yy", "h_z", "m")
-"""Of the ten of a body, those first that stay."""
+"""The ten parameters of a body, in the order in which they are kept."""
 TOLERANCE = 1e-8
-"""Relative length of what of a column is no combination of others, below which it is one; random states leave digits
-enough between rounding and what exists."""
+"""Columns whose residual after projection on the others is shorter than this fraction of their length count as linearly
+dependent. For random states this lies well between rounding errors and true residuals."""
 NEGLIGIBLE = 1e-12
-"""Columns shorter than this times the longest are zeros that terms leave which cancel."""
+"""Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
 SHOWN = 1e-7
-"""Coefficients smaller than this, relative to the largest of their combination, are rounding and not in words."""
+"""Coefficients below this fraction of the largest in their combination are rounding errors and set to zero."""
 
 
 class BaseParameters(NamedTuple):
-    """B combinations of P parameters."""
+    """B identifiable combinations of P parameters."""
 
     combinations: Float[np.ndarray, "B P"]
-    """beta = combinations theta; 1 in the column that a combination is called by."""
+    """beta = combinations theta; every row has a 1 in its independent column."""
     independent: tuple[int, ...]
-    """That column of each."""
+    """Independent column of every combination."""
     words: tuple[str, ...]
-    """As "I_xx_3 + 0.3 m_4"."""
+    """Combinations as text, such as "I_xx_3 + 0.3 m_4"."""
 
 
 def base_parameters(
     A: Float[np.ndarray, "N P"], columns: Columns, *, tolerance: float = TOLERANCE, negligible: float = NEGLIGIBLE
 ) -> BaseParameters:
-    """The base parameters of equations in general states, by Gram-Schmidt with reorthogonalisation.
+    """Finds the base parameters by Gram-Schmidt with reorthogonalisation.
 
     Args:
-        A: Phi of more states than there are parameters, or its triangle.
-        columns: their names.
-        tolerance: what is left of a column's length below which it is a combination of others.
-        negligible: relative length of columns that are none.
+        A: Phi in generic states, more of them than parameters, or its triangular factor.
+        columns: names, kinds and joints of the columns.
+        tolerance: residual relative to a column's length below which the column counts as linearly dependent.
+        negligible: columns shorter than this fraction of the longest count as zero.
     """
     norms = np.linalg.norm(A, axis=0)
     seen = norms > negligible * norms.max(initial=0.0)
@@ -63,7 +63,7 @@ def base_parameters(
         if length > tolerance:
             basis = np.column_stack([basis, left / length])
             independent.append(column)
-    # In units of the columns' lengths, and back.
+    # Solve with columns of unit length, then scale back.
     factors = np.linalg.lstsq(scaled[:, independent], scaled * seen, rcond=None)[0]
     combinations = factors * np.where(seen, norms, 1.0) / norms[independent][:, None]
     sizes = abs(factors).max(axis=1, initial=0.0)[:, None]
@@ -78,7 +78,7 @@ def base_parameters(
 
 
 def _order(columns: Columns) -> list[int]:
-    """Columns by joint from the ground, a body's as `PREFERRED`, those that are no body's last."""
+    """Columns of bodies by joint from the ground, within a body as in `PREFERRED`; all other columns last."""
 
     def key(column: int) -> tuple[bool, int, int]:
         name, body = columns.names[column], columns.kinds[column] == "inertia"
@@ -88,7 +88,7 @@ def _order(columns: Columns) -> list[int]:
 
 
 def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
-    """A combination as a sum, the names with factor 1 first."""
+    """Writes a combination as a sum, starting with the names that have factor 1."""
     chosen = sorted(np.flatnonzero(combination).tolist(), key=lambda column: (combination[column] != 1.0, column))
     text = ""
     for column in chosen:
@@ -100,11 +100,12 @@ def in_words(combination: Float[np.ndarray, " P"], names: Sequence[str]) -> str:
 
 
 def determinacy(unseen: Float[np.ndarray, "K P"], *, tolerance: float = 1e-6) -> tuple[Determinacy, ...]:
-    """Of each parameter, from orthonormal directions that change no force.
+    """Classifies every parameter as identifiable alone, in combination or not at all.
 
     Args:
-        unseen: in units in which all columns have one length; an unseen column has a direction of its own.
-        tolerance: share of a direction that counts as none.
+        unseen: orthonormal directions that change no force, for columns scaled to unit length; a zero column has a
+            direction of its own.
+        tolerance: a parameter whose share in these directions is below it counts as identifiable alone.
     """
     shares = np.linalg.norm(unseen, axis=0)
     return tuple("alone" if s < tolerance else "not at all" if s > 1 - tolerance else "in combination" for s in shares)
@@ -113,12 +114,12 @@ def determinacy(unseen: Float[np.ndarray, "K P"], *, tolerance: float = 1e-6) ->
 def null_directions(
     A: Float[np.ndarray, "N P"], *, tolerance: float = TOLERANCE, negligible: float = NEGLIGIBLE
 ) -> Float[np.ndarray, "K P"]:
-    """Orthonormal directions of the parameters, in units of their columns' lengths, that equations do not show.
+    """Orthonormal directions of the parameters that the equations do not determine, for columns scaled to unit length.
 
     Args:
-        A: Phi, or its triangle.
-        tolerance: relative to the largest singular value.
-        negligible: relative length of columns that are none.
+        A: Phi, or its triangular factor.
+        tolerance: singular values below this fraction of the largest count as zero.
+        negligible: columns shorter than this fraction of the longest count as zero.
     """
     norms = np.linalg.norm(A, axis=0)
     seen = norms > negligible * norms.max(initial=0.0)

@@ -1,8 +1,8 @@
-"""The columns of a model that is linear in its parameters: what each is called, and what values it may have.
+"""Columns of a model that is linear in its parameters: their names and admissible values.
 
-A model states both by its parameters alone: a leaf `inertias` [links, 10] are the inertial parameters of bodies, every
-other leaf has an entry for each joint and is called by its own name. So a law of friction that a model gains has its
-columns here without a further word.
+Both follow from the model's parameters. The leaf `inertias` [links, 10] holds the inertial parameters of the bodies;
+every other leaf has one entry per joint and gives its name to its columns. A new friction law therefore needs no change
+here.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -16,24 +16,24 @@ from dln_jax.models.model import Parameters
 
 Kind = Literal["inertia", "positive", "signed"]
 BODIES = "inertias"
-"""Name of the leaf with bodies, ten columns each."""
+"""Name of the leaf with the inertial parameters, ten columns per body."""
 SIGNED = ("offset",)
-"""Names of leaves whose entries may have either sign."""
+"""Endings of the names of leaves whose entries may have either sign."""
 
 
 class Columns(NamedTuple):
-    """P parameters in the order of the model's leaves."""
+    """Columns of P parameters in the order of the model's leaves."""
 
     names: tuple[str, ...]
-    """As "I_xx_3" or "viscous_2", joints counted from 1."""
+    """Names such as "I_xx_3" or "viscous_2", joints counted from 1."""
     kinds: tuple[Kind, ...]
-    """Ten of "inertia" for each body, "positive" for armature and friction, "signed" for what may have either sign."""
+    """"inertia" for the ten columns of a body, "positive" for armature and friction, "signed" for either sign."""
     joints: tuple[int, ...]
-    """That each belongs to, counted from 0."""
+    """Joint of every column, counted from 0."""
 
 
 def columns_of(parameters: Parameters) -> Columns:
-    """The columns of a model with such parameters; what is no tree's has its leaf's name and its place in it."""
+    """Columns of a model with these parameters; outside `inertias` a column is named by its leaf and place in it."""
     names: list[str] = []
     kinds: list[Kind] = []
     joints: list[int] = []
@@ -51,6 +51,6 @@ def columns_of(parameters: Parameters) -> Columns:
 
 
 def flat(parameters: Parameters) -> Float[np.ndarray, " P"]:
-    """All parameters end to end, in the order of the columns."""
+    """Concatenates all parameters in the order of the columns."""
     leaves: list[Any] = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(parameters)]
     return np.concatenate(leaves)

@@ -1,15 +1,15 @@
-"""Parameters of bodies that exist: least squares over positive definite pseudo-inertias and positive coefficients.
+"""Physically consistent parameters: least squares over positive definite pseudo-inertias and positive coefficients.
 
-A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is that of its known value and M is symmetric and positive
-definite: relative to what is known, so that no coordinate has a unit. Armature and friction are c = c_0 exp(z). These
-numbers minimise
+A body has the pseudo-inertia J = L M Lᵀ, where J_0 = L Lᵀ is its prior and M is symmetric and positive definite. M is
+relative to the prior, so its entries have no units. Armature and friction are c = c_0 exp(z). M and z minimise
 
     F = sum over joints of |Phi_j theta - tau_j|² / noise_j²  +  regularisation (sum of D(J | J_0) + sum of z² / 2)
 
-D(J | J_0) = tr M - log det M - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020); it depends on no
-frame. In M the sum is convex and D is the barrier of the bodies that exist, so that F is minimised as interior-point
-methods do (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's method with a regularisation that falls
-to the one that was asked for. The data are one triangle: an iteration takes some P³ operations, whatever N is.
+D(J | J_0) = tr M - log det M - 4 is the entropic divergence of Lee, Wensing and Park (T-RO 2020), which does not depend
+on the frame. The sum is convex in M, and D is a barrier for the physically consistent bodies. F is therefore minimised
+by an interior-point method (Boyd and Vandenberghe, Convex Optimization, chapter 11): Newton's method with a
+regularisation that falls to the requested value. The data enter as one triangular factor, so an iteration takes on the
+order of P³ operations, independent of the number of samples N.
 """
 
 from typing import NamedTuple
@@ -22,18 +22,18 @@ from dln_jax.mechanics.trees.inertia import body_of_pseudo_inertia, pseudo_inert
 from dln_jax.types import InputError, require_positive
 
 REGULARISATION = 1.0
-"""Of a body that is e times larger than it was known to be, about what one measurement counts that is wrong by twice
-its noise: nothing where the data say something."""
+"""With this value, a body e times larger than its prior costs about as much as one measurement with an error of twice
+its noise, which is negligible wherever the data are informative."""
 SMALLEST = 1e-6
-"""Least eigenvalue of a known pseudo-inertia, relative to its largest; where it is smaller, it is raised to it."""
+"""Eigenvalues of a prior pseudo-inertia below this fraction of the largest are raised to it."""
 UNKNOWN_SHARE = 0.01
-"""Of all torque, what a coefficient that is known as zero is first taken to explain."""
+"""Fraction of the torque that the initial value of a coefficient explains if its prior is zero."""
 FALL = 5.0
 """Factor by which the regularisation falls from one minimum to the next."""
 CENTRED = 0.1
-"""Newton's decrement, in units of the regularisation, at which a minimum counts as reached on the way."""
+"""Newton decrement, in units of the regularisation, at which an intermediate minimum counts as reached."""
 TOLERANCE = 1e-10
-"""Newton's decrement, the decrease of F that is expected of another iteration, relative to 1 + F, at which to stop."""
+"""Newton decrement (expected decrease of F in another iteration), relative to 1 + F, at which to stop."""
 _ABOVE = np.triu_indices(4, 1)
 _BASIS = np.array(
     [np.outer(row, row) for row in np.eye(4)]
@@ -43,25 +43,25 @@ _BASIS = np.array(
 
 
 class ConsistentFit(NamedTuple):
-    """Bodies that exist."""
+    """Physically consistent parameters and how the solver ended."""
 
     theta: Float[np.ndarray, " P"]
     divergence: Float[np.ndarray, " bodies"]
-    """D(J | J_0) of each body that there is."""
+    """D(J | J_0) of every body with inertia."""
     iterations: int
-    """Of Newton's method, in all."""
+    """Total number of Newton iterations."""
     converged: bool
-    """Whether another iteration would change nothing that counts; else the iterations were used up."""
+    """Whether the Newton decrement fell below the tolerance; otherwise the iterations or the line search ran out."""
 
 
 def is_consistent(theta: Float[np.ndarray, " P"], columns: Columns) -> tuple[bool, ...]:
-    """Of each body, whether its pseudo-inertia is positive definite, or there is no body."""
+    """Whether the pseudo-inertia of every body is positive definite; a body with ten zeros counts as consistent."""
     bodies = theta[np.array(columns.kinds) == "inertia"].reshape(-1, 10)
     return tuple(bool(not body.any() or np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0) for body in bodies)
 
 
 def nearest_body(theta: Float[np.ndarray, "10"], *, smallest: float = SMALLEST) -> Float[np.ndarray, "10"]:
-    """The body whose pseudo-inertia has eigenvalues raised to `smallest` times the largest, where they are below.
+    """Raises the eigenvalues of a body's pseudo-inertia to at least `smallest` times the largest.
 
     Raises:
         InputError: no eigenvalue is positive.
@@ -84,22 +84,21 @@ def fit_consistent(
     iterations: int = 500,
     tolerance: float = TOLERANCE,
 ) -> ConsistentFit:
-    """The consistent parameters of least error, from those known.
+    """Fits physically consistent parameters by least squares, with the known values as prior.
 
     Args:
-        triangle: of the equations in units of noise, as `equations.weighted`.
-        columns: of the P parameters, ten of each body side by side.
-        known: values to start from and to be near to; a body that does not exist is replaced by `nearest_body`, a
-            coefficient that is zero by one that explains a hundredth of the torque. Where all ten numbers of a body are
-            zero, there is none, and they stay.
-        regularisation: dimensionless; what a unit of divergence counts, in squares of the noise. Positive, since the
-            data never determine all.
+        triangle: triangular factor of the equations in units of noise, from `equations.weighted`.
+        columns: columns of the P parameters; the ten of a body are adjacent.
+        known: prior and initial values. An inconsistent body is replaced by `nearest_body`, a zero coefficient by one
+            that explains a hundredth of the torque. A body with ten zeros is absent and stays zero.
+        regularisation: cost of a unit of divergence, dimensionless (in squares of the noise); positive, since data
+            never determine all parameters.
         smallest: as for `nearest_body`.
-        iterations: of Newton's method, at most.
-        tolerance: of the decrease that is still to be had, relative to 1 + F.
+        iterations: upper limit of Newton iterations.
+        tolerance: Newton decrement, relative to 1 + F, at which to stop.
 
     Raises:
-        InputError: a regularisation that is not positive, or a body without mass.
+        InputError: `regularisation` or `smallest` is not positive, or a body has no mass.
     """
     require_positive(regularisation=regularisation, smallest=smallest)
     kinds = np.array(columns.kinds)
@@ -111,7 +110,7 @@ def fit_consistent(
     start = np.zeros(len(kinds))
     start[positive] = np.where(known[positive] > 0, known[positive], UNKNOWN_SHARE * typical[positive])
     start[signed] = known[signed]
-    # Directions of theta: ten for each body, then those of the coefficients, then those of what has either sign.
+    # Columns of the map to theta: ten per body, then the positive coefficients, then the signed ones.
     maps = []
     for places in inertial:
         J = pseudo_inertia(nearest_body(known[places], smallest=smallest))
@@ -126,25 +125,25 @@ def fit_consistent(
 
 
 class _Problem(NamedTuple):
-    """Residuals A y + r of y = (M - 1 of each body in the basis, exp(z) - 1, what has either sign)."""
+    """Residuals A y + r with y = (M - 1 of every body in the basis, exp(z) - 1, signed parameters)."""
 
     A: np.ndarray
     r: np.ndarray
     bodies: int
 
     def parts(self, x: np.ndarray, coefficients: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """M [B, 4, 4], z, and what has either sign."""
+        """M [B, 4, 4], z, and the signed parameters."""
         numbers, z, signed = np.split(x, [10 * self.bodies, 10 * self.bodies + coefficients])
         return np.eye(4) + np.einsum("bk,kij->bij", numbers.reshape(-1, 10), _BASIS), z, signed
 
     def directions(self, x: np.ndarray, coefficients: int) -> np.ndarray:
-        """y of the unknowns x, of which z are logarithms."""
+        """y as a function of the unknowns x, which hold z in place of exp(z) - 1."""
         y, z = x.copy(), slice(10 * self.bodies, 10 * self.bodies + coefficients)
         y[z] = np.expm1(x[z])
         return y
 
     def value(self, x: np.ndarray, coefficients: int, weight: float) -> float:
-        """F; infinite where a body does not exist."""
+        """F; infinite where a body is not physically consistent or z exceeds 100."""
         M, z, _ = self.parts(x, coefficients)
         if (M.size and np.linalg.eigvalsh(M).min() <= 0) or z.max(initial=0.0) > 100:
             return np.inf
@@ -152,7 +151,7 @@ class _Problem(NamedTuple):
         return float(errors @ errors + weight * (_divergences(M).sum() + 0.5 * z @ z))
 
     def newton(self, x: np.ndarray, coefficients: int, weight: float) -> tuple[np.ndarray, float]:
-        """Newton's step as a least-squares problem, whose solution is stable, and its decrement."""
+        """The Newton step, solved as a least-squares problem for numerical stability, and its decrement."""
         M, z, signed = self.parts(x, coefficients)
         errors = self.A @ self.directions(x, coefficients) + self.r
         scale = np.concatenate([np.ones(10 * self.bodies), np.exp(z), np.ones(len(signed))])
@@ -165,7 +164,7 @@ class _Problem(NamedTuple):
             block[:, 10 * body : 10 * body + 10] = inner.reshape(10, 16).T
             rows.append(np.sqrt(weight / 2) * block)
             right.append(-np.sqrt(weight / 2) * (C.T @ C - np.eye(4)).ravel())
-        # The second derivative of exp(z) counts where it is positive, which keeps the step one of descent.
+        # The curvature of exp(z) enters only where it is positive, so that the step remains a descent direction.
         place = 10 * self.bodies + np.arange(coefficients)
         bend = np.sqrt(weight / 2 + np.maximum(slopes[:, place].T @ errors, 0.0))
         rows.append(bend[:, None] * _rows(place, len(x)))
@@ -178,7 +177,7 @@ class _Problem(NamedTuple):
 def _minimum(
     problem: _Problem, coefficients: int, regularisation: float, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, int, bool]:
-    """The unknowns of least F, iterations, and whether they suffice."""
+    """The unknowns that minimise F, the number of iterations, and whether they converged."""
     x = np.zeros(problem.A.shape[1])
     weight = max(regularisation, problem.value(x, coefficients, 0.0) / max(1, len(x)))
     for done in range(iterations):
@@ -187,10 +186,11 @@ def _minimum(
         if last and decrement <= tolerance * (1 + now):
             return x, done, True
         length = 1.0
+        # Armijo's condition; F is infinite for inconsistent bodies, so a step never leaves the feasible set.
         while problem.value(x + length * step, coefficients, weight) > now - 1e-4 * length * decrement:
             length /= 2
             if length < 1e-12:
-                # Rounding hides what is left of F; that is an end if it is below what the sum resolves.
+                # Rounding hides any further decrease; this counts as converged if the decrement is small enough.
                 return x, done, last and decrement <= 1e-8 * (1 + now)
         x = x + length * step
         if not last and decrement <= CENTRED * weight:
@@ -199,12 +199,12 @@ def _minimum(
 
 
 def _divergences(M: np.ndarray) -> np.ndarray:
-    """tr M - log det M - 4 of each."""
+    """tr M - log det M - 4 of every body."""
     return np.trace(M, axis1=1, axis2=2) - np.linalg.slogdet(M)[1] - 4
 
 
 def _bodies(J: np.ndarray) -> np.ndarray:
-    """Ten numbers of each pseudo-inertia, as columns."""
+    """The ten inertial parameters of every pseudo-inertia, as columns."""
     return np.stack([np.asarray(body_of_pseudo_inertia(each)) for each in J], axis=1)
 
 

@@ -1,8 +1,8 @@
-"""All that data say of a model linear in its parameters: one triangle for each joint, however many samples there are.
+"""Least-squares equations of a model linear in its parameters, compressed to one triangular factor per joint.
 
     |Phi_j theta - tau_j|² = |R_j (theta, -1)|²,   [Phi_j tau_j] = Q_j R_j
 
-Weights of the joints, known parameters and other unknowns take operations on triangles [P + 1, P + 1], never the data.
+Reweighting joints, fixing parameters and changing unknowns then act on the [P + 1, P + 1] factors, not on the data.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ from dln_jax.solvers.least_squares import triangular_factor
 from dln_jax.types import InputError
 
 CHUNK = 2048
-"""Samples whose design matrix is in memory at a time."""
+"""Number of samples whose design matrix is in memory at a time."""
 
 
 class Equations(NamedTuple):
@@ -37,10 +37,10 @@ class Equations(NamedTuple):
 
 
 class Regressor(NamedTuple):
-    """Phi and tau of data, as often as asked, without the memory for all of them."""
+    """Phi and tau of a dataset, recomputed in chunks on every pass to save memory."""
 
     passes: Callable[[], Iterator[tuple[np.ndarray, np.ndarray]]]
-    """Phi [n, d, P] and tau [n, d] of n samples at a time."""
+    """Starts a pass: yields Phi [n, d, P] and tau [n, d] of n samples at a time."""
     samples: int
     joints: int
     unknowns: int
@@ -54,18 +54,17 @@ def regressor_of(
     free: np.ndarray | None = None,
     linearise: Callable | None = None,
 ) -> Regressor:
-    """The equations of data, sample by sample.
+    """Makes the regressor of a dataset.
 
     Args:
-        model: linear in its parameters.
-        parameters: of the model, at which it is differentiated, and its linearity is checked.
-        data: with tau.
-        free: columns [P] that are none where it is false, of parameters that are known to be zero.
-        linearise: `learning.linear.design` of the model, where it is compiled already.
+        model: a model that is linear in its parameters.
+        parameters: point at which the model is differentiated and its linearity checked.
+        data: samples with tau.
+        free: [P]; columns are set to zero where it is, for parameters known to be zero.
+        linearise: `learning.linear.design(model)`, to reuse a compiled one.
 
     Raises:
-        InputError: data without torques, or as many joints as the model has not; passes raise it where the model turns
-            out not to be linear.
+        InputError: the data have no torques. A pass raises it if the model turns out not to be linear.
     """
     if "tau" in data.estimated:
         raise InputError("the data have no tau; identification takes measured torques")
@@ -84,7 +83,7 @@ def regressor_of(
 
 
 def compressed(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = None) -> Equations:
-    """The equations as triangles, each row times the root of its weight where weights are given."""
+    """Compresses the equations to triangular factors, with rows scaled by the square root of `weights`, if any."""
     d, P = regressor.joints, regressor.unknowns
     triangles, first = np.zeros((d, P + 1, P + 1)), 0
     for columns, tau in regressor.passes():
@@ -99,20 +98,20 @@ def compressed(regressor: Regressor, weights: Float[np.ndarray, "N d"] | None = 
 
 
 def about(equations: Equations, theta: Float[np.ndarray, " P"]) -> Equations:
-    """The equations of theta' - theta."""
+    """The equations for theta' - theta as the unknown."""
     shifted = equations.triangles.copy()
     shifted[:, :, -1] -= equations.triangles[:, :, :-1] @ theta
     return equations._replace(triangles=shifted)
 
 
 def weighted(equations: Equations, noise: Float[np.ndarray, " d"]) -> Float[np.ndarray, "K P_and_1"]:
-    """One triangle of all joints, in units of their noise."""
+    """One triangular factor of all joints, with rows in units of the joint's noise."""
     rows = (equations.triangles / noise[:, None, None]).reshape(-1, equations.unknowns + 1)
     return triangular_factor(rows[:, :-1], rows[:, -1])
 
 
 def squares(equations: Equations, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " d"]:
-    """Sum over samples of squared residuals, of each joint."""
+    """Sum of squared residuals over the samples, per joint."""
     rows = equations.triangles @ np.append(theta, -1.0)
     return np.sum(rows**2, axis=1)
 

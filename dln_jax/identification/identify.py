@@ -1,4 +1,4 @@
-"""Identification from data in one call: what can be known, what these data say, and bodies that exist."""
+"""Identification in one call: structural identifiability, a least-squares fit and physically consistent parameters."""
 
 from typing import Any, NamedTuple
 
@@ -26,34 +26,34 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, JointKind
 
 STATES = 40
-"""Random states by joint, from which the structure is seen."""
+"""Number of random states per joint from which the structure is computed."""
 UNSEEN_SHARE = 0.02
-"""Of the part of a parameter that motions could show, squared: up to it data may miss what counts as seen, and what
-counts as missed may they show."""
+"""Tolerance on the squared fraction of a parameter's identifiable part that the data miss: up to this fraction missed
+counts as seen, and up to this fraction seen counts as missed."""
 
 
 class Identification(NamedTuple):
-    """What is known of P parameters."""
+    """Result of an identification of P parameters."""
 
     columns: Columns
     known: Float[np.ndarray, " P"]
-    """Values before."""
+    """Prior values."""
     structure: tuple[Determinacy, ...]
-    """What any motion could determine of each parameter."""
+    """Structural identifiability: how arbitrary motions could determine every parameter."""
     base: BaseParameters
-    """Combinations that any motion could determine."""
+    """Combinations that arbitrary motions could determine."""
     fit: WeightedFit
-    """Least squares by these data; bodies need not exist."""
+    """Least-squares fit to the data; its bodies may be physically inconsistent."""
     seen: tuple[Determinacy, ...]
-    """What these data determine of each parameter."""
+    """How these data determine every parameter."""
     statistics: ResidualStatistics
-    """Of the residuals of `fit`."""
+    """Statistics of the residuals of `fit`."""
     consistent: ConsistentFit | None
-    """Bodies that exist, where asked for."""
+    """Physically consistent parameters, if requested."""
 
     @property
     def theta(self) -> Float[np.ndarray, " P"]:
-        """The consistent parameters, else those of least squares."""
+        """The physically consistent parameters if computed, otherwise those of least squares."""
         return self.fit.theta if self.consistent is None else self.consistent.theta
 
 
@@ -72,23 +72,23 @@ def identify(
 ) -> Identification:
     """Identifies the parameters of a model that is linear in them.
 
-    Bodies without mass (links between the joints of one MJCF body) stay so.
+    Bodies without mass (links between the joints of one MJCF body) stay massless.
 
     Args:
         model: such as `models.make_rigid_tree`.
-        known: its parameters before, those of a file, at which what data do not show stays.
-        data: with tau, for training; hold out what the result is judged by.
-        joints: kinds, whose random states show the structure; by default all revolute.
-        noise: standard deviation of the torque of each joint [d], N m or N; by default estimated.
-        robust: errors beyond 1.345 times the noise count by their size and not by their square; noise is estimated.
+        known: prior parameters, such as those of a robot file; directions that the data do not determine keep them.
+        data: training data with tau; hold out other motions to judge the result.
+        joints: kinds of the joints, from which the random states are drawn; all revolute by default.
+        noise: standard deviation of the torque of each joint [d], N m or N; estimated by default.
+        robust: use Huber's loss, which grows linearly beyond 1.345 times the noise; the noise is then estimated.
         rank_tolerance: as for `fit_weighted`.
-        consistent: find bodies that exist, too.
+        consistent: also fit physically consistent parameters.
         regularisation: as for `fit_consistent`.
-        seed: of the random states.
+        seed: seed of the random states.
 
     Raises:
-        InputError: data of another number of joints than the model's or without torques, a model that is not linear, or
-            a setting out of range.
+        InputError: the data lack torques or have another number of joints than the robot, the model is not linear, or a
+            setting is out of range.
     """
     d = data.degrees_of_freedom
     joints = ("revolute",) * d if joints is None else joints
@@ -99,7 +99,7 @@ def identify(
     columns, theta = columns_of(known), flat(known)
     free = _with_mass(columns, theta)
     linearise = design(model)
-    # As many as data in a chunk, which is then one program.
+    # The random states fill chunks of the same size as the data, so that both use one compiled program.
     samples = max(STATES * d, -(-len(data.t) // -(-len(data.t) // equations.CHUNK)))
     states = random_states(joints, samples, seed)
     general = compressed(regressor_of(model, known, states, free=free, linearise=linearise))
@@ -132,12 +132,13 @@ def identify(
 
 
 def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy, ...]) -> tuple[Determinacy, ...]:
-    """What data show of each parameter, of what motions could."""
+    """Classifies how the data determine every parameter, relative to what motions could determine."""
     scaled = base.combinations / np.where(fit.lengths > 0, fit.lengths, np.inf)
     lengths = np.linalg.norm(scaled, axis=1)
     _, sizes, right = np.linalg.svd(scaled[lengths > 0] / lengths[lengths > 0, None], full_matrices=False)
     possible = np.sum(right[sizes > ROUNDING * sizes.max(initial=0.0)] ** 2, axis=0)
-    # Directions that data miss are those that no motion shows, and of the possible ones those that are lost.
+    # `unseen` holds the structurally unidentifiable directions and the identifiable ones that the data miss; subtract
+    # the former.
     missed = np.sum(fit.unseen**2, axis=0) - (1 - possible)
     shown = possible > ROUNDING
     shares = np.where(shown, missed / np.where(shown, possible, 1.0), 1.0)
@@ -151,12 +152,12 @@ def seen_by(fit: WeightedFit, base: BaseParameters, structure: tuple[Determinacy
 
 
 def parameters_of(found: Float[np.ndarray, " P"], like: Parameters) -> Parameters:
-    """Parameters of the model, of numbers in the order of its columns."""
+    """Parameters of the model from a vector in the order of its columns."""
     return jax.tree.map(jnp.asarray, unravelled(found, like))
 
 
 def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Trajectories:
-    """States anywhere: angles of the whole circle, a metre of displacement, rates and accelerations of some units."""
+    """Random states: angles on the full circle, displacements up to 1 m, normal rates (sd 2), accelerations (sd 5)."""
     d, random = len(joints), np.random.default_rng(seed)
     reach = np.where(np.array(joints) == "revolute", np.pi, 1.0)
     arrays = {
@@ -169,7 +170,7 @@ def random_states(joints: tuple[JointKind, ...], samples: int, seed: int) -> Tra
 
 
 def _with_mass(columns: Columns, theta: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """1 for each column, 0 for those of links that have no mass."""
+    """Mask of the columns: 0 for links without mass, 1 for all others."""
     free = np.ones(len(theta))
     inertial = np.flatnonzero(np.array(columns.kinds) == "inertia").reshape(-1, 10)
     free[inertial[~theta[inertial].any(axis=1)]] = 0.0

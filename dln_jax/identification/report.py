@@ -1,4 +1,4 @@
-"""What was identified, in words and rows: base parameters, each parameter, and what is to be said of the data."""
+"""Reports on an identification: base parameters, all parameters, and findings about the data."""
 
 from typing import Any
 
@@ -9,15 +9,15 @@ from dln_jax.identification.base import Determinacy
 from dln_jax.identification.identify import Identification
 
 STILL = 0.01
-"""rad or m: a joint that moves by less does not move."""
+"""rad or m: a joint whose range is smaller counts as motionless."""
 LARGE_CONDITION = 300.0
-"""Above it, errors grow much more along some combinations than along others."""
+"""Above this condition number, errors grow much more along some combinations than along others."""
 LONG_CORRELATION = 10.0
-"""Samples for which residuals follow each other, above which they are rather model error than noise."""
+"""Correlation time of the residuals in samples, above which they indicate model error rather than noise."""
 
 
 def base_rows(found: Identification) -> list[dict[str, Any]]:
-    """Each base parameter: in words, its value by these data, the standard error, and the value before."""
+    """One row per base parameter: the combination, its fitted value, standard error and prior value."""
     values, errors = found.base.combinations @ found.fit.theta, found.fit.standard_errors(found.base.combinations)
     known = found.base.combinations @ found.known
     rows = zip(found.base.words, values.tolist(), errors.tolist(), known.tolist(), strict=True)
@@ -28,7 +28,7 @@ def base_rows(found: Identification) -> list[dict[str, Any]]:
 
 
 def parameter_rows(found: Identification) -> list[dict[str, Any]]:
-    """Each parameter: what could be known of it and what these data show, values, and its error where it has one."""
+    """One row per parameter: structure, what the data determine, values, and the standard error if there is one."""
     names, errors = found.columns.names, found.fit.standard_errors(np.eye(len(found.columns.names)))
     return [
         {
@@ -45,7 +45,7 @@ def parameter_rows(found: Identification) -> list[dict[str, Any]]:
 
 
 def lost(found: Identification) -> tuple[str, ...]:
-    """Names of parameters that some motion would show, and these data do not."""
+    """Names of parameters that some motion could show, but these data do not."""
     return tuple(
         name
         for name, possible, seen in zip(found.columns.names, found.structure, found.seen, strict=True)
@@ -54,7 +54,7 @@ def lost(found: Identification) -> tuple[str, ...]:
 
 
 def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) -> list[str]:
-    """What a user should know of the data, a line each with its remedy."""
+    """Findings about the data, one line each with its remedy."""
     lines = []
     still = np.flatnonzero(np.ptp(data.q, axis=0) < STILL)
     if len(still):
@@ -89,7 +89,7 @@ def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) 
 
 
 def summary(found: Identification) -> list[str]:
-    """How much is known, in a few lines."""
+    """How many parameters are identifiable, in two lines."""
     names, structure = found.columns.names, found.structure
 
     def those(which: Determinacy) -> list[str]:
@@ -103,7 +103,7 @@ def summary(found: Identification) -> list[str]:
 
 
 def text(found: Identification) -> str:
-    """All of it, as a page of plain text."""
+    """The full report as plain text."""
     lines = [*summary(found), "", "base parameters: value ± standard error (before)"]
     for row in base_rows(found):
         lines.append(

@@ -1,8 +1,8 @@
-"""A small network on top of an identified tree: as large as held-out motions ask for, and none where they do not.
+"""A small residual network on top of an identified tree, no larger than held-out motions justify.
 
-The tree keeps its parameters. Candidates grow from no network at all; one is better than another only where its error
-on validation motions is lower by more than the standard error of the difference, over stretches of time that are taken
-to be independent, which neighbouring samples are not.
+The parameters of the tree are frozen. The candidates grow from no network at all. One replaces another only if its
+error on validation motions is lower by more than the standard error of the difference. That error is computed over
+segments of time assumed to be independent, since neighbouring samples are not.
 """
 
 import math
@@ -28,7 +28,7 @@ from dln_jax.types import InputError, Needs, ResidualTerm
 
 
 class Candidate(NamedTuple):
-    """A size of network; without terms it is none."""
+    """Size of a network; no terms means no network."""
 
     terms: tuple[ResidualTerm, ...] = ()
     width: int = 0
@@ -45,17 +45,17 @@ CANDIDATES = (
 
 
 class ResidualFit(NamedTuple):
-    """A tree with what was added, if anything was."""
+    """The tree with the selected residual network, if any."""
 
     model: Model
-    """The tree's own, or the sum."""
+    """The tree's own model, or the sum."""
     parameters: Parameters
-    """Of the tree, or `ResidualParameters`."""
+    """Parameters of the tree, or `ResidualParameters`."""
     chosen: Candidate
     settings: dict[str, Any]
-    """Keywords of `make_residual`; empty where nothing was added."""
+    """Keywords of `make_residual`; empty if no network was selected."""
     trials: list[Trial]
-    """All that were tried; the errors are those of stretches of validation motion, in units of the torque's own."""
+    """All candidates tried, with errors per segment of validation motion in units of the torque's spread."""
 
 
 def fit_residual(
@@ -70,21 +70,21 @@ def fit_residual(
     seconds: float = math.inf,
     seed: int = 0,
 ) -> ResidualFit:
-    """Fits networks to what an identified tree leaves, and keeps the smallest that held-out motions call enough.
+    """Fits residual networks to the torques unexplained by an identified tree, and selects the smallest sufficient one.
 
     Args:
         rigid: such as `models.make_rigid_tree`.
-        parameters: identified, which stay.
+        parameters: identified parameters, which stay fixed.
         needs: kinds of the joints.
-        train: what the tree was identified from.
-        validation: other motions; what is chosen is to be judged by others again.
-        candidates: in order of size, the first without terms.
-        iterations: of Gauss-Newton, at most; kept are the parameters with the lowest validation error.
-        seconds: after which the network in training is left as it is then, and no further one is tried.
-        seed: of the networks.
+        train: data from which the tree was identified.
+        validation: other motions, used for selection; judge the result on yet others.
+        candidates: candidates in order of size, the first without terms.
+        iterations: upper limit of Gauss-Newton iterations; the parameters with the lowest validation error are kept.
+        seconds: time limit, after which the current network stops training and no other one is tried.
+        seed: seed of the networks.
 
     Raises:
-        InputError: candidates that do not start with none, or data without varying torques.
+        InputError: the first candidate has terms, or the torques do not vary.
     """
     if not candidates or candidates[0].terms:
         raise InputError("candidates start with a network; expected none at all first, which others have to better")
@@ -127,7 +127,7 @@ def fit_residual(
 
 
 def _sizes(train: Trajectories, left: Float[np.ndarray, "N d"]) -> dict[str, tuple[float, ...]]:
-    """Typical sizes, to three digits: of what the tree leaves, and of rates and accelerations."""
+    """Typical magnitudes, to three digits, of unexplained torques, rates and accelerations."""
     named = {"torque_scale": left, "rate_scale": train.qd, "acceleration_scale": train.qdd}
     return {
         name: tuple(float(f"{size:.3g}") if size > 0 else 1.0 for size in spread(name, numbers))

@@ -1,4 +1,4 @@
-"""Residuals of identification: what they are like, and weights by which spikes among them count less."""
+"""Residual statistics of an identification, and weights that reduce the influence of outliers."""
 
 from typing import NamedTuple
 
@@ -10,28 +10,28 @@ from dln_jax.identification.weighted import WeightedFit, fit_weighted
 from dln_jax.types import require_positive
 
 THRESHOLD = 1.345
-"""Of Huber (1964), in units of the noise: 95 % as efficient as least squares on normal errors."""
+"""Huber (1964), in units of the noise: 95 % as efficient as least squares for normal errors."""
 TO_DEVIATION = 1.4826
-"""Standard deviation of normal errors over their median size."""
+"""Ratio of the standard deviation of normal errors to their median absolute value."""
 
 
 class ResidualStatistics(NamedTuple):
-    """Of each joint's residuals [d]."""
+    """Statistics of the residuals of each joint [d]."""
 
     rms: Float[np.ndarray, " d"]
-    """N m or N."""
+    """Root mean square, N m or N."""
     share_beyond_three: Float[np.ndarray, " d"]
-    """Of samples with more than three times the noise; 0.0027 of normal ones."""
+    """Fraction of samples beyond three times the noise; 0.0027 for normal errors."""
     excess_kurtosis: Float[np.ndarray, " d"]
-    """0 of normal ones; large with spikes."""
+    """0 for normal errors; large for outliers."""
     correlation: Float[np.ndarray, " d"]
-    """Samples for which residuals follow each other, 1 where they are independent: 1 + 2 sum of autocorrelations."""
+    """Correlation time in samples, 1 + 2 sum of autocorrelations; 1 for independent residuals."""
 
 
 def residual_statistics(
     errors: Float[np.ndarray, "N d"], trajectory: np.ndarray, noise: Float[np.ndarray, " d"]
 ) -> ResidualStatistics:
-    """Of residuals, their trajectories, and the noise that they are judged by."""
+    """Statistics of residuals relative to a noise level; they are correlated within trajectories only."""
     square = np.mean(errors**2, axis=0)
     kurtosis = np.mean(errors**4, axis=0) / np.where(square > 0, square, 1.0) ** 2 - 3
     beyond = np.mean(abs(errors) > 3 * noise, axis=0)
@@ -39,12 +39,13 @@ def residual_statistics(
 
 
 def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) -> Float[np.ndarray, " d"]:
-    """1 + 2 sum of autocorrelations up to the first pair of lags without a positive sum (Geyer 1992)."""
+    """1 + 2 sum of autocorrelations, truncated at the first pair of lags whose sum is not positive (Geyer 1992)."""
     starts = np.flatnonzero(np.diff(trajectory)) + 1
     parts = np.split(errors, starts)
     longest = max(len(part) for part in parts)
     products = np.zeros((longest, errors.shape[1]))
     for part in parts:
+        # Zero padding to twice the length keeps the correlation from wrapping round.
         spectrum = abs(np.fft.rfft(part, 2 * len(part), axis=0)) ** 2
         products[: len(part)] += np.fft.irfft(spectrum, 2 * len(part), axis=0)[: len(part)]
     correlations = products / np.where(products[0] > 0, products[0], 1.0)
@@ -52,7 +53,7 @@ def correlation_times(errors: Float[np.ndarray, "N d"], trajectory: np.ndarray) 
     for joint, values in enumerate(correlations.T):
         pairs = values[: 2 * (longest // 2)].reshape(-1, 2).sum(axis=1)
         end = np.argmax(pairs <= 0) if (pairs <= 0).any() else len(pairs)
-        times[joint] = max(2 * pairs[:end].sum() - 1, 1.0)
+        times[joint] = max(2 * pairs[:end].sum() - 1, 1.0)  # the pairs include lag 0, which is 1
     return times
 
 
@@ -65,21 +66,21 @@ def fit_robust(
     tolerance: float = 1e-4,
     rank_tolerance: float | None = None,
 ) -> tuple[WeightedFit, Float[np.ndarray, "N d"]]:
-    """Huber's estimate: an error beyond `threshold` times the noise counts by its size and no longer by its square.
+    """Huber's estimate: the loss grows linearly instead of quadratically beyond `threshold` times the noise.
 
-    Least squares again and again, with weights min(1, threshold noise / |error|), which are returned beside the fit;
-    noise is the median size of errors.
+    Iteratively reweighted least squares with weights min(1, threshold noise / |error|), returned with the fit; the
+    noise is estimated from the median absolute error.
 
     Args:
-        regressor: the data's equations, of which each iteration takes one pass.
-        known: values about which they are solved.
+        regressor: equations of the data; every iteration takes two passes.
+        known: prior values.
         threshold: in units of the noise.
-        iterations: at most.
-        tolerance: relative change of the predicted torques at which to stop.
+        iterations: upper limit.
+        tolerance: relative change of the residuals at which to stop.
         rank_tolerance: as for `fit_weighted`.
 
     Raises:
-        InputError: a threshold that is not positive, or as `fit_weighted`.
+        InputError: the threshold is not positive, or as `fit_weighted`.
     """
     require_positive(threshold=threshold)
     fit = fit_weighted(compressed(regressor), known, rank_tolerance=rank_tolerance)

@@ -1,11 +1,12 @@
-"""Least squares in which each joint counts by its noise, which its own residuals tell, with standard errors.
+"""Weighted least squares with standard errors; the weights follow from the residuals of each joint.
 
     theta minimises sum over joints of |Phi_j theta - tau_j|² / noise_j²
 
-about values that are known before, so that what data do not show stays as it was: of all theta that fit equally well
-it is the nearest, in units of the columns' lengths. Then noise_j² = |residual_j|² / (N - share of the parameters that
-joint j determines), and again, until noises stay. The covariance of theta is that of independent errors of this size;
-where residuals follow each other for T samples, T of them count as one (`robust.residual_statistics`).
+Directions that the data do not determine keep their prior values: of all theta that fit equally well, the solution is
+the nearest to the prior, in units of the columns' lengths. The noise is noise_j² = |residual_j|² / (N - share of the
+parameters that joint j determines); fit and noise alternate until the noise converges. The covariance of theta assumes
+independent errors of this size. If residuals are correlated over T samples, T of them count as one
+(`robust.residual_statistics`).
 """
 
 from typing import NamedTuple
@@ -19,32 +20,32 @@ from dln_jax.identification.equations import Equations
 from dln_jax.types import InputError
 
 ROUNDING = 1e-10
-"""Relative singular values below it are rounding of dependent columns."""
+"""Singular values below this fraction of the largest are rounding errors of dependent columns."""
 NOISE_FLOOR = 1e-10
-"""Least noise of a joint, relative to the torque of all, that weights may tell from none."""
+"""Lower limit of a joint's noise, relative to the largest joint torque."""
 
 
 class WeightedFit(NamedTuple):
-    """What least squares find, of P parameters and d joints."""
+    """Least-squares fit of P parameters to d joints."""
 
     theta: Float[np.ndarray, " P"]
     covariance: Float[np.ndarray, "P P"]
-    """Of all that has an effect on the data, also where it is too small to be used."""
+    """Includes every direction with an effect on the data, even those too weak to be used in the fit."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation of each joint's residual, N m or N."""
+    """Standard deviation of the residual of each joint, N m or N."""
     rank: int
-    """Combinations that the data determine."""
+    """Number of combinations that the data determine."""
     condition: float
-    """Largest over smallest singular value that counts, of columns of one length."""
+    """Largest over smallest singular value used, for columns of unit length."""
     unseen: Float[np.ndarray, "K P"]
-    """Orthonormal directions along which theta stays as it was, in units of the columns' lengths."""
+    """Orthonormal directions along which theta keeps its prior value, in units of the columns' lengths."""
     without_effect: Float[np.ndarray, "M P"]
-    """Those of them that change nothing in the data."""
+    """Those directions of `unseen` that have no effect on the data."""
     lengths: Float[np.ndarray, " P"]
-    """Of the columns, in units of noise; zero where there is none."""
+    """Lengths of the columns in units of noise; zero for columns without effect."""
 
     def standard_errors(self, combinations: Float[np.ndarray, "B P"]) -> Float[np.ndarray, " B"]:
-        """Of combinations of parameters; infinite where one has a part without effect on the data."""
+        """Standard errors of combinations of parameters; infinite if part of one has no effect on the data."""
         scaled = combinations / np.where(self.lengths > 0, self.lengths, 1.0)
         outside = np.linalg.norm(scaled @ self.without_effect.T, axis=1) > 1e-4 * np.linalg.norm(scaled, axis=1)
         variance = np.einsum("bp,pq,bq->b", combinations, self.covariance, combinations)
@@ -60,20 +61,21 @@ def fit_weighted(
     rank_tolerance: float | None = None,
     iterations: int = 20,
 ) -> WeightedFit:
-    """The weighted least-squares fit.
+    """Fits the parameters by weighted least squares.
 
     Args:
-        given: the data's equations.
-        known: values about which they are solved.
-        noise: standard deviation of each joint's torque, N m or N; by default estimated, all joints alike at first.
-        correlation: samples for which residuals of a joint follow each other, which the covariance counts as one.
-        rank_tolerance: singular values of columns of one length, relative to the largest, that count as zero; by
-            default the inverse of the torque in units of its noise, at least 1e-10. A combination with an effect of the
-            size of all torque along such a direction would not rise above the noise.
-        iterations: of noise and parameters, at most.
+        given: equations of the data.
+        known: prior values.
+        noise: standard deviation of each joint's torque, N m or N; estimated by default, starting from equal noise.
+        correlation: correlation time of each joint's residuals in samples; the covariance counts that many as one.
+        rank_tolerance: singular values of unit-length columns, relative to the largest, that count as zero. Default:
+            the inverse of the torque in units of its noise, at least 1e-10, since along such a direction even an effect
+            as large as all torque would not rise above the noise.
+        iterations: upper limit of the iterations for noise and parameters.
 
     Raises:
-        InputError: noise that is not positive, a tolerance outside [0, 1), no torque, or fewer samples than parameters.
+        InputError: noise is not positive, a tolerance is outside [0, 1), tau is zero, or there are fewer samples than
+            parameters.
     """
     d, known = len(given.triangles), np.asarray(known, float)
     torque = np.sqrt(np.sum(given.triangles[:, :, -1] ** 2, axis=1) / given.samples)
@@ -103,7 +105,7 @@ def fit_weighted(
 def _solved(
     given: Equations, sigma: np.ndarray, correlation: np.ndarray | None, rank_tolerance: float
 ) -> tuple[WeightedFit, np.ndarray]:
-    """The fit with these noises, and of the parameters the share that each joint determines, which sum to the rank."""
+    """The fit for these noise levels, and every joint's share in determining the parameters; shares sum to the rank."""
     triangle = equations.weighted(given, sigma)
     A, b = triangle[:, :-1], triangle[:, -1]
     lengths = np.linalg.norm(A, axis=0)
@@ -112,8 +114,8 @@ def _solved(
     left, sizes, right = np.linalg.svd(np.where(lengths > 0, A, 0.0) / scale)
     rank, every = (int(np.sum(sizes > each * sizes[0])) for each in (rank_tolerance, min(ROUNDING, rank_tolerance)))
     to_theta = (right[:every] / sizes[:every, None]).T / scale[:, None]
-    to_theta[lengths == 0] = 0.0  # and not rounding, which large torques in units of small noise would show
-    # Rows of each joint in the basis of what has an effect: their squares sum to one over all joints.
+    to_theta[lengths == 0] = 0.0  # large torques in units of small noise would amplify rounding here
+    # Rows of each joint in the basis of directions with an effect: their squares sum to one over all joints.
     by_joint = [rows[:, :-1] @ to_theta / each for rows, each in zip(given.triangles, sigma, strict=True)]
     times = np.ones(len(sigma)) if correlation is None else np.asarray(correlation, float)
     middle = np.sum([time * rows.T @ rows for time, rows in zip(times, by_joint, strict=True)], axis=0)

@@ -1,4 +1,4 @@
-"""Textbook systems: what each needs, and its exact energies and equations of motion."""
+"""Textbook systems: their `Needs`, exact energies and equations of motion."""
 
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.chain import chain

@@ -1,4 +1,4 @@
-"""Cart-pole: a driven cart on a rail carries a free pole; prismatic, revolute, under-actuated."""
+"""Cart-pole: a driven cart on a rail with a free pole; prismatic and revolute joints, under-actuated."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""Chain of d uniform rods with a motor in every joint: the scene for studying how cost grows with d."""
+"""Chain of d uniform rods with a motor in every joint, for studying how cost grows with d."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,17 +10,17 @@ from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector
 def chain(
     d: int, *, mass: float = 1.0, length: float = 1.0, acceleration: float = 9.81, friction: float = 0.0
 ) -> Scene:
-    """The planar chain, each angle relative to the link before, q = 0 hanging; per link kg and m, m/s², N m s.
+    """The planar chain with angles relative to the previous link, q = 0 hanging; per link kg and m, m/s², N m s.
 
-    In absolute angles θ = cumsum(q) the equations are short (a_ij cos(θ_i - θ_j) couples rods i and j);
-    the constant matrix S of the sum turns them into joint coordinates: M = Sᵀ M_θ S and likewise for forces.
+    In absolute angles θ = cumsum(q) the equations are short (a_ij cos(θ_i - θ_j) couples rods i and j). The constant
+    matrix S of the sum transforms them to joint coordinates: M = Sᵀ M_θ S, and likewise for forces.
 
     Raises:
         InputError: d < 1.
     """
     if d < 1:
         raise InputError(f"chain: d = {d} links; give at least 1")
-    outer_rods = np.arange(d - 1, -1, -1.0)  # how many rods hang below each rod
+    outer_rods = np.arange(d - 1, -1, -1.0)  # number of rods below each rod
     farther = np.minimum(outer_rods[:, None], outer_rods[None, :])
     coupling = mass * length**2 * (farther + 0.5)
     np.fill_diagonal(coupling, mass * length**2 * (outer_rods + 1 / 3))
@@ -49,5 +49,5 @@ def chain(
 
 
 def _sum_outwards(forces):
-    """Sᵀ times rows of forces: a joint's torque is the sum over its own rod and all rods beyond it."""
+    """Sᵀ times the rows: a joint's torque is the sum over its own rod and all rods beyond it."""
     return jnp.cumsum(forces[::-1], axis=0)[::-1]

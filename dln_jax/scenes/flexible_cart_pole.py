@@ -1,4 +1,4 @@
-"""Flexible cart-pole: a driven cart pulls, by a spring, a second cart with a free pole (Lutter et al., CoRL 2019)."""
+"""Flexible cart-pole: a driven cart pulls a second cart with a free pole by a spring (Lutter et al., CoRL 2019)."""
 
 import jax.numpy as jnp
 
@@ -16,19 +16,19 @@ def flexible_cart_pole(
     acceleration: float = 9.81,
     friction: tuple[float, float, float] = (0.5, 0.5, 0.0024),
 ) -> Scene:
-    """The flexible cart-pole with q = (driven cart, lengthening of the spring, pole angle from upright).
+    """The flexible cart-pole with q = (driven cart, extension of the spring, pole angle from upright).
 
-    The second cart is at the sum of the first two; it carries the pole, a point mass at `length` from its hinge. Only
-    the first cart is driven: tau = B f with B = (1, 0, 0)ᵀ. The numbers are the paper's.
+    The second cart is at q[0] + q[1]; it carries the pole, a point mass at `length` from its hinge. Only the first cart
+    is driven: tau = B f with B = (1, 0, 0)ᵀ. Defaults are the paper's values.
 
     Args:
         driven_mass: kg.
-        carried_mass: of the second cart, kg.
+        carried_mass: mass of the second cart, kg.
         pole_mass: kg.
         length: m.
-        stiffness: of the spring, N/m.
+        stiffness: stiffness of the spring, N/m.
         acceleration: m/s².
-        friction: viscous, of the two carts on the rail, N s/m, and of the hinge, N m s.
+        friction: viscous friction of the two carts on the rail, N s/m, and of the hinge, N m s.
     """
     coupling = pole_mass * length
     weight = coupling * acceleration

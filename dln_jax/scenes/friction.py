@@ -1,11 +1,11 @@
-"""Any scene with the friction that the joints of a laboratory have: viscous, dry, and more of it at rest."""
+"""Adds realistic joint friction to any scene: viscous, dry, and Stribeck friction near rest."""
 
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape, joint_dissipation
 from dln_jax.scenes.scene import Scene
 from dln_jax.types import Dissipation, FrictionLaw, InputError, Scalar, Vector
 
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "stribeck")
-"""That a scene can be given; the others of `mechanics.friction.laws` belong to gears."""
+"""Friction laws available for a scene; the others of `mechanics.friction.laws` apply to gears."""
 
 
 def with_friction(
@@ -13,18 +13,18 @@ def with_friction(
     coefficients: FrictionCoefficients,
     shape: FrictionShape = FrictionShape(),  # noqa: B008
 ) -> Scene:
-    """The same scene with friction in its joints, beside any that it has.
+    """Adds friction to the joints of a scene, in addition to any it already has.
 
-    Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint that "rests" creeps with less than it.
-    An explicit integrator is stable for steps below some 2.8 m v / c, with m the least inertia that the joint sees.
+    Dry friction is c tanh(u / v) with a small v, `shape.velocity_scale`: a joint "at rest" creeps more slowly than v.
+    An explicit integrator is stable for steps below some 2.8 m v / c, where m is the smallest inertia at the joint.
 
     Args:
-        scene: of any joints.
-        coefficients: viscous, coulomb and stribeck, a number for each joint or one for all.
-        shape: velocity scale and Stribeck's velocity.
+        scene: a scene with any joints.
+        coefficients: viscous, coulomb and stribeck, one number per joint or one for all.
+        shape: velocity scale and Stribeck velocity.
 
     Raises:
-        InputError: no coefficient, one of another law, or one that is negative.
+        InputError: no coefficient, one of another law, or a negative one.
     """
     given = {name: value for name, value in coefficients._asdict().items() if value is not None}
     if others := [name for name in given if name not in LAWS]:

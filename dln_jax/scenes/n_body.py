@@ -2,8 +2,8 @@
 
     V = -G sum over pairs of m_i m_j / sqrt(r_ij² + s²)
 
-q holds the positions one body after the other, [n * dimension]. The softening length s is zero unless asked for: V is
--inf where bodies meet.
+q holds the positions body by body, [n * dimension]. The softening length s is zero by default: V is -inf where bodies
+meet.
 """
 
 import jax.numpy as jnp
@@ -21,17 +21,17 @@ def n_body(
     G: float = 1.0,
     softening: float = 0.0,
 ) -> Scene:
-    """The n bodies, in a line, a plane or space.
+    """n bodies on a line, in a plane or in space.
 
     Args:
-        n: bodies.
-        dimension: coordinates of each.
-        masses: one for all, or one for each, in kg.
-        G: gravitational constant, in m³/(kg s²); zero for bodies that do not attract each other.
-        softening: length s, in m; where it is positive, the force is not Newton's.
+        n: number of bodies.
+        dimension: coordinates per body.
+        masses: one for all, or one per body, kg.
+        G: gravitational constant, m³/(kg s²); zero for no attraction.
+        softening: length s, m; if positive, the force deviates from Newton's law.
 
     Raises:
-        InputError: fewer than two bodies, masses that are not positive or not one for each, a negative softening.
+        InputError: fewer than two bodies, masses that are not positive or not one per body, or a negative softening.
     """
     each = masses if isinstance(masses, tuple) else (masses,) * n
     require_positive(dimension=dimension, **{f"mass {index}": mass for index, mass in enumerate(each)})

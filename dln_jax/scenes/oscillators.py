@@ -1,4 +1,4 @@
-"""Masses in wells: the harmonic oscillator, and one whose orbits may be chaotic."""
+"""Masses in potential wells: the harmonic oscillator, and the Hénon-Heiles system with chaotic orbits."""
 
 import jax.numpy as jnp
 
@@ -28,7 +28,7 @@ def mass_spring(*, mass: float = 1.0, stiffness: float = 1.0, friction: float = 
 
 
 def henon_heiles(*, coupling: float = 1.0, friction: float = 0.0) -> Scene:
-    """The system of Hénon and Heiles: orbits are regular or chaotic by their energy.
+    """The Hénon-Heiles system, whose orbits are regular or chaotic depending on their energy.
 
         H = ½ (p₁² + p₂²) + ½ (x² + y²) + λ (x² y - y³/3)
 

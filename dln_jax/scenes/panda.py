@@ -1,8 +1,8 @@
-"""The simulated Franka Panda on which models that do not know its kinematics are compared.
+"""The simulated Franka Panda for comparing models that do not know its kinematics.
 
 Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO 2024 (arXiv 2310.06585): masses and centres after Gaz et al. (RA-L
-2019), whose moments are taken about the links' frames; some links are no bodies that exist, which a comparison does not
-mind.
+2019). That paper's moments are taken about the links' frames, so some links are not physically consistent, which does
+not matter for a comparison.
 """
 
 import numpy as np
@@ -35,10 +35,10 @@ _LIMITS = [[-2.9, 2.9], [-1.8, 1.8], [-2.9, 2.9], [-3.0, 0.0], [-2.9, 2.9], [0.0
 
 
 def panda(active: int = 7) -> Arm:
-    """The Panda whose first so many joints move, while the others are held at the middle of their limits.
+    """The Panda with its first `active` joints moving and the others locked at the middle of their limits.
 
     Raises:
-        InputError: no number from 1 to 7.
+        InputError: `active` is not a number from 1 to 7.
     """
     if active not in range(1, 8):
         raise InputError(f"active is {active!r:.40}; expected 1 to 7 joints")
@@ -47,7 +47,7 @@ def panda(active: int = 7) -> Arm:
     tree = serial(rotations[:active], positions[:active], inertias[:active])
     rotation, position = np.eye(3), np.zeros(3)
     for link in range(active, 7):
-        # Frame of the held link in that of the last one that moves.
+        # Frame of the locked link relative to the last one that moves.
         c, s = np.cos(np.mean(_LIMITS[link])), np.sin(np.mean(_LIMITS[link]))
         position = position + rotation @ positions[link]
         rotation = rotation @ rotations[link] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])

@@ -1,6 +1,6 @@
-"""Arms to learn from: trees with friction and the limits within which they are moved, of whole numbers in SI units.
+"""Robot arms for learning: trees with friction and the limits of their motions, with round numbers in SI units.
 
-`skew_arm` and `sliding_arm` are of our own making: hardly two of their axes meet at right angles.
+`skew_arm` and `sliding_arm` are our own designs, in which hardly any two axes meet at right angles.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from dln_jax.mechanics.trees.inertia import inertial_parameters
 
 
 class Arm(NamedTuple):
-    """A tree of d joints, the friction that acts on them, and how far and fast each may be moved."""
+    """A tree of d joints, their friction, and limits of position, velocity and acceleration."""
 
     name: str
     tree: Tree
@@ -22,17 +22,17 @@ class Arm(NamedTuple):
     coulomb: Float[np.ndarray, " d"]
     """Dry friction, N m or N."""
     offset: Float[np.ndarray, " d"]
-    """N m or N."""
+    """Constant torque, N m or N."""
     limits: Float[np.ndarray, "d 2"]
-    """Of the coordinates, rad or m."""
+    """Limits of the coordinates, rad or m."""
     rates: Float[np.ndarray, " d"]
-    """Largest, rad/s or m/s."""
+    """Largest rates, rad/s or m/s."""
     accelerations: Float[np.ndarray, " d"]
-    """Largest, rad/s² or m/s²."""
+    """Largest accelerations, rad/s² or m/s²."""
 
 
 def skew_arm() -> Arm:
-    """Seven revolute joints of which no two neighbours are parallel or perpendicular, on a tilted base."""
+    """Seven revolute joints on a tilted base, no two neighbours parallel or perpendicular."""
     rows = [  # alpha, a, d, theta
         [0.35, 0.0, 0.3, 0.4], [-1.1, 0.05, 0.1, 0.2], [0.8, 0.12, 0.3, -0.5], [1.25, 0.25, -0.05, 0.3],
         [-0.6, 0.1, 0.28, 0.0], [1.0, -0.06, 0.08, 0.7], [-1.3, 0.07, 0.1, -0.2],
@@ -50,7 +50,7 @@ def skew_arm() -> Arm:
 
 
 def sliding_arm() -> Arm:
-    """Six joints, the third of which slides; the first two are not perpendicular, the last four are skew."""
+    """Six joints, the third prismatic; the first two are not perpendicular, the last four are skew."""
     rows = [
         [0.2, 0.0, 0.4, 0.0], [-1.3, 0.1, 0.0, 0.3], [1.0, 0.05, 0.2, 0.2],
         [0.7, 0.15, 0.1, -0.4], [-1.2, 0.1, 0.25, 0.0], [0.9, 0.05, 0.1, 0.5],
@@ -69,7 +69,7 @@ def sliding_arm() -> Arm:
 
 
 def _links(d: int) -> list[np.ndarray]:
-    """Bodies that exist, from 4 kg at the base to some 0.5 kg at the tip, none of them symmetrical."""
+    """Physically consistent, asymmetric bodies, from 4 kg at the base to some 0.5 kg at the tip."""
     links = []
     for link in range(d):
         mass = 4.0 * 0.72**link

@@ -17,8 +17,8 @@ def rotary_pendulum(
 ) -> Scene:
     """The rotary pendulum with q = (arm angle, pole angle from upright); kg, m, m/s² and N m s.
 
-    Arm and pole are uniform rods. Only the arm is driven: tau = B u with B = (1, 0)ᵀ. The sizes are those of a common
-    desktop plant.
+    Arm and pole are uniform rods. Only the arm is driven: tau = B u with B = (1, 0)ᵀ. The dimensions are those of a
+    common desktop plant.
     """
     centre = pole_length / 2
     about_hinge = pole_mass * pole_length**2 / 3

@@ -24,7 +24,7 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
     `zero` is the posture at q = 0, which sets the gravity convention: "horizontal" is that of all published data
     (gravity in cos q), "hanging" that of most textbooks (gravity in sin q).
     """
-    # The vertical of one convention is the other's, turned by a quarter.
+    # The conventions differ by a quarter turn.
     if zero == "horizontal":
         name, offset, rise, slope = "two-link-arm", 0.0, jnp.sin, jnp.cos
     else:
@@ -56,7 +56,7 @@ def two_link_arm(*, zero: Literal["horizontal", "hanging"] = "horizontal") -> Sc
 
 
 def joint_angles(tip: Vector) -> Vector:
-    """Inverse kinematics: q [2] with the elbow bent counter-clockwise (q2 > 0), for a tip [2] in m within reach.
+    """Inverse kinematics: q [2] with the elbow bent counter-clockwise (q2 > 0), for a tip [2] in m.
 
     Angle zero is horizontal. A tip out of reach gives NaN.
     """

@@ -9,7 +9,7 @@ from dln_jax.types import Matrix, Needs, Scalar, Vector
 
 
 class Links(NamedTuple):
-    """Of the inner and the outer link."""
+    """Parameters of the inner and the outer link."""
 
     masses: tuple[float, float] = (0.5234602302310271, 0.6255677234174437)
     """kg."""
@@ -30,7 +30,7 @@ def two_link_pendulum(
 ) -> Scene:
     """The acrobot or the pendubot with q = 0 hanging and q[1] relative to the first link; m/s² and N m s.
 
-    The links are by default those of design C.1, model 1.1, of the benchmark of Wiebe et al. (2022, "RealAIGym").
+    The default links are those of design C.1, model 1.1, of the benchmark of Wiebe et al. (2022, "RealAIGym").
     """
     (m1, m2), (l1, l2), (r1, r2), (I1, I2) = links
     coupling = m2 * l1 * r2

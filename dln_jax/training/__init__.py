@@ -1,3 +1,3 @@
-"""From a user's data to a run folder: training, errors, figures."""
+"""Training: from data to a run folder with a model, test errors and figures."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""From options to trained policies of a soft creature, and to the run folder of the best: model, numbers, gait."""
+"""Trains policies of a soft creature from options, and writes the run folder of the best: model, metrics, gait."""
 
 import math
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from dln_jax.zoo.parameter_files import save_tree
 from dln_jax.zoo.run import MODEL
 
 GOAL = 1.0
-"""Body lengths that the methods are compared by."""
+"""Distance in body lengths by which the methods are compared."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Options:
 
 
 def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Task:
-    """The task; refuses what cannot be trained by these methods and devices, before anything is written."""
+    """Makes the task, and refuses settings that these methods and devices cannot train, before anything is written."""
     require_positive(episode=given.episode, clock_period=given.clock_period)
     require_positive_if_given(given, ["seeds", "steps", "until", "window", "width", "lanes"])
     require_seed(given.seed, given.seeds)
@@ -78,7 +78,7 @@ def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Tas
 
 
 def announce(task: Task) -> None:
-    """Says what is trained."""
+    """Prints the creature and the episode."""
     size = f"{len(task.creature.mesh.vertices)} vertices, {task.muscle_count} muscles, {task.length:.3g} m long"
     print(f"{task.creature.name}: {size}; episodes of {task.episode} steps of {TIME_STEP} s; f64")
     for line in device_lines("f64"):
@@ -94,7 +94,7 @@ def learned(
     directory: Path | None = None,
     resume: bool = False,
 ) -> Trained:
-    """All seeds of one method, stored in a folder where one is given."""
+    """Trains all seeds of one method, with checkpoints in `directory`, if any."""
     steps = given.steps or STEPS[method]
     with progress(given.seeds * steps, "environment steps") as show:
 
@@ -121,7 +121,7 @@ def learned(
 def write_run(
     folder: Path, task: Task, method: Method, trained: Trained, given: Options, *, figures: bool
 ) -> dict[str, float]:
-    """Model, metrics, figure and GIF (at half the speed of the motion) of the best seed; gives the metrics."""
+    """Writes model, metrics, figure and GIF (at half speed) of the best seed; returns the metrics."""
     best, creature = trained.best, task.creature.name
     if not math.isfinite(best.distance):
         raise InputError(f"no evaluation converged; {folder} holds no model: lower the number of steps or the width")
@@ -155,7 +155,7 @@ def write_run(
 
 
 def metrics_of(task: Task, trained: Trained, seen: Walk) -> dict[str, float]:
-    """Of the best seed, whose episode is `seen`, and medians of all; those that are finite."""
+    """Finite metrics of the best seed, whose episode is `seen`, and medians over all seeds."""
     best = trained.best
     records = [of.records for of in trained.learned]
     heights = seen.x[:, :, 1].mean(axis=1) / task.creature.mesh.vertices[:, 1].mean()

@@ -22,9 +22,9 @@ from dln_jax.metrics.latency import one_step
 from dln_jax.zoo.run import load
 
 ROOT = Path(__file__).parents[2]
-"""Where the package is, which the process is to import."""
+"""Folder of the package, from which the process imports it."""
 LIMIT = 120.0
-"""Seconds after which the process is given up."""
+"""Time limit of the process, s."""
 STATES = 512
 
 
@@ -41,7 +41,7 @@ class Arguments:
 
 
 def main(given: Arguments) -> None:
-    """Times, and prints JSON."""
+    """Times the calls and prints JSON."""
     enable_low_latency()
     states = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
     system = load(given.run).flow if given.function == "rates" else load(given.run).dynamics
@@ -57,9 +57,9 @@ def low_latency_metrics(
     *,
     function: Literal["inverse_dynamics", "rates"] = "inverse_dynamics",
 ) -> dict[str, float]:
-    """What `main` prints, as metrics; none where the process fails, and `say` gets a line of why.
+    """Runs `main` in a process and returns its result as metrics; empty if it fails, with the reason passed to `say`.
 
-    `states` are the arguments of the function, each [N, d].
+    `states` are the arguments of the function, [N, d] each.
     """
     command = [sys.executable, "-m", "dln_jax.training.low_latency_calls", "--run", str(folder.resolve())]
     data = io.BytesIO()
@@ -70,7 +70,7 @@ def low_latency_metrics(
             input=data.getvalue(),
             capture_output=True,
             cwd=ROOT,
-            # The mode is one of the CPU; a second process would fight the first for a GPU's memory.
+            # The mode is for the CPU; a second process would compete with the first for a GPU's memory.
             env={**os.environ, "JAX_PLATFORMS": "cpu"},
             timeout=LIMIT,
         )
@@ -85,7 +85,7 @@ def low_latency_metrics(
 
 
 def last_line(output: bytes) -> str:
-    """Of what a process printed."""
+    """The last line of a process's output."""
     return next(iter(reversed(output.decode(errors="replace").strip().splitlines())), "it printed nothing")
 
 

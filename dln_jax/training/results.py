@@ -1,4 +1,4 @@
-"""What every kind of run shows and keeps alike: its numbers with their units, and its costs."""
+"""Output common to all kinds of runs: tables with units, and costs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -13,28 +13,28 @@ from dln_jax.learning.engine.problem import Progress, Training
 from dln_jax.metrics.latency import Latency
 
 OF_LOSSES = {"error": "loss", "loss": "training loss"}
-"""Words of a curve that shows losses."""
+"""Labels of a curve that shows losses."""
 
 
 def losses(at: Progress) -> str:
-    """For a line of progress; of several seeds the medians."""
+    """Losses for a line of progress; medians over seeds."""
     return f"loss {np.median(at.loss):.2e}  validation {np.median(at.validation):.2e}"
 
 
 def settings_of(optimiser: Optimiser) -> dict[str, Any]:
-    """For the file of arguments."""
+    """Settings of the optimiser for the file of arguments."""
     return {"optimizer": name_of(optimiser), **optimiser._asdict()}
 
 
 def unit_of(metric: str, units: Mapping[str, str]) -> str:
-    """Of one of `units`, of a time, or of what has none."""
+    """Unit of a metric: from `units`, or of a time by its suffix; empty otherwise."""
     return units.get(metric, "s" if metric.endswith("_seconds") else "µs" if metric.endswith("_us") else "")
 
 
 def print_numbers(
     rows: Iterable[Sequence[str]], *, title: str | None = None, columns: Sequence[str] = ("quantity", "value", "unit")
 ) -> None:
-    """Prints lines of a quantity, its values and perhaps their unit."""
+    """Prints a table of quantities, their values and units."""
     justify = {"quantity": "left", "joint": "left", "unit": "left"}
     table = Table(*(Column(each, justify=justify.get(each, "right")) for each in columns), title=title)  # type: ignore
     for row in rows:
@@ -43,12 +43,12 @@ def print_numbers(
 
 
 def one_step_metrics(latency: Latency) -> dict[str, float]:
-    """Of single calls."""
+    """Latency metrics of single calls."""
     return {"one_step_p50_us": latency.p50_us, "one_step_p99_us": latency.p99_us}
 
 
 def cost_metrics(training: Training, latency: Latency, *, parameters: int, best_step: int) -> dict[str, float | int]:
-    """What a model took to train, and what its calls take."""
+    """Costs of training a model and of its calls."""
     seconds = {"compile_seconds": training.compile_seconds, "train_seconds": training.train_seconds}
     steps = {"parameters": parameters, "steps": training.stop.step, "best_step": best_step}
     return {**steps, **seconds, **one_step_metrics(latency)}

@@ -1,4 +1,4 @@
-"""What `simulate` shows of a motion: numbers, warnings, figures and the GIF."""
+"""Output of `simulate` for a motion: metrics, warnings, figures and the GIF."""
 
 import math
 from pathlib import Path
@@ -25,12 +25,12 @@ TITLES = {
     "creature": "creature: a wave of its muscles makes it crawl",
 }
 STACKED = ("twist", "creature")
-"""Scenes whose moments are drawn below each other."""
+"""Scenes whose moments are drawn one below the other."""
 FRAMES_PER_SECOND, MOST_FRAMES = 20.0, 100
 
 
 class Motion(NamedTuple):
-    """A motion of T steps, its start included in t, x and v."""
+    """A motion of T steps; t, x and v include the start."""
 
     t: np.ndarray
     x: np.ndarray
@@ -41,7 +41,7 @@ class Motion(NamedTuple):
 
 
 def results(scene: str, mesh: Mesh, motion: Motion) -> list[Row]:
-    """What the table shows."""
+    """Rows of the table."""
     info, iterations = motion.info, motion.info.iterations
     ratios = np.stack([simplex_volumes(x.astype(np.float64), mesh.elements) for x in motion.x]) / volumes(mesh)
     numbers = (
@@ -65,17 +65,17 @@ LABELS = {
     "smallest_volume_ratio": "smallest J = volume / rest volume",
     "energy_created_J": "energy created by the time step (damped where negative)",
 }
-"""Of numbers that do not say it themselves."""
+"""Labels of quantities that are not self-explanatory."""
 
 
 def line(row: Row) -> tuple[str, str, str]:
-    """A number in words, its value and its unit."""
+    """A row as label, value and unit."""
     label = LABELS.get(row.quantity, row.quantity.replace("_", " "))
     return label, f"{row.value:.4g}", "" if row.unit == "1" else row.unit
 
 
 def warn(motion: Motion) -> None:
-    """Says what is not as it should be."""
+    """Warns about steps that failed, overlapping components and non-finite motions."""
     info, steps = motion.info, len(motion.t) - 1
     growth, at_hand = np.asarray(info.energy_growth), np.asarray(info.energy_at_hand)
     diverged = ~(growth <= LARGEST_GROWTH * at_hand)
@@ -104,20 +104,20 @@ def warn(motion: Motion) -> None:
 
 
 def finite_moments(motion: Motion) -> int:
-    """How many moments come before the first that is not finite."""
+    """Number of moments before the first that is not finite."""
     bad = np.array([not np.isfinite(x + v).all() for x, v in zip(motion.x, motion.v, strict=True)])
     return int(np.argmax(bad)) if bad.any() else len(bad)
 
 
 def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: str, figures: bool) -> Moments:
-    """Writes the figures and the GIF; gives what the picture of moments shows."""
+    """Writes the figures and the GIF; returns the moments drawn."""
     shown = finite_moments(motion)
     dt = float(motion.t[1])
     t, x, v = motion.t[:shown], motion.x[:shown], motion.v[:shown]
     driven = drive(example, dt, max(shown - 1, 1))
     control = driven.control
     if control is not None:
-        # The start has the actuation of the first step.
+        # The start is shown with the actuation of the first step.
         control = jnp.concatenate([control[:1], control])[:shown]
     picture = moments(scene, example, t, x)
     if not figures:
@@ -144,7 +144,7 @@ def draw(scene: str, example: Example, motion: Motion, folder: Path, *, title: s
 
 
 def what_takes(example: Example) -> str | None:
-    """What takes energy away, where nothing feeds it in."""
+    """Label of the energy that is dissipated; `None` if energy is fed in."""
     if example.control is not None or example.held_path is not None:
         return None
     rubs = any(getattr(parameters, "friction", None) is not None for parameters in example.scene.params.terms.values())
@@ -152,13 +152,13 @@ def what_takes(example: Example) -> str | None:
 
 
 def moments(scene: str, example: Example, t: np.ndarray, x: np.ndarray) -> Moments:
-    """The moments worth a picture, or start, middle and end where the motion is too short for them."""
-    # Pictures of bodies in space hide each other.
+    """The scene's selected moments, or start, middle and end if the motion is too short for them."""
+    # Bodies in space hide each other in the figure, so fewer moments are drawn.
     every = 1 if scene in STACKED or example.scene.mesh.dimension == 2 else 2
     within = [moment for moment in example.moments[::every] if moment <= t[-1] + 1e-9]
     times = within if len(within) > 1 else [0.0, t[-1] / 2, t[-1]]
     chosen = np.unique(np.abs(t[:, None] - np.array(times)).argmin(axis=0))
-    # A beam's times stand beside its tip.
+    # For a beam the times are written beside its tip.
     rest = example.scene.mesh.vertices
     tip = int(np.argmax(rest[:, 0] - 1e-6 * rest[:, -1])) if scene == "beam" else None
     stacked = scene in STACKED
@@ -168,7 +168,7 @@ def moments(scene: str, example: Example, t: np.ndarray, x: np.ndarray) -> Momen
 
 
 def with_slope(example: Example, x: np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """The body and, where the ground rises, a wedge below it: the animation knows level ground only."""
+    """The body and, for sloping ground, a wedge below it, since the animation draws level ground only."""
     mesh = example.scene.mesh
     if not example.ground:
         return mesh, x

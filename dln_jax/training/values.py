@@ -1,4 +1,4 @@
-"""Value functions of published plants into run folders, and back from them."""
+"""Trains value functions of published plants, and saves and loads their run folders."""
 
 import functools
 import itertools
@@ -30,19 +30,19 @@ from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import REMEDY, load_manifest, load_tree, save_tree
 
 VALUE = "value"
-"""Name of the file pair in a run's folder that holds the value function."""
+"""Stem of the pair of files in a run folder that holds the value function."""
 OTHER_NAMES = {"furuta": "rotary-pendulum", "cartpole": "cart-pole"}
 METHODS = ("fitted", "residual")
 ROUNDS = 6
-"""Of new samples at the problem's own discount."""
+"""Number of resamplings at the problem's own discount."""
 ITERATIONS = 15
-"""Of Gauss-Newton for each discount."""
+"""Gauss-Newton iterations per discount."""
 Report = Callable[[int, int, str], None]
-"""(iterations done, of how many, what they came to)."""
+"""(iterations done, total iterations, result as text)."""
 
 
 class Family(NamedTuple):
-    """What `value_network` is given beside a problem, as JSON values."""
+    """Arguments of `value_network` other than the problem, as JSON values."""
 
     widths: tuple[int, ...]
     members: int
@@ -52,27 +52,27 @@ class Family(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """A value function of one seed."""
+    """Value function of one seed."""
 
     parameters: Any
     validation: float
     train_seconds: float
-    """Compilation included."""
+    """Includes compilation."""
 
 
 @dataclass(frozen=True, eq=False)
 class ValueRun:
-    """A value function from its folder."""
+    """A value function loaded from its folder."""
 
     name: str
-    """Of the plant."""
+    """Name of the plant."""
     plant: ValuePlant
     network: ValueNetwork
     parameters: Any
 
     @property
     def problem(self) -> ControlProblem:
-        """What is controlled, at which cost."""
+        """The control problem: dynamics and cost."""
         return self.plant.problem
 
     @functools.cached_property
@@ -87,10 +87,10 @@ class ValueRun:
 
 
 def plant_named(name: str, goal: Sequence[float] | None = None) -> ValuePlant:
-    """The plant of a name, with a posture [d] other than upright as its goal.
+    """The plant with this name, with a posture [d] other than upright as its goal, if requested.
 
     Raises:
-        InputError: unknown names, which lists those that there are, or a goal that cannot be held.
+        InputError: an unknown name (the message lists all), or a goal of the wrong length or that no control can hold.
     """
     name = OTHER_NAMES.get(name, name)
     if name not in PLANTS:
@@ -110,7 +110,7 @@ def family_of(plant: ValuePlant, family: Family) -> ValueNetwork:
 
 
 def usual(name: str, method: str) -> Fit:
-    """Network and numbers that a plant is trained with unless others are asked for."""
+    """Default network and training settings of a plant."""
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     if method == "residual":
@@ -126,7 +126,7 @@ def by_iteration(
     report: Report,
     mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by fitted value iteration, one for each seed; devices share the states."""
+    """Fits value functions by fitted value iteration, one per seed; devices share the states."""
     done, total = itertools.count(1), len(seeds) * numbers.iterations
 
     def told(at: Progress) -> None:
@@ -147,7 +147,10 @@ def by_equation(
     report: Report,
     mesh: Mesh | None = None,
 ) -> list[Trained]:
-    """Values by the residual of the Hamilton-Jacobi-Bellman equation, one for each seed; devices share the samples."""
+    """Fits value functions by the residual of the Hamilton-Jacobi-Bellman equation, one per seed.
+
+    Devices of a mesh share the samples.
+    """
     network, discounts = family_of(plant, family), discounts_down_to(plant.problem.discount)
     each = len(discounts) - 1 + ROUNDS
     trained: list[Trained] = []
@@ -168,7 +171,7 @@ def by_equation(
 
 
 def measured(plant: ValuePlant, law: Law, *, count: int = 100, seed: int = 0) -> dict[str, float]:
-    """Returns of a law in the published evaluation, from both kinds of starts; a start that fails counts as NaN."""
+    """Returns of a law in the published evaluation, from both kinds of starts; a failed start counts as NaN."""
     numbers: dict[str, float] = {}
     for where in ("down", "uniform"):
         found = evaluate(plant, law, starts(plant, where, count, seed))
@@ -195,7 +198,7 @@ def save_value(folder: Path, plant: str, goal: Sequence[float] | None, family: F
 
 
 def load_value(folder: str | Path) -> ValueRun:
-    """The value function that a run of train_value left in its folder.
+    """Loads the value function from the folder of a run of train_value.
 
     Raises:
         InputError: there is none, or its files are damaged or of another release.
@@ -228,7 +231,7 @@ def load_value(folder: str | Path) -> ValueRun:
 
 
 def _stated(value: Any, hint: Any) -> bool:
-    """Whether a JSON value is one of a field of `Family`."""
+    """Whether a JSON value is valid for a field of `Family`."""
     if get_origin(hint) is tuple:
         return isinstance(value, list) and all(matches(each, int) for each in value)
     return matches(value, hint)

@@ -1,4 +1,4 @@
-"""The models by name, and trained ones in folders: what describes a model, saves it and loads it."""
+"""The model zoo: models by name, their descriptions, and trained models saved to and loaded from folders."""
 
 from dln_jax.zoo.catalogue import CATALOGUE, Entry, Properties
 from dln_jax.zoo.descriptions import build, describe, describe_for, typical_sizes

@@ -1,7 +1,7 @@
-"""The models by name: what makes each, what its typical sizes are taken from, and what it is by construction.
+"""Catalogue of models by name: the factory, the scales taken from data, and the properties by construction.
 
-A name is the same on command lines, in files, in tables and beside published numbers. Behaviour hangs on `Properties`,
-never on how a name is spelled.
+A name is the same on command lines, in files, in tables and beside published numbers. Behaviour depends on
+`Properties`, never on the spelling of a name.
 """
 
 import inspect
@@ -41,36 +41,36 @@ from dln_jax.zoo.pictures import make_picture_model
 
 
 class Properties(NamedTuple):
-    """What a model is for any parameters."""
+    """Properties of a model that hold for any parameters."""
 
     energy: bool = True
-    """Its functions come from an energy, so that it has a mass matrix."""
+    """Its functions derive from an energy, so it has a mass matrix."""
     definite: bool = False
-    """Its mass matrix is positive definite."""
+    """Its mass matrix is positive definite by construction."""
     canonical: bool = False
-    """It is a function of (q, p), which Hamilton's equations fit to data with momenta."""
+    """It is a function of (q, p), fitted by Hamilton's equations to data with momenta."""
     linear: bool = False
-    """Its parameters enter linearly, so that one least-squares problem fits them."""
+    """Its parameters enter linearly, so one least-squares problem fits them."""
     searched: bool = False
-    """A search of its own finds its parameters (`learning.kinematics`)."""
+    """A dedicated search finds its parameters (`learning.kinematics`)."""
     kernel: bool = False
-    """It is made of samples, by as many equations as they have torques (`learning.kernel`)."""
+    """It is built from training samples, with one equation per torque (`learning.kernel`)."""
 
 
 class Entry(NamedTuple):
     """A model of the catalogue."""
 
     factory: Callable[..., Any]
-    """Keywords, of which `needs` and `dtype` where it takes them -> model."""
+    """Makes the model from keywords, including `needs` and `dtype` if it takes them."""
     properties: Properties
     sizes: Mapping[str, tuple[str, ...]] = MappingProxyType({})
-    """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation each is."""
+    """Keywords that are typical sizes, and the arrays of `Trajectories` whose standard deviation sets each."""
 
 
 def extending(make: Callable[..., Model], *replaced: str) -> Callable[[Callable[..., Model]], Callable[..., Model]]:
-    """A factory that hands its `**keywords` on to `make` states those of both, but for the replaced ones.
+    """Gives a factory that passes its `**keywords` on to `make` the signature of both, without the replaced ones.
 
-    A description has every keyword that the signature of its factory names.
+    A description stores every keyword in the signature of its factory.
     """
 
     def decorate(factory: Callable[..., Model]) -> Callable[..., Model]:
@@ -85,10 +85,10 @@ def extending(make: Callable[..., Model], *replaced: str) -> Callable[[Callable[
 
 
 def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
-    """The factory of a Hamiltonian whose friction may depend on q: `friction_width` hidden units give it.
+    """Adds friction that may depend on q to a Hamiltonian's factory: a network with `friction_width` hidden units.
 
-    With `friction_width` 0 each coordinate has one coefficient, as `make` has it; without friction in the needs the
-    friction's keywords say nothing.
+    With `friction_width` 0 each coordinate has one coefficient, as in `make`. Without friction in the needs, the
+    friction keywords have no effect.
     """
 
     @extending(make)
@@ -120,7 +120,7 @@ def with_friction_network(make: Callable[..., Model]) -> Callable[..., Model]:
 
 
 def with_friction_laws(make: Callable[..., Model], *, linear: bool = False) -> Callable[..., Model]:
-    """The factory of a model with the friction laws that the needs name; `linear` as for `with_joint_friction`."""
+    """Adds the friction laws named by the needs to a factory; `linear` as for `with_joint_friction`."""
 
     @extending(make, "needs")
     def factory(needs: Needs, **keywords: Any) -> Model:
@@ -133,7 +133,7 @@ def with_friction_laws(make: Callable[..., Model], *, linear: bool = False) -> C
 
 @extending(make_pairwise_hamiltonian, "bodies")
 def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model:
-    """`make_pairwise_hamiltonian` of the bodies that the needs have coordinates for."""
+    """`make_pairwise_hamiltonian` for the bodies whose coordinates the needs state."""
     require_positive(dimension=dimension)
     has_friction = needs.friction or needs.joint_friction
     if set(needs.joints) != {"prismatic"} or needs.degrees_of_freedom % dimension or has_friction:
@@ -145,7 +145,7 @@ def make_pairwise(needs: Needs, *, dimension: int = 2, **keywords: Any) -> Model
 
 @extending(make_rigid_tree, "friction")
 def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> Model:
-    """`make_rigid_tree` of a tree as `mechanics.trees.tree_to_json` gives it, with the friction that the needs name."""
+    """`make_rigid_tree` for a tree from `mechanics.trees.tree_to_json`, with the friction named by the needs."""
     frames = tree_from_json(tree)
     if (frames.joints, frames.needs.gravity) != (needs.joints, needs.gravity):
         raise InputError(
@@ -155,7 +155,7 @@ def make_stored_tree(needs: Needs, *, tree: dict[str, Any], **keywords: Any) -> 
 
 
 def with_residual_network(make: Callable[..., Model]) -> Callable[..., Model]:
-    """The factory of a model with a `make_residual` beside it, whose `velocity_scale` is `resolved_velocity` here."""
+    """Adds a `make_residual` to the factory of a model; its `velocity_scale` is called `resolved_velocity` here."""
 
     @extending(make)
     def factory(
@@ -229,14 +229,14 @@ CATALOGUE = {
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
     "latent-phase": Entry(make_picture_model, Properties(energy=False)),
 }
-"""Every model that a command trains and a file names."""
+"""Every model that a command trains or a file names."""
 
 
 def entry_of(name: str) -> Entry:
-    """The model of a name.
+    """The catalogue entry with this name.
 
     Raises:
-        InputError: an unknown one.
+        InputError: an unknown name.
     """
     if name not in CATALOGUE:
         raise InputError(f"model is {name!r:.60}; this release knows {', '.join(CATALOGUE)}")

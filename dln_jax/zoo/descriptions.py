@@ -1,8 +1,8 @@
-"""What a model's file says of it: JSON values that build the same model again, whatever becomes of defaults.
+"""Model descriptions: JSON values that rebuild a model exactly, independently of any future defaults.
 
-A description has `name`, `precision` (f32 or f64), and every keyword that the signature of the name's factory has
-(`dtype` apart, which the precision stands for). Names are those of the catalogue; "package.module:function" for a
-factory of one's own that can be imported; and "own" for one that whoever loads the model gives.
+A description has `name`, `precision` (f32 or f64), and every keyword in the signature of the name's factory (except
+`dtype`, which follows from the precision). The name is one of the catalogue, "package.module:function" for a user's own
+importable factory, or "own" for a factory that must be passed when the model is loaded.
 """
 
 import importlib
@@ -29,22 +29,23 @@ from dln_jax.zoo.parameter_files import REMEDY
 Description = dict[str, Any]
 """JSON values."""
 STATED = set(Needs._fields) - {"joint_friction", "joint_map", "velocity_scale"}
-"""What needs in a file state; older ones say nothing of the friction of joints, since there was none."""
+"""Fields that stored needs must have; files of older releases lack the fields of joint friction."""
 OWN = "own"
-"""Name of a model whose factory the file does not tell."""
+"""Name of a model whose factory is not stored in the file."""
 
 
 def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any) -> Description:
-    """The description of a model, with every keyword of its factory: those given, and the defaults of the others.
+    """Describes a model by all keywords of its factory: those passed, and the defaults of the others.
 
     Args:
-        model: a name of the catalogue; a factory of one's own, which has to be given again to load the model; or
-            "package.module:function", which is imported, and stored, so that `load(folder, trust=True)` finds it.
+        model: a name of the catalogue; a factory of your own, which must be passed again to load the model; or
+            "package.module:function", which is imported and stored, so that `load(folder, trust=True)` finds it.
         precision: f32 or f64, the factory's `dtype`.
-        keywords: of the factory, in Python or as JSON (an activation or its name, `Needs` or their dictionary).
+        keywords: keywords of the factory, in Python or as JSON (an activation or its name, `Needs` or their
+            dictionary).
 
     Raises:
-        InputError: an unknown name or keyword, one that is missing, or a value that no file can hold.
+        InputError: an unknown name or keyword, a missing keyword, or a value that cannot be stored as JSON.
     """
     require_precision(precision)
     name = model if isinstance(model, str) else OWN
@@ -59,7 +60,7 @@ def describe(model: str | Callable[..., Any], *, precision: str, **keywords: Any
 def describe_for(
     name: str, data: Trajectories, needs: Needs, *, precision: str, pooled: bool = False, **keywords: Any
 ) -> Description:
-    """The description of a model of the catalogue for these training data, whose typical sizes are theirs.
+    """Describes a model of the catalogue for training data, with the typical sizes of these data.
 
     Raises:
         InputError: as `describe` and `typical_sizes`.
@@ -69,16 +70,16 @@ def describe_for(
 
 
 def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dict[str, float | list[float]]:
-    """The typical sizes that a model divides by, to three digits: standard deviations of the data.
+    """Typical sizes by which a model divides, to three digits: standard deviations of the data.
 
     Args:
-        name: of the catalogue.
-        data: for training.
-        pooled: one size for all coordinates, which a phase space needs, in place of one each; the data must then have
-            what it is taken from. Otherwise what they lack leaves the factory's default.
+        name: name in the catalogue.
+        data: training data.
+        pooled: one size for all coordinates, as a phase space needs, instead of one each. The data must then have the
+            arrays; otherwise missing arrays leave the factory's default.
 
     Raises:
-        InputError: numbers so large or small that their squares are infinite or zero, or momenta that are missing.
+        InputError: numbers so large or small that their squares overflow or vanish, or missing momenta.
     """
     sizes: dict[str, float | list[float]] = {}
     for keyword, keys in entry_of(name).sizes.items():
@@ -97,16 +98,16 @@ def typical_sizes(name: str, data: Trajectories, *, pooled: bool = False) -> dic
 
 
 def build(description: Description, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Any:
-    """The model that a description stands for: a `Model`, or one of functions or pictures.
+    """Builds the model of a description: a `Model`, or a model of functions or images.
 
     Args:
-        description: as `describe` gives it.
-        factory: of one's own, for a model that is not of the catalogue.
+        description: from `describe`.
+        factory: your own factory, for a model outside the catalogue.
         trust: import the factory that the description names.
 
     Raises:
-        InputError: an unknown name, a keyword that is missing, unknown or of another type, or one that the factory
-            refuses; or a factory of one's own that was neither given nor trusted.
+        InputError: an unknown name; a keyword that is missing, unknown, of the wrong type or refused by the factory; or
+            a factory outside the catalogue that is neither passed nor trusted.
     """
     name = description.get("name")
     if not isinstance(name, str):
@@ -132,7 +133,7 @@ def build(description: Description, *, factory: Callable[..., Any] | None = None
 
 
 def factory_of(name: str, given: Callable[..., Any] | None = None, *, trust: bool = False) -> Callable[..., Any]:
-    """The factory of a name: the catalogue's, the given one, or, trusted, an imported one; arguments as `build`.
+    """The factory of a name: from the catalogue, as passed, or imported if trusted; arguments as `build`.
 
     Raises:
         InputError: as `build`.
@@ -162,14 +163,14 @@ def factory_of(name: str, given: Callable[..., Any] | None = None, *, trust: boo
 
 
 def _parameters(factory: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
-    """What a description has of a factory."""
+    """Parameters of a factory that a description stores."""
     every = inspect.signature(factory).parameters
     variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     return {key: each for key, each in every.items() if key != "dtype" and each.kind not in variable}
 
 
 def require_complete(description: Description, factory: Callable[..., Any]) -> None:
-    """Raises `InputError` unless a description has every key that it should, and no other."""
+    """Raises `InputError` unless a description has exactly the expected keys."""
     expected = {"name", "precision", *_parameters(factory)}
     if missing := expected - set(description):
         raise InputError(f"model description: lacks {', '.join(sorted(missing))}; {REMEDY}")
@@ -198,10 +199,10 @@ def _as_json(key: str, value: Any) -> Any:
 
 
 def _from_json(key: str, value: Any, parameter: inspect.Parameter) -> Any:
-    """A keyword of a factory, hashable where it can be.
+    """Converts a JSON value to a keyword of a factory, with lists as tuples so that it is hashable.
 
     Raises:
-        InputError: it is not what the factory takes.
+        InputError: the value does not fit the factory's annotation.
     """
     if key == "needs":
         return needs_from_json(value)
@@ -218,7 +219,7 @@ def _as_tuples(value: Any) -> Any:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a JSON value may be one of a factory's annotation; what says nothing here is left to the factory."""
+    """Whether a JSON value fits an annotation; annotations not covered here are left to the factory."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, each) for each in inner)

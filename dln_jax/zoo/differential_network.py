@@ -1,4 +1,4 @@
-"""Differential networks, and ensembles of them, as a model of the catalogue: value, Jacobian and Hessian of one x."""
+"""Differential networks and ensembles of them as a model of the catalogue: value, Jacobian and Hessian at one x."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from dln_jax.types import VectorLike, require_positive
 
 
 class Derivatives(NamedTuple):
-    """What the function returns at one x [n]; of an ensemble, the means over its members."""
+    """Derivatives at one x [n]; for an ensemble, means over its members."""
 
     value: Float[Array, "m"]
     jacobian: Float[Array, "m n"]
@@ -26,27 +26,27 @@ class Derivatives(NamedTuple):
 
 
 class FunctionModel(NamedTuple):
-    """A function of x with parameters."""
+    """A parametric function of x."""
 
     init: Callable[[Array], Layers]
-    """Random key -> layers, with the members of the ensemble on the leading axis, also when there is one."""
+    """Random key -> layers, with ensemble members on the leading axis, even for one member."""
     derivatives: Callable[[Layers], Callable[[VectorLike], Derivatives]]
-    """Layers -> function of x [n], which refuses what is no such x."""
+    """Layers -> function of x [n], which checks its argument."""
 
 
 def make_differential_network(
     *, sizes: tuple[int, ...], activation: Activation, members: int, dtype: DTypeLike = jnp.float32
 ) -> FunctionModel:
-    """The model of `nn.differential_mlp`.
+    """Makes the model of `nn.differential_mlp`.
 
     Args:
         sizes: (inputs n, hidden widths ..., outputs m).
-        activation: of the hidden layers.
-        members: networks in the ensemble.
-        dtype: of the parameters.
+        activation: activation of the hidden layers.
+        members: number of networks in the ensemble.
+        dtype: dtype of the parameters.
 
     Raises:
-        InputError: sizes that make no network, or too many layers, or no members.
+        InputError: invalid sizes, too large a network, or no members.
     """
     require_positive(members=members)
     differential_mlp.layer_shapes(sizes)

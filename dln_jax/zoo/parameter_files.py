@@ -1,7 +1,7 @@
-"""Parameter trees on disk: safetensors for the numbers, JSON for what they mean. Nothing that is read can run code.
+"""Parameter trees on disk: tensors as safetensors, metadata as JSON. Reading them never runs code.
 
-The manifest names its tensor file and carries its SHA-256, so that a truncated, swapped or edited file is refused.
-Both files are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new.
+The manifest names its tensor file and stores its SHA-256, so a truncated, swapped or edited file is refused. Both files
+are written beside the old ones and then renamed, the manifest last: a reader sees the old pair or the new.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from dln_jax.files import is_file, matches, read_json, write_bytes, write_json
 from dln_jax.types import InputError
 
 MODEL = "model"
-"""Name of the file pair in a run's folder that holds the trained model."""
+"""Stem of the pair of files in a run folder that holds the trained model."""
 SCHEMA_VERSION = 2
 REMEDY = "restore the file or train again"
 
@@ -26,17 +26,17 @@ REMEDY = "restore the file or train again"
 def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, number: int | None = None) -> None:
     """Writes `name.json` and its tensor file, `name.safetensors` or, numbered, `name-NUMBER.safetensors`.
 
-    Numbered files never replace one another, so that not even a kill between the two renames leaves a torn pair;
-    the file that the manifest named before is removed afterwards.
+    Numbered files never replace one another, so even a kill between the two renames leaves a consistent pair. The
+    tensor file of the previous manifest is removed afterwards.
 
     Args:
         directory: an existing folder.
-        name: of the pair.
+        name: stem of the pair.
         tree: any pytree of arrays.
-        facts: JSON values to store in the manifest beside versions, shapes and digest.
+        facts: JSON values to store in the manifest with versions, shapes and digest.
         number: distinguishes successive states of one run.
     """
-    # safetensors writes memory as it lies: by rows, or the numbers come back in another order.
+    # safetensors writes the raw memory, which must be in row-major order for the numbers to be read back correctly.
     tensors = {key: np.asarray(leaf, order="C") for key, leaf in _flatten(tree).items()}
     data = safetensors.numpy.save(tensors)
     file_name = f"{name}.safetensors" if number is None else f"{name}-{number:09d}.safetensors"
@@ -57,7 +57,7 @@ def save_tree(directory: Path, name: str, tree: Any, facts: dict[str, Any], *, n
 
 
 def require_fitting(tree: Any, like: Any) -> None:
-    """Raises `InputError` unless a tree has real numbers of the names, shapes and types of another."""
+    """Raises `InputError` unless a tree has real arrays with the names, shapes and dtypes of another."""
     given, expected = _flatten(tree), _flatten(like)
     if different := sorted(set(given) ^ set(expected)):
         state = "unknown" if different[0] in given else "missing"
@@ -71,7 +71,7 @@ def require_fitting(tree: Any, like: Any) -> None:
 
 
 def load_manifest(directory: Path, name: str) -> dict[str, Any]:
-    """The manifest `name.json`, checked for its schema version.
+    """Reads the manifest `name.json` and checks its schema version.
 
     Raises:
         InputError: it is missing, no JSON object, or of another schema.
@@ -94,7 +94,7 @@ def load_manifest(directory: Path, name: str) -> dict[str, Any]:
 
 
 def load_tree(directory: Path, name: str, like: Any) -> Any:
-    """The stored tree, in the structure of `like`.
+    """Reads the stored tree into the structure of `like`.
 
     Raises:
         InputError: a file is missing, truncated or altered, or its tensors do not fit `like`.
@@ -111,7 +111,7 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
         raise InputError(f"{path}: truncated or altered (its SHA-256 is not {name}.json's); restore or train again")
     try:
         tensors = safetensors.numpy.load(data)
-    except Exception as error:  # the decoder's own errors, and NumPy's for types that it does not know
+    except Exception as error:  # the decoder's own errors, and NumPy's for unknown types
         raise InputError(f"{path}: not a safetensors file ({error}); restore it or train again") from error
     expected = _flatten(like)
     for key, array in expected.items():
@@ -123,7 +123,7 @@ def load_tree(directory: Path, name: str, like: Any) -> Any:
                 f"{path}: '{key}' is {stored.dtype} {stored.shape}, expected {array.dtype} {array.shape}; "
                 "load it with the settings and precision it was written with"
             )
-    # Copies: arrays over the file's bytes could not be donated.
+    # Copies, because arrays that share the file's bytes could not be donated.
     leaves = [jax.numpy.array(tensors[key]) for key in expected]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 

@@ -1,4 +1,4 @@
-"""A latent model of pictures: an autoencoder of their principal components, and what moves in the latent plane."""
+"""Latent models of images: an autoencoder of their principal components, and dynamics in the latent plane."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,18 +22,18 @@ from dln_jax.nn.activations import Activation, silu, tanh
 from dln_jax.types import InputError, require_positive
 
 MOST_NUMBERS = 10**8
-"""Of the components of a picture."""
+"""Largest number of entries in the basis of principal components."""
 
 
 class PictureModel(NamedTuple):
-    """Pictures and their latent plane with parameters."""
+    """A parametric model of images and their latent plane."""
 
     init: Callable[[Array], Any]
     """Random key -> {"parameters": of the networks, "components": mean, basis and scale of the components}."""
     pictures: Callable[[Any], LatentPhase]
-    """These -> functions of two pictures after each other [2 n]."""
+    """Parameters -> functions of two successive images [2 n]."""
     of_coefficients: Callable[[float], LatentModel]
-    """Typical coefficient -> the model of the components' coefficients, which is what is trained."""
+    """Typical coefficient -> the model of the components' coefficients, which is the one trained."""
 
 
 def make_picture_model(
@@ -49,19 +49,20 @@ def make_picture_model(
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> PictureModel:
-    """The model of pictures by their principal components, framewise.
+    """Makes a model of images that encodes each frame by its principal components.
 
     Args:
-        field: what moves in the latent plane.
-        pixels: n, of one picture.
-        components: of a picture.
-        field_width: hidden units per layer of what moves there.
-        field_depth: its hidden layers.
+        field: kind of dynamics in the latent plane.
+        pixels: pixels n per image.
+        components: principal components per image.
+        field_width: hidden units per layer of the latent dynamics.
+        field_depth: hidden layers of the latent dynamics.
         width: hidden units per layer of encoder and decoder.
-        momentum_scale: typical size of the momentum in the latent plane, where the coordinate has one of 1.
+        momentum_scale: typical latent momentum, for a typical coordinate of 1.
 
     Raises:
-        InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` in the components.
+        InputError: an unknown field, a size that is not positive, or more than `MOST_NUMBERS` entries in the
+            components.
     """
     require_positive(pixels=pixels, components=components)
     if pixels * components > MOST_NUMBERS:
@@ -106,6 +107,6 @@ def make_picture_model(
 
 
 def with_components(components: Components, parameters: Any, dtype: DTypeLike = jnp.float32) -> Any:
-    """The parameters of a `PictureModel`, from those of its coefficients' model."""
+    """The parameters of a `PictureModel`, from those of the model of its coefficients."""
     arrays = {"mean": components.mean, "basis": components.basis, "scale": components.scale}
     return {"parameters": parameters, "components": {name: jnp.asarray(each, dtype) for name, each in arrays.items()}}

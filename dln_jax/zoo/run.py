@@ -1,4 +1,4 @@
-"""A trained run from its folder: the model, its parameters, and the jitted functions that they give."""
+"""A trained run loaded from its folder: the model, its parameters, and jitted functions."""
 
 import functools
 from collections.abc import Callable
@@ -30,50 +30,52 @@ Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFl
 AnyModel = Model | FunctionModel | PictureModel
 
 
-# No NamedTuple: functions that are asked for twice have to be the same, or they would be compiled twice.
+# Not a NamedTuple: cached properties return the same function on every access, so it is compiled only once.
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trained model. Its functions are jitted, take one state, as arrays or lists of numbers, and compute in the
-    precision of the training. To train on, to differentiate by parameters or to build on the model, take `model` and
-    `parameters`: `mechanics.equations.dynamics(run.model.energies(parameters))`.
+    """A trained model with jitted functions of one state.
+
+    The functions take arrays or lists of numbers and compute in the precision of the training. To continue training, to
+    differentiate by parameters or to extend the model, use `model` and `parameters`:
+    `mechanics.equations.dynamics(run.model.energies(parameters))`.
     """
 
     model: AnyModel
-    """The pair of pure functions: of a mechanical system, of a function, or of pictures."""
+    """Pair of pure functions: of a mechanical system, of a function, or of images."""
     parameters: Parameters
-    """Of the model."""
+    """Parameters of the model."""
     description: Description
-    """What builds the model."""
+    """Description from which the model is built."""
     uncertainty: Uncertainty | None = None
-    """What the model does not know, where the run has it."""
+    """Uncertainty of the model, if the run has one."""
 
     @functools.cached_property
     def energies(self) -> Any:
-        """One of `mechanics.equations.System`, not jitted. InputError for a model of no mechanics."""
+        """One of `mechanics.equations.System`, not jitted. Raises InputError for a model without mechanics."""
         return self._of("energies", Model).energies(self.parameters)
 
     @functools.cached_property
     def dynamics(self) -> Dynamics | PlainDynamics:
-        """Functions of coordinates and velocities. InputError for a model that has none."""
+        """Functions of coordinates and velocities. Raises InputError for a model that has none."""
         if isinstance(self.energies, PhaseRates):
             raise self._refusal("dynamics")
         return compiled(equations.dynamics(self.energies, degrees_of_freedom=self._degrees_of_freedom), self.dtype)
 
     @functools.cached_property
     def flow(self) -> Flow | PlainFlow:
-        """Functions of coordinates and momenta, without applied forces. InputError for a model that has none."""
+        """Functions of coordinates and momenta, without applied forces. Raises InputError for a model that has none."""
         if isinstance(self.energies, InverseForward):
             raise self._refusal("flow")
         return compiled(equations.flow(self.energies, degrees_of_freedom=self._degrees_of_freedom), self.dtype)
 
     @functools.cached_property
     def derivatives(self) -> Callable[[VectorLike], Derivatives]:
-        """x [n] -> value, Jacobian and Hessian. InputError for a model that is not a differential network."""
+        """x [n] -> value, Jacobian and Hessian. Raises InputError unless the model is a differential network."""
         return _jitted(self._of("derivatives", FunctionModel).derivatives(self.parameters), self.dtype)
 
     @functools.cached_property
     def pictures(self) -> LatentPhase:
-        """Encoder, decoder, and the flow of the latent plane. InputError for a model that is not of pictures."""
+        """Encoder, decoder, and flow of the latent plane. Raises InputError unless the model is one of images."""
         system = self._of("pictures", PictureModel).pictures(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
@@ -82,14 +84,14 @@ class Run:
     def torque_std(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
         """(q, qd, qdd) -> standard deviation [d] of a measured torque about the model's, N m or N.
 
-        InputError for a run that has none.
+        Raises InputError for a run without uncertainty.
         """
         factor, noise, inflation, _ = self._known_uncertainty
         return _jitted(predictive(self._of("torque_std", Model), self.parameters, factor, noise, inflation), self.dtype)
 
     @functools.cached_property
     def outside(self) -> Callable[[VectorLike, VectorLike, VectorLike], Array]:
-        """(q, qd, qdd) -> whether the state is outside the training data. InputError for a run that cannot tell."""
+        """(q, qd, qdd) -> whether the state is out of distribution. Raises InputError for a run without uncertainty."""
         uncertainty = self._known_uncertainty
         return _jitted(outside(self._of("outside", Model), self.parameters, uncertainty), self.dtype)
 
@@ -104,7 +106,7 @@ class Run:
 
     @property
     def dtype(self) -> Any:
-        """Of the training."""
+        """Floating-point type of the training."""
         return data_type(self.description["precision"])
 
     @property
@@ -131,16 +133,16 @@ class Run:
 def save_model(
     directory: str | Path, description: Description, parameters: Parameters, *, overwrite: bool = False
 ) -> None:
-    """Writes `model.safetensors` and `model.json` into an existing folder, which `load` reads; `dln_jax.save`.
+    """Writes `model.safetensors` and `model.json` into an existing folder, for `load`; public as `dln_jax.save`.
 
     Args:
-        directory: of the run.
-        description: as `describe` gives it.
-        parameters: of the model that it describes.
-        overwrite: replace the model that the folder has, and forget the uncertainty of its parameters.
+        directory: folder of the run.
+        description: from `describe`.
+        parameters: parameters of the described model.
+        overwrite: replace the model in the folder and discard the uncertainty of its parameters.
 
     Raises:
-        InputError: no such folder, one that has a model, or parameters of another model.
+        InputError: the folder does not exist or already has a model, or the parameters are of another model.
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -151,14 +153,14 @@ def save_model(
 
 
 def save(directory: str | Path, description: Description, parameters: Parameters) -> None:
-    """As `save_model`, into the folder of a run that is being trained, whose model is replaced.
+    """Like `save_model`, but replaces the model in the folder of a run that is being trained.
 
     Raises:
         InputError: parameters of another model.
     """
     name = description.get("name")
     if name == OWN or ":" in str(name):
-        like = jax.tree.map(np.asarray, parameters)  # of a factory that only the user has
+        like = jax.tree.map(np.asarray, parameters)  # the factory is the user's, so only the structure is known
     else:
         like = jax.eval_shape(build(description).init, jax.random.key(0))
     require_fitting(parameters, like)
@@ -167,18 +169,17 @@ def save(directory: str | Path, description: Description, parameters: Parameters
 
 
 def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, trust: bool = False) -> Run:
-    """The trained run in a folder.
+    """Loads the trained run in a folder.
 
     Args:
-        directory: what a training command, or `save`, has written.
-        factory: that of a model of one's own.
-        trust: import the factory of one's own that the file names. Give it for files that you have written: importing
-            runs code.
+        directory: folder written by a training command or by `save`.
+        factory: factory of a model outside the catalogue.
+        trust: import the factory that the file names. Use it only for files that you have written: importing runs code.
 
     Raises:
-        InputError: no model in the folder, one that is damaged, altered or of another schema, a factory of one's own
-            that was neither given nor trusted, or a model in double precision while JAX computes in single: the message
-            names the line to add.
+        InputError: the folder has no model, or one that is damaged, altered or of another schema; a factory outside the
+            catalogue is neither passed nor trusted; or the model is in double precision while JAX computes in single
+            (the message names the line to add).
     """
     directory = Path(directory)
     description = read_description(directory)
@@ -195,7 +196,7 @@ def load(directory: str | Path, *, factory: Callable[..., Any] | None = None, tr
 
 
 def read_description(directory: Path) -> Description:
-    """The description in a run's folder; `InputError` if there is none."""
+    """The description in a run's folder; raises `InputError` if there is none."""
     description = load_manifest(directory, MODEL).get("model")
     if not isinstance(description, dict):
         raise InputError(f"{directory / MODEL}.json: describes no model; {REMEDY}")
@@ -203,13 +204,13 @@ def read_description(directory: Path) -> Description:
 
 
 def compiled(functions: Functions, dtype: Any) -> Functions:
-    """The same functions, jitted, with numbers in their arguments converted to one type."""
+    """Jits the functions and converts numbers in their arguments to one dtype."""
     return type(functions)(*(_jitted(function, dtype) for function in functions))
 
 
 def _jitted(function: Callable[..., Any], dtype: Any) -> Any:
     def convert(leaf):
-        # What is no real number stays as it is, for the function to refuse.
+        # Other types stay unchanged, for the function to refuse.
         kinds = (jnp.floating, jnp.integer)
         return leaf.astype(dtype) if any(jnp.issubdtype(leaf.dtype, kind) for kind in kinds) else leaf
 

@@ -1,4 +1,4 @@
-"""Folders of runs: a new one or an existing one, one writer at a time, and nothing left of what came to nothing."""
+"""Run folders: new or resumed, locked for one writer, and removed if a command fails before writing results."""
 
 import itertools
 from collections.abc import Iterator
@@ -11,34 +11,34 @@ from dln_jax.files import PARTIAL, is_file
 from dln_jax.types import InputError
 
 CONFIG = "config.json"
-"""File in a run's folder that holds the arguments it was started with."""
+"""File in a run folder with the arguments that the run was started with."""
 LOCK = ".lock"
-"""File in a run's folder by which it is locked; it stays, and the lock ends with the process that holds it."""
+"""Lock file in a run folder; the file stays, and the lock ends with the process that holds it."""
 
 
 @contextmanager
 def run_folder(out: Path | None, default: str, *, resume: bool = False, resumable: bool = False) -> Iterator[Path]:
-    """Yields the folder of a run, locked: a new one, `out` or the first free number behind `runs/default`.
+    """Yields the locked folder of a run: `out`, or the first free number after `runs/default`.
 
-    What ends in an `InputError` with nothing written but the arguments leaves no folder, so that the same command can
-    be given again.
+    If an `InputError` occurs while the folder holds nothing but the arguments, the folder is removed, so that the same
+    command can be repeated.
 
     Args:
         out: the folder, which may exist if it is free.
-        default: name of the folder where `out` is `None`.
-        resume: the folder is that of an existing run, which is continued.
-        resumable: whether the command that asks could continue a run in the folder.
+        default: name of the folder if `out` is `None`.
+        resume: continue the existing run in the folder.
+        resumable: whether the calling command could continue a run in the folder.
 
     Raises:
-        InputError: the folder holds something already, cannot be created, or another process is writing there.
-        KeyboardInterrupt: with the folder as its argument, so that whoever reports it can say where the run is.
+        InputError: the folder is not empty, cannot be created, or another process is writing there.
+        KeyboardInterrupt: with the folder as its argument, so that the handler can report where the run is.
     """
     if resume and out is not None:
         with locked(out), _naming_itself(out):
             yield out
         return
     folder, created = _next_number(Path("runs"), default) if out is None else (out, _create(out))
-    _require_free(folder, resumable)  # before a lock is put there, and again once nobody else can write
+    _require_free(folder, resumable)  # before locking, and again below once no other process can write
     with locked(folder):
         _require_free(folder, resumable)
         try:
@@ -50,17 +50,17 @@ def run_folder(out: Path | None, default: str, *, resume: bool = False, resumabl
 
 
 def holds_only(folder: Path, *names: str) -> bool:
-    """Whether a folder has nothing but files of these names, and what a kill left half-written."""
+    """Whether a folder has only files with these names, and partial files left by a killed process."""
     every = folder.iterdir()
     return all(each.name in names or (each.name.endswith(PARTIAL) and not each.is_dir()) for each in every)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Holds the lock of an existing folder, which also ends with the process, and removes what a kill left behind.
+    """Locks an existing folder until the block or the process ends, and removes partial files of a killed process.
 
     Raises:
-        InputError: another process holds it.
+        InputError: another process holds the lock.
     """
     lock = FileLock(folder / LOCK)
     try:
@@ -87,7 +87,7 @@ def _naming_itself(folder: Path) -> Iterator[None]:
 
 
 def _next_number(parent: Path, name: str) -> tuple[Path, list[Path]]:
-    """Two processes never get one number: creating the folder takes it."""
+    """Creates the folder with the next free number; its creation reserves the number against other processes."""
     created = _create(parent)
     for number in itertools.count(1):
         folder = parent / f"{name}-{number}"
@@ -102,7 +102,7 @@ def _next_number(parent: Path, name: str) -> tuple[Path, list[Path]]:
 
 
 def _create(folder: Path) -> list[Path]:
-    """Creates a folder with those above it, where they are missing; gives the new ones, the deepest first."""
+    """Creates a folder and its missing parents; returns the new folders, the deepest first."""
     try:
         if folder.is_dir():
             return []
@@ -124,7 +124,7 @@ def _require_free(folder: Path, resumable: bool) -> None:
 
 
 def _withdraw(folder: Path, created: list[Path]) -> None:
-    """Removes what holds nothing of value: the arguments of a run that came to nothing, and the folders made for it."""
+    """Removes the arguments of a run without results, and the folders created for it."""
     if not holds_only(folder, CONFIG, LOCK):
         return
     with suppress(OSError):

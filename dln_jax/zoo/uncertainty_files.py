@@ -1,4 +1,4 @@
-"""What a model does not know, stored beside it in the folder of its run: `uncertainty.safetensors` and its JSON."""
+"""Stores the uncertainty of a model in its run folder: `uncertainty.safetensors` and its JSON."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -14,19 +14,19 @@ from dln_jax.types import InputError
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, save_tree
 
 UNCERTAINTY = "uncertainty"
-"""Name of the file pair."""
+"""Stem of the pair of files."""
 
 
 def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: Any) -> None:
-    """Stores what the model in a run's folder does not know, in the precision of the model.
+    """Stores the uncertainty of the model in a run's folder, in the precision of the model.
 
     Args:
-        directory: of a run, with its model.
-        uncertainty: of that model's parameters, as `learning.uncertainty.estimate` finds it.
-        facts: JSON values of how it came about.
+        directory: folder of a run, with its model.
+        uncertainty: uncertainty of the model's parameters, from `learning.uncertainty.estimate`.
+        facts: JSON values on how it was estimated.
 
     Raises:
-        InputError: no model in the folder, or an uncertainty of another number of parameters.
+        InputError: the folder has no model, or the number of parameters differs.
     """
     directory = Path(directory)
     manifest = load_manifest(directory, MODEL)
@@ -42,10 +42,10 @@ def save_uncertainty(directory: str | Path, uncertainty: Uncertainty, **facts: A
 
 
 def load_uncertainty(directory: Path) -> Uncertainty | None:
-    """What is stored beside a run's model; `None` where there is nothing.
+    """Loads the uncertainty stored beside a run's model; `None` if there is none.
 
     Raises:
-        InputError: it is damaged, or of other parameters than the model's.
+        InputError: it is damaged, or belongs to other parameters than the model's.
     """
     path = directory / f"{UNCERTAINTY}.json"
     if not is_file(path):
@@ -74,7 +74,7 @@ def load_uncertainty(directory: Path) -> Uncertainty | None:
 
 
 def _with_harmless(known: Uncertainty) -> Uncertainty:
-    """An uncertainty of an earlier release, with flags as that release gave them."""
+    """Converts an uncertainty of an earlier release, with the out-of-distribution flags of that release."""
     domain, d = known.domain, len(known.noise)
     if not len(domain.reach):
         everywhere = np.full(3 * d, np.finfo(domain.reach.dtype).max)
@@ -83,7 +83,7 @@ def _with_harmless(known: Uncertainty) -> Uncertainty:
 
 
 def discard_uncertainty(directory: Path) -> None:
-    """Removes what is stored, if anything is."""
+    """Removes the stored uncertainty, if any."""
     for ending in ("json", "safetensors"):
         with suppress(OSError):
             (directory / f"{UNCERTAINTY}.{ending}").unlink(missing_ok=True)

@@ -1,7 +1,7 @@
-"""What is wrong with a log before it is learned from: findings in one line each, with what to do about them.
+"""Log validation: findings about a log before it is used for learning, one line each with a remedy.
 
-`quick(data, robot)` looks at few torques, as commands that train do; `examine(recording, robot)` is what `check_data`
-prints.
+`quick(data, robot)` looks at few torques and is run by commands that train; `examine(recording, robot)` is the full
+examination that `check_data` prints.
 """
 
 from dln_jax.data.checks.doctor import Examination, examine, quick

@@ -1,4 +1,4 @@
-"""Checks of single channels: what never moves, moves in steps, or ends at a limit."""
+"""Checks single channels: motionless joints, coarse steps, spikes and saturation."""
 
 import numpy as np
 
@@ -7,25 +7,25 @@ from dln_jax.data.encoders.noise import step_of
 from dln_jax.data.schema import Trajectories
 
 TURNS = 4 * np.pi
-"""rad: two turns, beyond which an angle of an arm is looked at twice."""
+"""rad: two turns; larger angles of an arm are suspicious."""
 WEAK = 0.03
-"""Of the median joint's velocity, below which a joint is hardly moved."""
+"""Fraction of the median joint's velocity below which a joint is hardly excited."""
 COARSE = 3e-4
-"""Steps of an encoder in rad that are worth a word: 1/20000 of a turn."""
+"""rad: smallest encoder step reported, 1/20000 of a turn."""
 RUN = 4
-"""Samples at the very same extreme value that make a flat top."""
+"""Samples at exactly the same extreme value that make a flat top."""
 SHARE = 2e-3
-"""Of all samples, in flat tops, from which a channel is called saturated."""
+"""Fraction of samples in flat tops above which a channel counts as saturated."""
 SPIKE = 4.0
-"""Times the usual change of a channel over two samples, from which a single sample is a spike."""
+"""A spike exceeds the usual change of the channel over two samples by this factor."""
 CLEAR = 3.0
-"""Times the range of its four neighbours, which a spike exceeds."""
+"""A spike exceeds the range of its four neighbours by this factor."""
 ABRUPT = 0.5
-"""Of the typical step between samples: by so much a channel moves into or out of a limit that cuts it off."""
+"""A channel enters or leaves a clipping limit by more than this fraction of the typical step."""
 
 
 def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding]:
-    """Joints that do not move, torques that do not vary, steps and flat tops; `rates` are qd of the filtered q."""
+    """Checks for still joints, constant torques, spikes, steps and flat tops; `rates` are qd of the filtered q."""
     found = []
     still = np.flatnonzero(np.ptp(data.q, axis=0) <= 1e-9 * max(1.0, np.abs(data.q).max()))
     if len(still):
@@ -42,7 +42,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
     if "tau" not in data.estimated:
         constant = np.flatnonzero(np.ptp(data.tau, axis=0) == 0)
         found += _dead(data, still)
-        # A joint without a motor has zero torque, and a passive system has none at all.
+        # A joint without a motor has zero torque; a passive system has only such joints.
         constant = np.array([joint for joint in constant if data.tau[0, joint] != 0], int)
         if len(constant):
             said = f"the torque of {named(constant)} is constant"
@@ -61,7 +61,7 @@ def check_channels(data: Trajectories, rates: np.ndarray | None) -> list[Finding
 
 
 def _dead(data: Trajectories, still: np.ndarray) -> list[Finding]:
-    """Torques that are zero all the time, although the joint moves and nothing says that it has no motor."""
+    """Reports torques that are always zero although the joint moves and no actuation matrix excludes a motor."""
     needs = data.needs
     driven = np.ones(data.degrees_of_freedom, bool)
     if needs is not None and needs.actuation is not None:
@@ -77,7 +77,7 @@ def _dead(data: Trajectories, still: np.ndarray) -> list[Finding]:
 
 
 def _spiky(data: Trajectories) -> list[Finding]:
-    """Single samples far from both neighbours, which themselves agree."""
+    """Reports single samples far from both neighbours, which agree with each other."""
     found = []
     for key, word in (("q", "position"), ("tau", "torque")):
         if key in data.estimated:
@@ -92,9 +92,10 @@ def _spiky(data: Trajectories) -> list[Finding]:
 
 
 def spikes(values: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
-    """Samples [N, k] that leave a channel and come back at once, by far more than it ever changes otherwise.
+    """Mask of samples [N, k] that leave a channel and return at once, by much more than it ever changes otherwise.
 
-    Three neighbours on either side say how the channel runs; the quartiles of the errors of all samples, how well.
+    A sample is compared with the median of the two neighbours on either side. Upper quartiles of that error and of the
+    neighbours' range over all samples give the usual change.
     """
     found = np.zeros(values.shape, bool)
     inside = np.flatnonzero(trajectory[4:] == trajectory[:-4]) + 2
@@ -120,9 +121,10 @@ def _saturated(data: Trajectories, key: str, word: str, remedy: str) -> list[Fin
 
 
 def flat_share(channel: np.ndarray, trajectory: np.ndarray) -> float:
-    """Share of the samples in runs at the largest or smallest value that are entered or left abruptly.
+    """Fraction of samples in runs at the largest or smallest value that are entered or left abruptly.
 
-    A smooth extreme is approached ever more slowly, and a joint at rest stays where it was; a limit cuts a motion off.
+    A smooth extreme is approached ever more slowly and a joint at rest does not move, whereas a limit cuts a motion
+    off.
     """
     size = np.ptp(channel)
     if size == 0:

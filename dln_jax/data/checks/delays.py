@@ -1,11 +1,11 @@
-"""Shifts in time: which samples have neighbours, and the lowest point between samples."""
+"""Helpers for time shifts: interior samples, and minima between samples."""
 
 import numpy as np
 from jaxtyping import Int
 
 
 def vertex(values: np.ndarray, lowest: int) -> float:
-    """Where the parabola through a lowest value and its neighbours has its own lowest, in steps from it."""
+    """Offset of the minimum of the parabola through the lowest value and its neighbours, in steps."""
     if not 0 < lowest < len(values) - 1:
         return 0.0
     before, here, after = values[lowest - 1 : lowest + 2]
@@ -14,6 +14,6 @@ def vertex(values: np.ndarray, lowest: int) -> float:
 
 
 def away_from_ends(part: Int[np.ndarray, " N"], farthest: int) -> Int[np.ndarray, " n"]:
-    """Samples with so many neighbours on both sides in their own part."""
+    """Indices of samples with `farthest` neighbours of the same part on either side."""
     places = np.arange(farthest, len(part) - farthest)
     return places[(part[places - farthest] == part[places]) & (part[places + farthest] == part[places])]

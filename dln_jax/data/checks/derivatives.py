@@ -1,4 +1,4 @@
-"""Checks of rates against what they are rates of: factor, sign and delay."""
+"""Checks qd and qdd against the derivatives of q: factor, sign and delay."""
 
 from typing import NamedTuple
 
@@ -11,31 +11,31 @@ from dln_jax.data.schema import Trajectories
 
 RADIAN = 180 / np.pi
 ALIKE = 0.9
-"""Correlation, after scale and delay, from which two signals are one."""
+"""Correlation, after scaling and delay, above which two signals count as equal."""
 UNLIKE = 0.5
-"""Below which they are not."""
+"""Correlation below which two signals count as unrelated."""
 EXCHANGED = 0.3
-"""Of the error as its own rate, that qd or qdd leave as the other."""
+"""qd and qdd count as exchanged if the error as the other rate is below this fraction of the error as their own."""
 LATE = 0.5
-"""Samples of delay that are worth a word."""
+"""Smallest delay reported, in samples."""
 FARTHEST = 0.25
-"""s, of delay that is looked for."""
+"""s: largest delay tested."""
 RATE_REMEDY = "leave qd and qdd out of the file, and let --cutoff auto derive them from q"
 
 
 class Match(NamedTuple):
-    """measured(t) = factor * derived(t - delay), as well as it goes."""
+    """Least-squares match of two signals, measured(t) = factor * derived(t - delay)."""
 
     factor: float
     delay: float
-    """Samples by which the measured signal is late."""
+    """Delay of the measured signal in samples."""
     correlation: float
     gained: float
-    """Squared error at no delay over that at this one."""
+    """Squared error at no delay over that at `delay`."""
 
 
 def match(measured: np.ndarray, derived: np.ndarray, part: np.ndarray, farthest: int) -> Match:
-    """How a measured signal follows a derived one: the factor and delay of least squared error."""
+    """Factor and delay that minimise the squared error between a measured and a derived signal."""
     shifts = np.arange(-farthest, farthest + 1)
     inside = away_from_ends(part, farthest)
     if len(inside) < 16 or not derived[inside].any():
@@ -53,7 +53,7 @@ def match(measured: np.ndarray, derived: np.ndarray, part: np.ndarray, farthest:
 
 
 def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
-    """Whether qd is the rate of q, and qdd that of qd, where the file has them; `even` is smooth(data, trim=0)."""
+    """Checks that qd is the rate of q, and qdd that of qd, if the file has them; `even` is smooth(data, trim=0)."""
     found = []
     for key, derived, of in (("qd", even.data.qd, "dq/dt"), ("qdd", even.data.qdd, "d²q/dt²")):
         if key in data.estimated:
@@ -76,7 +76,7 @@ def check_derivatives(data: Trajectories, even: Smoothed) -> list[Finding]:
 
 
 def _closer(measured: np.ndarray, own: np.ndarray, other: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Whether each column follows another rate than its own, with any factor, and far better."""
+    """Whether every column, up to a factor, follows the other rate much better than its own."""
     inside = away_from_ends(part, 2)
 
     def left(reference: np.ndarray) -> np.ndarray:

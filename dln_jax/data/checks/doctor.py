@@ -1,4 +1,4 @@
-"""The doctor: all checks in turn, and what they saw beside their findings."""
+"""Runs all checks on a log and collects findings and intermediate results."""
 
 from typing import NamedTuple
 
@@ -21,50 +21,50 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.types import InputError
 
 FARTHEST = 0.1
-"""s, of a delay between q and tau that is looked for; at most `MOST_SHIFTS` samples."""
+"""s: largest delay between q and tau tested; at most `MOST_SHIFTS` samples."""
 MOST_SHIFTS = 20
 EQUATIONS = 1000
-"""Torques, over all joints, by which faults are looked for."""
+"""Number of torques, over all joints, used to search for faults."""
 FEWER, FEWER_EACH = 300, 100
-"""The same where it must be quick: at least so many, and so many of each joint."""
+"""Smaller numbers for `quick`: the minimum over all joints, and the number per joint."""
 BLINDING = ("saturation-tau", "saturation-q", "dead-torque", "constant-torque", "unexcited")
-"""Findings beside which torques are not examined without a robot."""
+"""Without a robot, torques are not examined if one of these findings is present."""
 ESTIMATED = "--cutoff auto, or data.encoders.smooth(), filters q before rates are derived"
 
 
 class Examination(NamedTuple):
-    """What was found, and what it was found in."""
+    """Findings, and the intermediate results behind them."""
 
     findings: list[Finding]
-    """Worst first."""
+    """Most severe first."""
     recording: Recording
     smoothed: Smoothed | None
-    """The log with rates of filtered coordinates; `None` where no stretch is long enough for any."""
+    """The log with rates of filtered coordinates; `None` if no segment is long enough."""
     regression: Torques | None
-    """What its torques tell without a robot; `None` without torques, with too few samples, or with a robot."""
+    """Examination of the torques without a robot; `None` without torques, with too few samples, or with a robot."""
     on_tree: OnTree | None
-    """What the robot's description says of it; `None` without one."""
+    """Comparison with the robot's description; `None` without one."""
     steps: np.ndarray
-    """Of each encoder, rad or m [d]; zero where there are none."""
+    """Encoder resolution, rad or m [d]; zero for channels without steps."""
 
 
 def quick(data: Trajectories, robot: Robot | None = None) -> list[Finding]:
-    """Findings by fewer torques, in a few seconds; arguments as `examine`."""
+    """Runs all checks on fewer torques, in a few seconds; arguments as `examine`."""
     return examine(as_recording(data), robot, equations=quick_equations(data.degrees_of_freedom)).findings
 
 
 def quick_equations(d: int) -> int:
-    """Torques, over all of d joints, by which `quick` looks for faults."""
+    """Number of torques, over all d joints, that `quick` uses to search for faults."""
     return max(FEWER, FEWER_EACH * d)
 
 
 def examine(recording: Recording, robot: Robot | None = None, *, equations: int = EQUATIONS) -> Examination:
-    """All checks.
+    """Runs all checks.
 
     Args:
-        recording: of the log.
-        robot: whose joints are those of the data.
-        equations: torques, over all joints, by which faults of signs, order and delay are looked for.
+        recording: the log.
+        robot: description of the robot, with the joints of the data.
+        equations: number of torques, over all joints, used to search for faults of sign, order and delay.
 
     Raises:
         InputError: the robot has another number of joints than the data.
@@ -90,7 +90,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         findings += _noise(data, even)
         findings += check_derivatives(data, even)
         findings += check_degrees(even.data, joints, driven=driven)
-        # Torques along motions in other units, or of channels that are cut off or dead, say nothing of signs.
+        # Wrong units, and channels that are clipped or dead, make the signs of torques inconclusive.
         sound = not any(each.severity == "error" or each.check in BLINDING for each in findings)
         if driven and sound and robot is None and plain(data):
             regression = examine_torques(
@@ -109,7 +109,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
 
 
 def plain(data: Trajectories) -> bool:
-    """Whether tau are the forces of the coordinates themselves, a motor for each."""
+    """Whether tau acts on the coordinates directly, with one motor per joint."""
     needs = data.needs
     passive = not np.ptp(data.tau, axis=0).all()
     return not passive and (needs is None or (needs.actuation is None and needs.joint_map is None))
@@ -133,12 +133,12 @@ def _farthest(even: Smoothed) -> int:
 def _even(data: Trajectories) -> Smoothed | None:
     try:
         return smooth(data, trim=0.0)
-    except InputError:  # single states, or motions of a few samples: nothing to say of their rates
+    except InputError:  # single states, or motions of a few samples: their rates cannot be checked
         return None
 
 
 def _noise(data: Trajectories, even: Smoothed) -> list[Finding]:
-    """Raw differences of a noisy q."""
+    """Reports accelerations from unfiltered differences of a noisy q."""
     estimated = [key for key in ("qd", "qdd") if key in data.estimated]
     if not estimated or np.isinf(even.cutoff) or even.choice is None:
         return []

@@ -1,15 +1,15 @@
-"""Forces of any energy: the covariance of torques whose kinetic and potential energy are Gaussian processes.
+"""Torques of an unknown robot: their covariance if kinetic and potential energy are Gaussian processes.
 
-The robot is not known, but its torques have a Lagrangian T(q, qd) - V(q), one for all joints. With
+The robot is unknown, but its torques derive from one Lagrangian T(q, qd) - V(q) for all joints. With
 
     V ~ GP(0, v(q, q')),    T = sum over a, b of f_ab(q) qd_a qd_b / 2,    cov(T, T') = k(q, q') (qdᵀ W qd')²,
 
-products of kernels of single angles, the torques d/dt dT/dqd - dT/dq + dV/dq are jointly Gaussian, and their covariance
-is a closed form (the construction of Giacomuzzo et al., arXiv 2310.06585). It contains every tree of rigid bodies with
-revolute joints. Most arms are chains whose columns run from the base to the tip: the energy of a body then depends on
-the joints below it alone, and its kinetic energy not on the first joint. Energies of that form have weights of their
-own, so that few samples suffice where they fit, and those of any energy remain where they do not. Friction, viscous,
-dry on two scales, and an offset, is added to each joint by itself.
+and kernels that are products over the coordinates, the torques d/dt dT/dqd - dT/dq + dV/dq are jointly Gaussian with a
+closed-form covariance (the construction of Giacomuzzo et al., arXiv 2310.06585). The prior contains every tree of rigid
+bodies with revolute joints. Most arms are chains with columns ordered from base to tip: the energy of a body then
+depends on the joints below it only, and its kinetic energy not on the first joint. Such energies have weights of their
+own, so few samples suffice for chains, and the general energies remain for all other robots. Each joint adds its own
+friction: viscous, dry on two scales, and an offset.
 """
 
 from collections.abc import Sequence
@@ -19,28 +19,28 @@ import numpy as np
 from jaxtyping import Float
 
 STRONGEST = 0.5
-"""Dependence of the energies on the angle of the joint with the largest forces; 1 would be a pure cosine."""
+"""Dependence of the energies on the angle of the joint with the largest inertia; 1 is a pure cosine."""
 WEAKEST = 0.03
-"""The same of joints with far smaller forces."""
+"""The same for joints with far smaller inertia."""
 OF_BODY = 0.7
 """Dependence of a body's energies on the angle of each joint that moves it."""
 MOST_BODIES = 8
-"""Bodies of a chain that have energies of their own; in a longer one, every second or third."""
+"""Bodies of a chain with energies of their own; a longer chain uses every second or third."""
 LENGTH = 2.0
-"""Ranges of a prismatic joint, over which energies change."""
+"""Length scale of the energies for a prismatic joint, in multiples of its range."""
 SCALES = (0.02, 0.3)
-"""Of each joint's typical velocity, over which its dry friction changes sign."""
+"""Velocity scales of dry friction, relative to the typical velocity of the joint."""
 
 
 class Parts(NamedTuple):
-    """Covariances [n d, m d] of torques at two sets of states, of which the sum is taken with weights."""
+    """Covariances [n d, m d] of torques at two sets of states, to be summed with weights."""
 
     kinetic: Float[np.ndarray, "a b"]
     potential: Float[np.ndarray, "a b"]
 
 
 class _Kernel(NamedTuple):
-    """A product kernel of the coordinates and its logarithmic derivatives, [n, m] and [n, m, d]."""
+    """A product kernel [n, m] of the coordinates and its logarithmic derivatives [n, m, d]."""
 
     value: np.ndarray
     slope: np.ndarray
@@ -52,12 +52,13 @@ class _Kernel(NamedTuple):
 def covariances(
     states: Sequence[np.ndarray], others: Sequence[np.ndarray], joints: Sequence[str], sizes: np.ndarray
 ) -> list[Parts]:
-    """Covariances of torques without friction: those of any energy, then those of the bodies of a chain.
+    """Covariances of torques without friction: first for an arbitrary energy, then for the bodies of a chain.
 
     Args:
         states, others: q, qd and qdd [n, d].
-        joints: kind of each.
-        sizes: of inertias [d]: W = diag(sizes) for any energy, and their mean for each body, whatever moves it.
+        joints: kinds of the joints.
+        sizes: magnitudes of inertias [d]: W = diag(sizes) for an arbitrary energy, their mean for every joint of a
+            body.
     """
     relative = np.sqrt(sizes / sizes.max())
     ranges = np.maximum(np.ptp(states[0], axis=0), 1e-9)
@@ -80,7 +81,7 @@ def _covariance(
     strengths: tuple[np.ndarray, np.ndarray],
     sizes: np.ndarray,
 ) -> Parts:
-    """Of one energy; `strengths` [d] of the kinetic and the potential one are zero where it ignores a coordinate."""
+    """Covariance of one energy; `strengths` [d] (kinetic, potential) are zero for coordinates that it ignores."""
     kinetic, potential = (
         _kernel(states[0], others[0], joints, strength, ranges, power)
         for strength, power in zip(strengths, (2, 1), strict=True)
@@ -108,7 +109,7 @@ def _kernel(
 
 
 def _hessian(kernel: _Kernel) -> np.ndarray:
-    """h_i h_j + [i = j] e_i: minus the mixed second derivatives over the value [n, m, d, d]."""
+    """h_i h_j + [i = j] e_i [n, m, d, d]: minus the mixed second derivatives, divided by the value."""
     found = kernel.slope[..., :, None] * kernel.slope[..., None, :]
     diagonal = np.arange(kernel.slope.shape[2])
     found[..., diagonal, diagonal] += kernel.bend
@@ -124,14 +125,14 @@ def _kinetic(kernel: _Kernel, rates: Sequence[np.ndarray], others: Sequence[np.n
     U, V, A, B = (W * each for each in (u, v, a, b))
     eye = np.diag(W)
 
-    # Over the kernel's value: D k = uh, D' k = -vh, k_i = h_i, k_j' = -h_j, with D = u . d/dq.
+    # All divided by the kernel's value: D k = uh, D' k = -vh, k_i = h_i, k_j' = -h_j, with D = u . d/dq.
     both = -(uh * vh + np.einsum("ni,mi,nmi->nm", u, v, e))  # D D' k
     d_other = -(uh[..., None] * h + u[:, None] * e)  # D k_j'
     other_d = -(h * vh[..., None] + v[None] * e)  # D' k_i
     mixed = -_hessian(kernel)  # k_ij'
 
     def outer(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """right [m, i] times left [n, j] at [n, m, i, j]."""
+        """The product right[m, i] left[n, j] as [n, m, i, j]."""
         return right[None, :, :, None] * left[:, None, None, :]
 
     def scaled(scalar: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -152,6 +153,6 @@ def _kinetic(kernel: _Kernel, rates: Sequence[np.ndarray], others: Sequence[np.n
 
 
 def friction_columns(qd: Float[np.ndarray, "n d"], typical: Float[np.ndarray, " d"]) -> Float[np.ndarray, "n d 4"]:
-    """Viscous friction, dry friction on two scales, and an offset, of each joint, in units of one."""
+    """Friction columns of every joint, dimensionless: viscous, dry on two scales, and an offset."""
     ratio = qd / typical
     return np.stack([ratio, *(np.tanh(ratio / scale) for scale in SCALES), np.ones_like(qd)], axis=2)

@@ -1,9 +1,8 @@
-"""What a log says for one explanation of its torques against another: predictions of blocks that were left out.
+"""Bayesian evidence for explanations of a log's torques, from predictions of left-out blocks.
 
-An explanation is a Gaussian prior of all torques: a mean, and a sum of covariances whose weights are variances. The
-weights are those of largest likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.07426). Explanations are
-compared by the probability of each block of time given all others, so that a fault has to be visible in most of the
-log before it is one.
+An explanation is a Gaussian prior of all torques: a mean, and a sum of covariances weighted by variances. The weights
+maximise the likelihood (minorisation-maximisation: Zhou et al., arXiv 1509.07426). Explanations are compared by the
+probability of every block of time conditional on all others, so a fault counts only if it shows in most of the log.
 """
 
 import importlib
@@ -14,39 +13,39 @@ import numpy as np
 from jaxtyping import Float
 
 ITERATIONS = 12
-"""Steps to the largest likelihood, which needs no more than a digit of the weights."""
+"""Iterations of the likelihood maximisation; one digit of the weights is enough."""
 BLOCKS = 10
 WEIGHED = 300
-"""Torques by which weights are found, at most; predictions take all."""
+"""Largest number of torques used to find the weights; predictions use all."""
 
 
 class Prior(NamedTuple):
-    """Of the torques of n samples, sample by sample, [n d]."""
+    """Gaussian prior of the torques of n samples [n d], sample by sample."""
 
     mean: Float[np.ndarray, " a"]
     parts: list[Float[np.ndarray, "a a"]]
-    """Covariances that are weighted."""
+    """Covariances, to be weighted."""
     columns: list[Float[np.ndarray, "a k"]]
-    """Factors of more such covariances, C Cᵀ."""
+    """Factors C of further covariances C Cᵀ, to be weighted."""
 
 
 class Explanation(NamedTuple):
-    """How well a prior explains torques."""
+    """How well a prior explains the torques."""
 
     weights: Float[np.ndarray, " w"]
-    """Variance of each part, each factor, and each joint's noise."""
+    """Variance of every part, every factor, and every joint's noise."""
     inverse: Float[np.ndarray, "a a"]
-    """Of the covariance."""
+    """Inverse of the covariance."""
     pull: Float[np.ndarray, " a"]
     """inverse (y - mean)."""
     densities: Float[np.ndarray, " B"]
-    """Logarithm of the probability of each block given the others."""
+    """Log probability of every block conditional on the others."""
     unexplained: Float[np.ndarray, "B d"]
-    """Squared error of each block's predictions over the variance of the joint's torque."""
+    """Squared prediction error of every block, relative to the variance of the joint's torque."""
 
 
 def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = ITERATIONS) -> Explanation:
-    """The weights of largest likelihood, and how well each block is predicted from the others."""
+    """Finds the maximum-likelihood weights and predicts every block from the others."""
     n, d = tau.shape
     few = np.arange(n * d).reshape(n, d)[:: -(-n * d // WEIGHED)].ravel()
     sizes = np.maximum(tau.var(axis=0), 1e-12 * tau.var(axis=0).max())
@@ -65,7 +64,7 @@ def explain(prior: Prior, tau: Float[np.ndarray, "n d"], *, iterations: int = IT
 
 
 def _of(prior: Prior, chosen: np.ndarray) -> Prior:
-    """The prior of some of the torques."""
+    """Restricts the prior to some of the torques."""
     square = np.ix_(chosen, chosen)
     return Prior(
         prior.mean[chosen], [part[square] for part in prior.parts], [columns[chosen] for columns in prior.columns]
@@ -73,7 +72,7 @@ def _of(prior: Prior, chosen: np.ndarray) -> Prior:
 
 
 def _likeliest(prior: Prior, y: np.ndarray, noise: np.ndarray, d: int, iterations: int) -> np.ndarray:
-    """Weights of parts, columns and noise [w], whose likelihood grows with each iteration."""
+    """Weights of parts, columns and noise [w]; the likelihood grows in every iteration."""
     weights = np.concatenate([_start(prior, float(np.mean(y**2 / noise)), noise), np.full(d, 0.05)])
     for _ in range(iterations):
         inverse = _inverse(_covariance(prior, weights, noise, d))
@@ -94,18 +93,18 @@ def _covariance(prior: Prior, weights: np.ndarray, noise: np.ndarray, d: int) ->
         K += weight * part
     for weight, columns in zip(weights[len(prior.parts) :], prior.columns, strict=False):
         K += weight * columns @ columns.T
-    # Rounding of large parts may leave K indefinite where noise is small, as on an exact log or a dead channel.
+    # Rounding of large parts can make K indefinite if the noise is small, as on an exact log or a dead channel.
     K[np.diag_indices_from(K)] += len(K) * np.finfo(float).eps * K.diagonal().max()
     return K
 
 
 def blocks_of(n: int, d: int) -> list[np.ndarray]:
-    """Equations of each block of samples."""
+    """Indices of the equations of every block of samples."""
     return np.array_split(np.arange(n * d).reshape(n, d), min(BLOCKS, n))
 
 
 def screened(found: Explanation, prior: Prior, trials: Sequence[Float[np.ndarray, "n d"]]) -> Float[np.ndarray, "B H"]:
-    """Logarithm of each block's density for other torques, with the same weights, less that of the first of them."""
+    """Log density of every block for other torques at the same weights, relative to the first of them."""
     n, d = trials[0].shape
     Y = np.stack([trial.ravel() for trial in trials], axis=1) - prior.mean[:, None]
     pull = found.inverse @ Y

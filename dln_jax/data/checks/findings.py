@@ -1,4 +1,4 @@
-"""A finding: what was seen in the data, how bad it is, and what to do about it."""
+"""Findings about data: observation, severity and remedy."""
 
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
@@ -8,36 +8,36 @@ from jaxtyping import Int
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""error: what is learned would be wrong, so that commands that learn stop; warning: worse than it need be; note: good
-to know."""
+"""error: a model learned from the data would be wrong, so commands that learn stop; warning: it would be less accurate
+than possible; note: for information."""
 
 
 class Finding(NamedTuple):
-    """One line for a user."""
+    """A finding, shown to the user as one line."""
 
     severity: Severity
     check: str
-    """Stable lower-case name of what was looked at."""
+    """Stable lower-case name of the check."""
     said: str
-    """What was seen, with numbers."""
+    """Observation, with numbers."""
     remedy: str
-    """What to do."""
+    """Recommended action."""
     joints: tuple[int, ...] = ()
-    """Counted from 0; none where it is about all."""
+    """Joints concerned, counted from 0; empty if the finding concerns the whole log."""
 
     @property
     def line(self) -> str:
-        """All of it."""
+        """The finding as one line of text."""
         return f"{self.severity}: {self.said}; {self.remedy}"
 
 
 def told(findings: Iterable[Finding]) -> list[Finding]:
-    """In the order of severity."""
+    """Sorts findings by severity."""
     return sorted(findings, key=lambda each: SEVERITIES.index(each.severity))
 
 
 def named(joints: Sequence[int] | Int[np.ndarray, " j"]) -> str:
-    """ "joint 3" or "joints 1, 2 and 4", counted from 1 as figures do."""
+    """Formats joints as "joint 3" or "joints 1, 2 and 4", counted from 1 as in figures."""
     numbers = [str(joint + 1) for joint in joints]
     if len(numbers) == 1:
         return f"joint {numbers[0]}"

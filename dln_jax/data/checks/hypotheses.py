@@ -1,9 +1,9 @@
-"""Faults of torques as hypotheses: a sign, two columns, a delay and others; each against the log as it is.
+"""Tests hypotheses about faults in torques: a wrong sign, exchanged columns, a delay and others.
 
-A hypothesis counts when blocks of time that were left out are predicted far better with it, nearly all of them. Without
-a robot the torques' prior is that of any energy with friction (`energies`), which holds for arms of any kinematics; a
-robot's file gives a narrower one (`tree`). One fault at a time is taken, the best supported, and the search goes on
-with the log repaired.
+A hypothesis is accepted if it predicts left-out blocks of time much better than the log as recorded, in nearly all
+blocks. Without a robot the prior of the torques is that of an arbitrary energy with friction (`energies`), valid for
+arms of any kinematics; a robot's file gives a narrower prior (`tree`). The best supported fault is repaired, then the
+search is repeated.
 """
 
 import functools
@@ -21,59 +21,59 @@ from dln_jax.data.checks.repaired import Build, Log, sizes_of
 from dln_jax.data.schema import Trajectories
 
 DECISIVE = 15.0
-"""Logarithm of the likelihood ratio over all blocks: odds of three million to one."""
+"""Log likelihood ratio over all blocks that decides: odds of three million to one."""
 MOST_BLOCKS = 0.8
-"""Of the blocks, which have to agree."""
+"""Fraction of blocks that must agree."""
 BETTER = 0.8
-"""Of the unexplained variance, below which a sign or an order has to bring it: with a robot, of all joints, which its
-parameters bind together; without one, of those whose torques change."""
+"""A sign or an order must lower the unexplained variance to this fraction: with a robot that of all joints, since its
+parameters couple them; without one that of the joints whose torques change."""
 LESS_LATE = 0.95
 """The same for a delay."""
 LATE = 0.2
-"""Samples of delay that are worth a word."""
+"""Smallest delay reported, in samples."""
 MOST_FAULTS = 3
 SCANNED, ROUGHLY, CANDIDATES = 250, 3, 2
-"""Equations and iterations by which all single faults are ranked, and how many of a kind are looked at closely."""
+"""Ranking of single faults: equations, iterations, and the number of faults of a kind that are then tested fully."""
 INERTIAS = 8
-"""Configurations at which the sign of inertias is looked at."""
+"""Number of configurations at which the sign of the inertias is tested."""
 NEGATIVE = -5.0
-"""Standard deviations of the sum over joints, below which inertias are negative."""
+"""Inertias are negative if their sum over joints is below this many standard deviations."""
 
 
 class Torques(NamedTuple):
-    """What the torques of a log tell."""
+    """Result of the examination of a log's torques."""
 
     explanation: Explanation
-    """Of the log as it is."""
+    """Explanation of the log as recorded."""
     log: Log
-    """Without its faults."""
+    """The log with its faults repaired."""
     repaired: Explanation
-    """Of that."""
+    """Explanation of the repaired log."""
     tried: Float[np.ndarray, " S"]
-    """Delays, samples."""
+    """Delays tried, in samples."""
     loss: Float[np.ndarray, " S"]
-    """Logarithm of the likelihood ratio of no delay against each."""
+    """Log likelihood ratio of no delay against every delay tried."""
     likely_delay: float
-    """Samples of the delay with the lowest loss."""
+    """Delay with the lowest loss, in samples."""
     viscous: Float[np.ndarray, " d"]
     """N m s or N s/m."""
     coulomb: Float[np.ndarray, " d"]
     """N m or N."""
     coulomb_error: Float[np.ndarray, " d"]
-    """Its standard deviation."""
+    """Standard deviation of `coulomb`."""
     velocity_scale: Float[np.ndarray, " d"]
-    """1/s or m/s, on which dry friction changes its sign."""
+    """1/s or m/s: velocity scale of the smooth sign change of dry friction."""
     rest: Float[np.ndarray, "n d"]
-    """Torques without what is explained by anything but friction."""
+    """Friction and noise: torques minus everything else that was explained."""
 
     @property
     def rows(self) -> np.ndarray:
-        """Samples that were looked at."""
+        """Indices of the samples used."""
         return self.log.rows
 
     @property
     def explained(self) -> Float[np.ndarray, " d"]:
-        """Share of each torque's variance that is predicted in blocks that were left out, without the faults."""
+        """Fraction of each torque's variance that is predicted in left-out blocks after repair."""
         return 1 - self.repaired.unexplained.mean(axis=0)
 
 
@@ -87,17 +87,17 @@ def examine_torques(
     faults: bool = True,
     others: Callable[[Log], list[Log]] = lambda _: [],
 ) -> Torques | None:
-    """Looks for signs, exchanged columns, a delay and `others`; `None` with too few samples.
+    """Searches for wrong signs, exchanged columns, a delay and `others`; `None` with too few samples.
 
     Args:
-        data: at equal steps, with sound rates.
-        build: of priors.
-        farthest: samples of delay that are tried.
-        equations: that are taken, n d.
-        ambiguous: whether the prior is that of any robot: it allows negative inertias, so that the sign of all torques
-            is to be found, and binds joints together so little that a fault is judged by the joints that it concerns.
-        faults: whether faults are looked for at all.
-        others: more faults, as logs without them.
+        data: samples at equal steps, with sound rates.
+        build: makes the prior.
+        farthest: largest delay tried, in samples.
+        equations: number n d of equations used.
+        ambiguous: whether the prior fits any robot. It then allows negative inertias, so the common sign of all torques
+            is tested too, and couples joints so weakly that a fault is judged by the joints it concerns.
+        faults: whether to search for faults at all.
+        others: proposes further faults, as logs in which they are repaired.
     """
     d = data.degrees_of_freedom
     inside = away_from_ends(data.trajectory, farthest + 1)
@@ -124,7 +124,7 @@ def _explained(log: Log, build: Build, iterations: int = evidence.ITERATIONS) ->
 
 
 def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.ndarray, float]:
-    """Loss of each delay, and the best one to a fraction of a sample."""
+    """Loss of every delay, and the best delay with subsample resolution."""
     tau = log.torques()
     trials = [tau, *(log.torques(shift) for shift in range(-farthest, farthest + 1))]
     loss = -evidence.screened(now, build(log.states(), tau, log.gravity), trials)[:, 1:].sum(axis=0)
@@ -135,7 +135,7 @@ def _late(log: Log, build: Build, now: Explanation, farthest: int) -> tuple[np.n
 def _better(
     log: Log, build: Build, now: Explanation, farthest: int, others: Callable[[Log], list[Log]], *, alone: bool
 ) -> tuple[Log, Explanation] | None:
-    """The log without its likeliest fault, if that is beyond doubt; `alone`: judged by the joints that it concerns."""
+    """The log with its likeliest fault repaired, if that is decisive; `alone` judges by the joints concerned."""
     d = len(log.order)
     flips = [log._replace(signs=np.where(np.arange(d) == joint, -log.signs, log.signs)) for joint in range(d)]
     exchanges = []
@@ -162,7 +162,7 @@ def _better(
 
 
 def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
-    """The few of many faults that are likelier than the log, by fewer samples and rough weights."""
+    """The few faults that are likelier than the log as it is, by fewer samples and rough weights."""
 
     if not trials:
         return []
@@ -183,13 +183,13 @@ def _likeliest(log: Log, trials: list[Log], build: Build) -> list[Log]:
 
 
 def _concerned(log: Log, trial: Log) -> np.ndarray:
-    """Joints whose torques have another sign or column in a trial; all of them if it is about time, or the base."""
+    """Joints whose torques change sign or column in a trial; all joints if the trial concerns time or the base."""
     concerned = (trial.signs != log.signs) | (np.array(trial.order) != np.array(log.order))
     return concerned if concerned.any() else np.ones(len(concerned), bool)
 
 
 def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndarray) -> bool:
-    """Whether another explanation is better beyond doubt, and by so much that it matters to these joints."""
+    """Whether another explanation is better beyond doubt, and by enough to matter for these joints."""
     gains = other.densities - now.densities
     return bool(
         gains.sum() > DECISIVE
@@ -199,7 +199,7 @@ def decisive(now: Explanation, other: Explanation, limit: float, joints: np.ndar
 
 
 def _inertias(log: Log, now: Explanation) -> float:
-    """Sum over joints of the mean inertia about each, in its standard deviations over the root of their number."""
+    """Sum over joints of the mean inertia divided by its standard deviation, over the square root of their number."""
     tau, (q, qd, qdd) = log.torques(), log.states()
     n, d = q.shape
     chosen = q[np.linspace(0, n - 1, INERTIAS).astype(int)]
@@ -220,7 +220,7 @@ def _inertias(log: Log, now: Explanation) -> float:
 
 
 def _kinetic(now: Explanation, parts: list[Parts]) -> np.ndarray:
-    """Covariance of the torques of all kinetic energies, with their weights."""
+    """Covariance of the torques of all kinetic energies, by their weights."""
     total = np.zeros_like(parts[0].kinetic)
     for weight, each in zip(now.weights[::2], parts, strict=False):
         total += weight * each.kinetic
@@ -228,7 +228,7 @@ def _kinetic(now: Explanation, parts: list[Parts]) -> np.ndarray:
 
 
 def _friction(log: Log, build: Build, now: Explanation) -> tuple[np.ndarray, ...]:
-    """Viscous and dry friction, the error of the latter, its scale, and torques without all else."""
+    """Viscous and dry friction, the error of the latter, its velocity scale, and torques of friction and noise only."""
     tau, (_, qd, _) = log.torques(), log.states()
     n, d = tau.shape
     prior = build(log.states(), tau, log.gravity)

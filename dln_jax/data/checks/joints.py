@@ -1,4 +1,4 @@
-"""Which column is which joint: names, limits, and the order in which torques fit; and the regressor to judge by."""
+"""Checks of joint names, limits and column order against a robot, and the regressor used to judge them."""
 
 import functools
 from collections.abc import Callable
@@ -15,27 +15,27 @@ from dln_jax.mechanics.trees import Tree, regressor
 from dln_jax.types import JointKind
 
 OUTSIDE = 0.05
-"""rad or m beyond a limit."""
+"""rad or m: tolerance beyond a limit."""
 EXPLAINED = 0.02
-"""Of the torques' variance left unexplained, below which their order is right."""
+"""Unexplained fraction of the torques' variance below which their order counts as correct."""
 PADDED = 200
-"""Samples to a multiple of which a batch is filled up."""
+"""Batches are padded to a multiple of this number of samples."""
 BETTER = 0.3
-"""Of the unexplained variance that another order of the joints leaves."""
+"""Another order of the joints must lower the unexplained variance to this fraction."""
 
 
 def parameters_of(tree: Tree) -> np.ndarray:
-    """theta [11 d] of a tree of known numbers, as its regressor takes them."""
+    """theta [11 d] of a tree with known inertias and armature, in the order of its regressor."""
     return np.concatenate([np.ravel(tree.inertias), np.ravel(tree.armature)])
 
 
 def regressor_of(tree: Tree) -> Callable[..., np.ndarray]:
-    """(q, qd, qdd [n, d], gravity [3]) -> Phi [n, d, 11 d] of a tree: one program for trees of one structure."""
+    """(q, qd, qdd [n, d], gravity [3]) -> Phi [n, d, 11 d] of a tree; trees of one structure share a program."""
     program = _program(tree.parents, tree.joints, tuple(map(tuple, np.asarray(tree.axes).tolist())))
     frames = np.asarray(tree.rotations, float), np.asarray(tree.positions, float)
 
     def phi(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-        # Few shapes make few programs.
+        # Padding limits the number of shapes, and thus of compiled programs.
         missing = -len(q) % PADDED
         states = [np.concatenate([each, np.repeat(each[-1:], missing, axis=0)]) for each in (q, qd, qdd)]
         with jax.enable_x64(True):
@@ -58,7 +58,7 @@ def _program(parents: tuple[int, ...], joints: tuple[JointKind, ...], axes: tupl
 
 
 def named_order(robot: Robot, names: tuple[str, ...]) -> list[Finding]:
-    """Whether the data name their joints as the robot does, and in its order; nothing where either names none."""
+    """Compares joint names and their order with the robot's; no finding if either has no names."""
     stated = robot.tree.names
     if not names or not stated or names == stated:
         return []
@@ -70,7 +70,7 @@ def named_order(robot: Robot, names: tuple[str, ...]) -> list[Finding]:
 
 
 def limits(data: Trajectories, robot: Robot) -> list[Finding]:
-    """Whether positions are within the robot's limits."""
+    """Checks that positions are within the robot's limits."""
     low, high = robot.position_limits.T
     outside = np.mean((data.q < low - OUTSIDE) | (data.q > high + OUTSIDE), axis=0)
     joints = np.flatnonzero(outside > 1e-3)
@@ -88,9 +88,9 @@ def better_order(
     samples: tuple[np.ndarray, ...],
     friction: list[np.ndarray],
 ) -> list[Finding]:
-    """Whether another order of the joints explains their torques far better: two exchanged, all reversed or shifted.
+    """Searches for a joint order that explains the torques much better: two joints exchanged, all reversed or rotated.
 
-    `samples` are q, qd, qdd and tau [n, d], `friction` each joint's columns of friction [n, 3].
+    `samples` are q, qd, qdd and tau [n, d], `friction` the friction columns [n, 3] of every joint.
     """
     q, qd, qdd, tau = samples
     d = q.shape[1]

@@ -1,4 +1,4 @@
-"""An examination as one page of text: what the log is, a table of joints, and the findings."""
+"""Formats an examination as a page of text: the log, a table of joints, and the findings."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ WIDTH = 10
 
 
 def page(examined: Examination, name: str) -> list[str]:
-    """Lines of text; findings come last, worst first."""
+    """Lines of text; findings come last, most severe first."""
     data = examined.recording.data
     count = len(np.unique(data.trajectory))
     lines = [f"{name}: {len(data.t)} samples of {count} trajectories, {data.degrees_of_freedom} joints"]

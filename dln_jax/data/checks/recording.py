@@ -1,4 +1,4 @@
-"""A file as it is: what `schema.load` refuses about its times is repaired here, and said."""
+"""Reads a log tolerantly: faults in its times that `schema.load` refuses are repaired and reported."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,21 +11,21 @@ from dln_jax.data.schema import Trajectories
 
 
 class Recording(NamedTuple):
-    """Trajectories in order of time, which joints they name, and what had to be repaired for it."""
+    """Trajectories in order of time, with joint names and findings on repairs."""
 
     data: Trajectories
     names: tuple[str, ...] = ()
-    """Of the joints, where the file has `joint_names`."""
+    """Joint names, if the file has `joint_names`."""
     repaired: tuple[Finding, ...] = ()
 
 
 def as_recording(data: Trajectories) -> Recording:
-    """Trajectories that were read already."""
+    """Wraps trajectories that have already been read."""
     return Recording(data)
 
 
 def read(path: str | Path, *, rate: float | int | None = None, units: str | None = None) -> Recording:
-    """The recording of a file in the schema, whose samples may be out of order or double; arguments as `schema.load`.
+    """Reads a file in the schema with samples possibly unordered or duplicated; arguments as `schema.load`.
 
     Raises:
         InputError: as `schema.load` for anything else.
@@ -40,10 +40,10 @@ def _from_arrays(arrays: dict[str, Any]) -> Recording:
 
 
 def _in_order(arrays: dict[str, Any]) -> tuple[dict[str, Any], tuple[Finding, ...]]:
-    """The samples of each trajectory together and in order of time, the first of those at one time."""
+    """Groups samples by trajectory, sorts them by time and drops duplicates after the first."""
     t, trajectory = (np.asarray(arrays.get(key, np.zeros(0))) for key in ("t", "trajectory"))
     if t.ndim != 1 or t.shape != trajectory.shape or not np.issubdtype(t.dtype, np.number) or not len(t):
-        return arrays, ()  # which the schema refuses
+        return arrays, ()  # the schema refuses them
     order = np.lexsort((t, trajectory))
     same = np.r_[False, (np.diff(t[order]) == 0) & (np.diff(trajectory[order]) == 0)]
     found = []

@@ -1,4 +1,4 @@
-"""Logs whose faults are repaired one by one, and the prior of their torques without a robot."""
+"""Logs in which faults are repaired one by one, and the prior of their torques without a robot."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,28 +12,28 @@ from dln_jax.data.schema import Trajectories
 
 States = tuple[np.ndarray, np.ndarray, np.ndarray]
 Build = Callable[[States, np.ndarray, np.ndarray | None], Prior]
-"""(q, qd, qdd [n, d]), torques [n, d], gravity [3] or `None` for what is usual -> the prior of those torques."""
+"""(q, qd, qdd [n, d]), torques [n, d], gravity [3] (`None` for the stated one) -> prior of those torques."""
 
 
 class Log(NamedTuple):
-    """A log, and the faults that are repaired in it."""
+    """A log and the faults repaired in it."""
 
     data: Trajectories
     rows: np.ndarray
-    """Samples that are looked at [n]."""
+    """Indices of the samples used [n]."""
     signs: Float[np.ndarray, " d"]
-    """-1 for torques that have the wrong sign."""
+    """-1 for torques with the wrong sign."""
     order: tuple[int, ...]
-    """Columns of tau that belong to the joints."""
+    """Column of tau for every joint."""
     delay: float = 0.0
-    """Samples by which torques are late."""
+    """Delay of the torques in samples."""
     speed: float = 1.0
-    """Times the speed that t states, with which the joints moved."""
+    """True speed of the joints relative to that by t."""
     gravity: np.ndarray | None = None
-    """m/s² [3], where it is another than stated."""
+    """m/s² [3]; `None` for the stated gravity."""
 
     def states(self) -> States:
-        """At the times of the rows, or a part of a sample earlier if torques are late."""
+        """q, qd and qdd at the rows' times, shifted back by the delay with linear interpolation."""
         whole = int(np.floor(-self.delay))
         part, first = -self.delay - whole, self.rows + whole
 
@@ -43,12 +43,12 @@ class Log(NamedTuple):
         return at(self.data.q), self.speed * at(self.data.qd), self.speed**2 * at(self.data.qdd)
 
     def torques(self, shift: int = 0) -> np.ndarray:
-        """Of the joints, with their signs, so many samples later."""
+        """Torques of the joints with repaired signs and order, `shift` samples later."""
         return self.data.tau[self.rows + shift][:, list(self.order)] * self.signs
 
 
 def any_energy(joints: tuple[str, ...]) -> Build:
-    """The prior without a robot: torques of any kinetic and potential energy, and friction."""
+    """Prior without a robot: torques of an arbitrary kinetic and potential energy, and friction."""
 
     def build(states: States, tau: np.ndarray, gravity: np.ndarray | None) -> Prior:
         del gravity  # any
@@ -60,7 +60,7 @@ def any_energy(joints: tuple[str, ...]) -> Build:
 
 
 def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:
-    """Columns [n d, 4] of each joint's friction."""
+    """Friction columns [n d, 4] of every joint."""
     own = friction_columns(qd, np.maximum(qd.std(axis=0), 1e-12))
     n, d, count = own.shape
     found = []
@@ -72,6 +72,6 @@ def friction(qd: Float[np.ndarray, "n d"]) -> list[np.ndarray]:
 
 
 def sizes_of(qdd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Sizes of the joints' inertias [d], by the ratio of torques to accelerations."""
+    """Magnitudes of the joints' inertias [d] as the ratio of torques to accelerations."""
     found = tau.std(axis=0) / np.maximum(qdd.std(axis=0), 1e-12)
     return np.maximum(found, 1e-3 * max(float(found.max()), 1e-300))

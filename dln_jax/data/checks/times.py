@@ -1,4 +1,4 @@
-"""Checks of the times at which a log was sampled, and of how many trajectories it has."""
+"""Checks the sampling times of a log and its number of trajectories."""
 
 import numpy as np
 
@@ -7,18 +7,18 @@ from dln_jax.data.encoders import sampling
 from dln_jax.data.schema import Trajectories
 
 JITTER = 0.05
-"""Standard deviation of the steps, relative to the step."""
+"""Largest standard deviation of the steps, relative to the step."""
 SLOWEST = 1.0
-"""Hz, below which t is hardly in seconds."""
+"""Hz: at a lower rate t is hardly in seconds."""
 UNEQUAL = 0.2
-"""Relative difference of the trajectories' rates."""
+"""Largest relative difference between the rates of trajectories."""
 FEWEST = 3
-"""Trajectories for training, validation and test."""
+"""Fewest trajectories for training, validation and test."""
 FILTER = "interpolate to equal steps with smooth() or --cutoff auto"
 
 
 def check_times(data: Trajectories) -> list[Finding]:
-    """Rate, jitter, gaps, and whether there is enough for a split."""
+    """Checks rate, jitter, gaps and the number of trajectories for a split."""
     found = []
     counts = np.unique(data.trajectory, return_counts=True)[1]
     if len(counts) < FEWEST:

@@ -1,4 +1,4 @@
-"""Findings on torques: signs, columns, delay, friction, and angles that may be degrees."""
+"""Findings about torques: signs, columns, delay, friction, and angles that may be in degrees."""
 
 import numpy as np
 
@@ -9,17 +9,17 @@ from dln_jax.data.checks.repaired import any_energy
 from dln_jax.data.schema import Trajectories
 
 TRUSTED = 0.8
-"""Of a torque's variance, which has to be predicted before its friction counts."""
+"""Fraction of a torque's variance that must be predicted before its friction is reported."""
 DRY = 0.02
-"""Of a torque's standard deviation, from which dry friction is named."""
+"""Smallest dry friction reported, relative to the torque's standard deviation."""
 SURE = 5.0
-"""Standard deviations of dry friction, by which it is above zero."""
+"""Dry friction must exceed zero by this many standard deviations."""
 FEWER = 300
-"""Equations by which degrees and radians are compared."""
+"""Number of equations used to compare degrees with radians."""
 
 
 def check_torques(data: Trajectories, found: Torques, *, friction_stated: bool, by: str = "") -> list[Finding]:
-    """What the torques tell; `by` names the robot's file, if there is one."""
+    """Turns the examination of torques into findings; `by` is non-empty if a robot's file was used."""
     log, findings = found.log, []
     before, after = (each.unexplained.mean() for each in (found.explanation, found.repaired))
     gain = f"unexplained in blocks left out: {before:.2%} now, {after:.2%} then"
@@ -56,7 +56,7 @@ def _friction(found: Torques) -> list[Finding]:
 
 
 def check_degrees(data: Trajectories, joints: tuple[str, ...], *, driven: bool) -> list[Finding]:
-    """Angles so large that they may be degrees, or those of motors."""
+    """Reports angles so large that they may be in degrees, or motor angles."""
     largest = np.abs(data.q).max(axis=0)
     large = np.array([kind == "revolute" for kind in joints]) & (largest > TURNS)
     if not large.any():

@@ -1,4 +1,4 @@
-"""Checks of a log against a robot's description: signs, gravity, gears, excitation, and which joint is which."""
+"""Checks a log against a robot's description: signs, gravity, gears, excitation, and the order of the joints."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,57 +18,58 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.solvers import least_squares
 
 MOST = 800
-"""Samples that are looked at."""
+"""Number of samples used."""
 RELATED = 0.5
-"""Correlation of a torque and the tree's, friction apart, from which they are of one joint."""
+"""Correlation with the tree's torque, without friction, above which a measured torque belongs to the same joint."""
 GEAR = 5.0
-"""A torque so many times the tree's, or less than it by so much, is that of another side of a gear."""
+"""A measured torque that exceeds the model's by more than this factor (or falls below its inverse) was probably
+measured on the other side of the gear."""
 TILTED = 4.0
-"""Degrees between the gravity of the data and that of the description, from which a tilt is looked for."""
+"""Degrees between the data's gravity and the description's, above which a tilt is tested."""
 PACE = 0.03
-"""Logarithm of the factor between the motions' speeds by the robot and by t, from which a wrong clock is looked for."""
+"""Log ratio of the speeds by the robot and by t, above which a wrong clock is tested."""
 LENGTH = 0.1
-"""m, by which the centre of a body may be elsewhere than its file says."""
+"""m: uncertainty of a body's centre of mass relative to its file."""
 EQUATIONS = 1000
-"""Torques, over all joints, by which faults are looked for."""
+"""Number of torques, over all joints, used to search for faults."""
 ILL = 1000.0
-"""Condition of the scaled regressor, above which noise decides parameters."""
+"""Condition of the scaled regressor above which noise dominates the parameters."""
 RANK = 1e-7
-"""Singular values below it, relative to the largest, are not determined."""
+"""Singular values below this fraction of the largest count as undetermined."""
 FRICTION_SCALE = 0.05
-"""Of a joint's typical velocity, on which dry friction is smooth."""
+"""Smoothing velocity of dry friction, relative to the typical velocity of the joint."""
 
 
 class OnTree(NamedTuple):
-    """What a robot's description says of a log."""
+    """Result of comparing a log with a robot's description."""
 
     findings: list[Finding]
     scale: np.ndarray
-    """Measured torque over the tree's, friction apart [d]; NaN without torques."""
+    """Measured torque over the tree's, without friction [d]; NaN without torques."""
     correlation: np.ndarray
-    """Of both, friction apart [d]."""
+    """Correlation of both, without friction [d]."""
     gravity: np.ndarray
-    """That explains the data best, in the frame of the ground, in m/s² [3]; NaN where the data do not tell."""
+    """Gravity that explains the data best, in the ground frame, m/s² [3]; NaN if it cannot be estimated."""
     rank: int
-    """Combinations of the tree's and the friction's parameters that the motions determine."""
+    """Number of combinations of tree and friction parameters that the motions determine."""
     parameters: int
     condition: float
-    """Of the scaled columns that count."""
+    """Condition of the scaled columns within the rank."""
     torques: Torques | None
-    """By parameters near those of the tree; `None` without torques or with too few samples."""
+    """Examination with a prior near the tree's parameters; `None` without torques or with too few samples."""
 
 
 class _Forces(NamedTuple):
-    """Of the tree along the motions, and the measured ones."""
+    """Forces of the tree along the motions, and measured torques."""
 
     inertial: np.ndarray
-    """With the Coriolis forces [n, d]."""
+    """Inertial and Coriolis forces [n, d]."""
     gravity: np.ndarray
-    """Of 1 m/s² along each axis [n, d, 3]."""
+    """Forces of 1 m/s² gravity along each axis [n, d, 3]."""
     measured: np.ndarray
     """[n, d]."""
     friction: list[np.ndarray]
-    """Columns of each joint's friction [n, 3]."""
+    """Friction columns [n, 3] of every joint."""
 
 
 def against_tree(
@@ -80,15 +81,15 @@ def against_tree(
     farthest: int = 0,
     equations: int = EQUATIONS,
 ) -> OnTree:
-    """Compares samples whose rates are sound with the tree.
+    """Compares samples with sound rates with a robot's tree.
 
     Args:
-        data: in the robot's order of joints.
-        robot: as described.
-        names: the data's joints, where they state them.
+        data: samples in the robot's joint order.
+        robot: the robot's description.
+        names: joint names of the data, if stated.
         driven: whether there are torques.
-        farthest: samples of delay that are tried.
-        equations: torques, over all joints, by which faults are looked for.
+        farthest: largest delay tried, in samples.
+        equations: number of torques, over all joints, used to search for faults.
     """
     found = named_order(robot, names) + limits(data, robot)
     inside = away_from_ends(data.trajectory, farthest)
@@ -120,17 +121,17 @@ def against_tree(
     if torques is not None:
         found += check_torques(data, torques, friction_stated=True, by="robot") + _base_and_clock(torques, down)
     if not any(each.check in ("order", "tree-sign", "gravity", "clock") for each in found):
-        # Columns of q and tau in another order than the robot's make torques of other sizes, too.
+        # A column order that differs from the robot's changes the size of torques too, so it is tested before gears.
         found += better_order(phi, theta, down, (q, qd, qdd, tau), friction) or geared
     return OnTree(found, scale, correlation, estimate, rank, columns.shape[1], condition, torques)
 
 
 def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarray) -> Build:
-    """The prior of torques of a tree whose parameters are near those of its file, and friction."""
+    """Prior of the torques of a tree with parameters near those of its file, and friction."""
     d = len(theta) // 11
     bodies = np.abs(theta[: 10 * d]).reshape(d, 10)
     mass = np.maximum(bodies[:, :1], 1e-3 * bodies[:, :1].max())
-    # A body whose file is wrong by its own mass has its centre and inertia elsewhere by as much as these.
+    # If the file is wrong by a body's own mass, its centre of mass and inertia are off by these amounts.
     spread = np.hstack([mass, mass * LENGTH * np.ones((1, 3)), mass * LENGTH**2 * np.ones((1, 6))])
     sizes = np.concatenate([np.maximum(bodies, spread).ravel(), np.full(d, float(spread[:, 4].max()))])
 
@@ -142,7 +143,7 @@ def near_tree(phi: Callable[..., np.ndarray], theta: np.ndarray, down: np.ndarra
 
 
 def _mounted(log: Log, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
-    """The log of a robot whose base is turned as the data say."""
+    """The log of a robot with its base turned as the data suggest."""
     length = float(np.linalg.norm(estimate))
     if log.gravity is not None or not length > 0 or _angle(estimate, down) < TILTED:
         return []
@@ -150,7 +151,7 @@ def _mounted(log: Log, estimate: np.ndarray, down: np.ndarray) -> list[Log]:
 
 
 def _paced(log: Log, forces: _Forces, down: np.ndarray) -> list[Log]:
-    """The log of a robot that moved faster or slower than its times say: inertial forces go with the square."""
+    """The log at the speed that the inertial forces imply; they scale with the square of the speed."""
     if log.speed != 1.0:
         return []
     rows, rhs = [], []
@@ -187,7 +188,7 @@ def _base_and_clock(found: Torques, down: np.ndarray) -> list[Finding]:
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Degrees between two vectors."""
+    """Angle between two vectors, degrees."""
     cosine = first @ second / max(float(np.linalg.norm(first) * np.linalg.norm(second)), 1e-300)
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -211,7 +212,7 @@ def _determined(columns: np.ndarray, tau: np.ndarray, *, driven: bool) -> tuple[
 
 
 def _with_friction(columns: np.ndarray, friction: list[np.ndarray]) -> np.ndarray:
-    """The regressor with viscous, dry friction and offset of each joint [n d, P]."""
+    """The regressor [n d, P] extended by viscous friction, dry friction and offset of every joint."""
     d = len(friction)
     own = np.zeros((len(columns), d, 3 * d))
     for joint, block in enumerate(friction):
@@ -234,7 +235,7 @@ def _gears(scale: np.ndarray, correlation: np.ndarray) -> list[Finding]:
 
 
 def _by_joint(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scale and correlation of each torque to the tree's, friction apart."""
+    """Scale and correlation of measured torques relative to the tree's, without friction."""
     scale, correlation = [], []
     for joint, columns in enumerate(forces.friction):
         basis = np.linalg.qr(columns)[0]
@@ -248,7 +249,7 @@ def _by_joint(forces: _Forces, down: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _gravity(forces: _Forces, down: np.ndarray) -> np.ndarray:
-    """The gravity that explains all joints' torques best, with inertial forces of any size."""
+    """The gravity that explains the torques of all joints best, with inertial forces scaled freely."""
     rows, rhs = [], []
     for joint, columns in enumerate(forces.friction):
         measured = forces.measured[:, joint]

@@ -1,6 +1,6 @@
-"""Logs of encoders: q, t and tau at a rate of one's own, with noise, become trajectories with rates.
+"""Encoder logs: convert noisy q, t and tau at an arbitrary rate to trajectories with derivatives.
 
-`smooth(data)` resamples, filters without delay, differentiates, trims and decimates; it says what it chose.
+`smooth(data)` resamples, filters without delay, differentiates, trims and decimates, and reports the settings chosen.
 """
 
 from dln_jax.data.encoders.cutoff import Choice, choose_cutoff

@@ -1,17 +1,17 @@
-"""A cut-off from the data: the one at which accelerations are expected to be best.
+"""Chooses the cut-off frequency that minimises the expected error of accelerations.
 
-The spectrum of each coordinate is that of its motion, S(f), above a floor N of noise, which is white. A filter of gain
-H leaves of the motion's acceleration 1 - H missing, and lets H of the noise's through:
+The spectrum of a coordinate is that of its motion, S(f), above a noise floor N, which is white. A filter of gain H
+removes the fraction 1 - H of the motion's acceleration and passes the fraction H of the noise's:
 
     E(cutoff) = sum over joints of  integral (2 pi f)^4 [(1 - H)² S + H² N] df  /  integral (2 pi f)^4 S df
 
-The weight of frequencies falls out of the place of the minimum for a steep filter, which is where S = N whatever is
-differentiated: so one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967), so that
-the motion does not leak into the floor, and divided by the gain of the differences.
+For a steep filter the frequency weight does not affect the minimum, which lies where S = N for derivatives of any
+order: one cut-off serves q, qd and qdd. Spectra of second differences are averaged (Welch 1967) and divided by the gain
+of the differences, so that the motion does not leak into the floor.
 
-Spectra are means of squares, which a single jump decides; the noise is a median, which no jump changes. So jumps are
-interpolated over before spectra are taken, and where the top of a spectrum is flat and higher than the median's floor,
-that is the floor. Noise need not be white: from where the spectrum of accelerations rises for good, it is noise.
+Spectra are means of squares, which a single jump can dominate; the noise is a median, which no jump changes. Jumps are
+therefore interpolated before spectra are taken. If the top of a spectrum is flat and above the median's floor, it is
+the floor. Noise need not be white: where the spectrum of accelerations rises up to the highest frequency, it is noise.
 """
 
 import math
@@ -25,46 +25,46 @@ from dln_jax.data.encoders.noise import NORMAL
 from dln_jax.types import InputError, require_positive
 
 SEGMENT = 8.0
-"""s, of a stretch whose spectrum is taken at a time."""
+"""s: length of the segments over which spectra are averaged."""
 SEEN = 1.5
-"""Times the floor, above which a smoothed spectrum is that of a motion."""
+"""A smoothed spectrum above this multiple of the floor belongs to the motion."""
 CANDIDATES = 200
-"""Cut-offs that are tried."""
+"""Number of cut-offs tried."""
 TOP = 0.45
-"""Highest cut-off that is tried, as a fraction of the rate."""
+"""Highest cut-off tried, as a fraction of the sampling rate."""
 MOVES = 2.0
-"""Standard deviations of noise, by more than which a joint has to move."""
+"""A joint counts as moving if its standard deviation exceeds this multiple of its noise."""
 WORTH = 1e-4
-"""Relative error of unfiltered accelerations, below which nothing is filtered; above it there always is a cut-off."""
+"""Relative error of unfiltered accelerations up to which no filter is applied; above it there always is a cut-off."""
 JUMP = 8.0
-"""Standard deviations by which a sample of a jump differs from what its neighbours predict."""
+"""A jump differs from its neighbours' prediction by more than this many standard deviations."""
 RARE = 0.1
-"""Largest share of the samples that can be jumps; more of them are a motion, or noise that is not white."""
+"""Largest fraction of samples that can be jumps; more of them are a motion, or noise that is not white."""
 PREDICTION = math.sqrt(1 + 524 / 400)
-"""Standard deviation of the prediction's error, in that of the noise."""
+"""Standard deviation of the prediction error, in units of the noise."""
 MEDIAN = math.log(2)
-"""Median of a spectrum's lines over their mean, where few segments are averaged."""
+"""Ratio of median to mean of a spectrum's lines if few segments are averaged."""
 RISES = 3.0
-"""Times its lowest value, which a spectrum of accelerations exceeds at high frequencies where those are noise."""
+"""A spectrum of accelerations that exceeds its minimum by this factor at high frequencies is noise there."""
 FLAT = 4.0
-"""Largest ratio between the parts of the upper half of a spectrum at which it counts as flat."""
+"""Largest ratio between the thirds of the upper half of a spectrum for it to count as flat."""
 
 
 class Choice(NamedTuple):
-    """The cut-off, and what it was chosen from, to be drawn."""
+    """The cut-off, and the quantities it was chosen from (for plots)."""
 
     cutoff: float
-    """Hz; infinite where noise is too small to be worth a filter."""
+    """Hz; infinite if the noise is too small for a filter."""
     tried: Float[np.ndarray, " C"]
-    """Hz."""
+    """Cut-offs tried, Hz."""
     error: Float[np.ndarray, " C"]
-    """E of each: expected relative error of the accelerations, squared, mean over joints."""
+    """E of every cut-off: expected squared relative error of the accelerations, mean over joints."""
     f: Float[np.ndarray, " F"]
     """Hz."""
     spectrum: Float[np.ndarray, "F d"]
-    """Of q, (rad or m)² / Hz."""
+    """Spectrum of q, (rad or m)² / Hz."""
     floor: Float[np.ndarray, " d"]
-    """N, likewise."""
+    """White part of N, in the same unit."""
 
 
 def choose_cutoff(
@@ -75,17 +75,17 @@ def choose_cutoff(
     noise: Float[np.ndarray, " d"],
     order: int = ORDER,
 ) -> Choice:
-    """The cut-off of least expected error.
+    """Finds the cut-off with the lowest expected error.
 
     Args:
-        q: at equal steps.
-        trajectory: that each sample belongs to.
+        q: coordinates at equal steps.
+        trajectory: trajectory of every sample.
         rate: Hz.
-        noise: standard deviation of each coordinate's.
-        order: of the filter.
+        noise: standard deviation of the noise of every coordinate.
+        order: order of the filter.
 
     Raises:
-        InputError: no stretch has sixteen samples, or nothing moves by more than its noise.
+        InputError: no segment has sixteen samples, or nothing moves by more than its noise.
     """
     require_positive(rate=rate, order=order)
     f, spectrum = spectra(without_jumps(q, trajectory, noise), trajectory, rate=rate)
@@ -112,10 +112,10 @@ def choose_cutoff(
 def without_jumps(
     values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], noise: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "N k"]:
-    """Values in which rare samples that neither noise nor the motion explains are interpolated.
+    """Interpolates rare samples that neither noise nor the motion explains.
 
-    A sample is compared with what the quintic through three samples on either side predicts, (1, -6, 15, 15, -6, 1)
-    / 20. A jump is an error of many standard deviations both of the noise and of such errors elsewhere.
+    A sample is compared with the prediction of the quintic through three samples on either side, (1, -6, 15, 15, -6, 1)
+    / 20. It is a jump if the error is many standard deviations both of the noise and of such errors elsewhere.
     """
     from scipy.interpolate import make_interp_spline
     from scipy.ndimage import maximum_filter1d
@@ -127,7 +127,7 @@ def without_jumps(
     errors = np.zeros_like(values)
     errors[inside] = np.abs(values[inside] - (15 * sums[0] - 6 * sums[1] + sums[2]) / 20)
     usual = np.maximum(PREDICTION * noise, np.median(errors[inside], axis=0) / NORMAL)
-    # Errors of the samples beside a jump come from the jump.
+    # A jump also causes errors in neighbouring samples; only the largest error nearby counts.
     wrong = (errors > JUMP * usual) & (errors == maximum_filter1d(errors, 7, axis=0))
     values, places = values.copy(), np.arange(len(values))
     for channel in np.flatnonzero(wrong.any(axis=0) & (wrong.mean(axis=0) < RARE)):
@@ -137,7 +137,7 @@ def without_jumps(
 
 
 def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, " d"]:
-    """The level of the upper half of each spectrum where that is flat, as white noise is; zero elsewhere."""
+    """Level of the upper half of a spectrum that is flat, as white noise is; zero otherwise."""
     parts = [np.median(part, axis=0) for part in np.array_split(spectrum[f > f[-1] / 2], 3) if len(part)]
     if len(parts) < 3:
         return np.zeros(spectrum.shape[1])
@@ -147,10 +147,10 @@ def _flat_top(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) ->
 
 
 def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
-    """The part of each spectrum above the lowest power of the accelerations, where that rises up to half the rate.
+    """The part of a spectrum above the minimum of the acceleration power, if that rises up to half the rate; else zero.
 
-    Forces of finite power make accelerations whose spectrum falls, so what rises is noise, white or not: samples that
-    are late by a part of a step, for one, are noise whose size is that of the velocity. Zero elsewhere.
+    Forces of finite power make accelerations with a falling spectrum, so a rising one is noise, white or not: timing
+    jitter of a fraction of a step, for example, is noise proportional to the velocity.
     """
     accelerations = f[:, None] ** 4 * _smoothed(spectrum)
     found = np.zeros_like(spectrum)
@@ -165,7 +165,7 @@ def _rising(f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"]) -> F
 def spectra(
     values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"], *, rate: float
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F k"]]:
-    """Frequencies above zero, in Hz, and the power spectrum of each channel, in its unit² / Hz, mean over stretches.
+    """Positive frequencies, Hz, and power spectra of the channels, unit² / Hz, averaged over segments.
 
     Raises:
         InputError: no trajectory has sixteen samples.
@@ -191,14 +191,14 @@ def spectra(
 def _motion(
     f: Float[np.ndarray, " F"], spectrum: Float[np.ndarray, "F d"], floor: Float[np.ndarray, "F d"]
 ) -> Float[np.ndarray, "F d"]:
-    """S of each joint: what stands out of the floor, up to where it first does not."""
+    """S of every joint: the spectrum above the floor, up to the frequency where it first falls to the floor."""
     smooth = _smoothed(spectrum)
     hidden = np.cumsum(smooth < SEEN * floor, axis=0) > 0
     return np.where(hidden, 0.0, np.maximum(spectrum - floor, 0.0))
 
 
 def _smoothed(spectrum: Float[np.ndarray, "F d"]) -> Float[np.ndarray, "F d"]:
-    """Geometric mean over a sixth of an octave to either side, so that single lines do not end a motion."""
+    """Geometric mean over a sixth of an octave on either side, so that a gap between lines does not end a motion."""
     logarithm = np.log(np.maximum(spectrum, np.finfo(float).tiny))
     summed = np.concatenate([np.zeros((1, spectrum.shape[1])), np.cumsum(logarithm, axis=0)])
     place = np.arange(1, len(spectrum) + 1)

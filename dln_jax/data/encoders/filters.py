@@ -1,15 +1,16 @@
-"""A low-pass without delay, and derivatives of what it leaves.
+"""A low-pass filter without delay, and derivatives of the filtered signal.
 
-The filter is a Butterworth filter that runs forwards and backwards (Gustafsson 1996): gain
+A Butterworth filter runs forwards and backwards (Gustafsson 1996), with the gain
 
     H(f) = 1 / (1 + (f / cutoff)^(2 order))
 
-without a shift in time, ½ at the cut-off. It is linear, so that it commutes with a model that is linear in its
-parameters, F(Phi theta) = F(Phi) theta: `low_pass` of the torques calls for `low_pass` of the columns of Phi. Columns
-from a filtered q are not filtered columns, where a force has a wider band than the motion, as dry friction has.
+without a time shift, ½ at the cut-off. It is linear, so it commutes with a model that is linear in its parameters,
+F(Phi theta) = F(Phi) theta: if the torques pass `low_pass`, so must the columns of Phi. Columns of a filtered q are not
+filtered columns if a force has a wider band than the motion, such as dry friction.
 
-At its ends a filter knows one side only. What is turned round there is what a slow polynomial leaves, which makes
-accelerations at the end 2 to 40 times better than without; they are as good as elsewhere from 1.5 periods on.
+At the ends the filter knows one side only. It extends the signal there by reflection, after a slow polynomial is
+subtracted. This makes accelerations at the end 2 to 40 times more accurate; from 1.5 periods on they are as accurate as
+elsewhere.
 
 Derivatives are those of the quintic spline through the filtered samples. A second derivative is exact to 0.02 % at a
 tenth of the rate and to 1.3 % at a quarter, where central differences taken twice lose 12 % and 60 %.
@@ -21,15 +22,16 @@ from jaxtyping import Float, Int
 from dln_jax.types import InputError, require_positive
 
 ORDER = 4
-"""Of the Butterworth filter, which acts twice."""
+"""Order of the Butterworth filter, which is applied twice."""
 PERIODS = 3
-"""Of the cut-off, by which a stretch is extended at both ends, by itself turned about its end."""
+"""Length of the reflected extension at both ends of a segment, in periods of the cut-off."""
 END_PERIODS, END_DEGREE = 1.0, 5
-"""Of the cut-off, and of the polynomial through them by which value, slope and curvature at an end are found."""
+"""Length of the end fit in periods of the cut-off, and degree of its polynomial, from which value, slope and curvature
+at an end are estimated."""
 
 
 def gain(f: Float[np.ndarray, " n"], cutoff: float, order: int = ORDER) -> Float[np.ndarray, " n"]:
-    """H of both passes; 1 where the cut-off is infinite."""
+    """H of both passes; 1 for an infinite cut-off."""
     return 1 / (1 + (f / cutoff) ** (2 * order))
 
 
@@ -41,17 +43,17 @@ def low_pass(
     order: int = ORDER,
     trajectory: Int[np.ndarray, " N"] | None = None,
 ) -> Float[np.ndarray, "N k"]:
-    """Values at equal steps without what is faster than the cut-off, each trajectory for itself.
+    """Low-pass filters values at equal steps, every trajectory separately.
 
     Args:
-        values: columns, of anything that is linear in what is to be found: torques, or a regressor's columns.
-        rate: Hz, of the samples.
-        cutoff: Hz; infinite leaves the values as they are.
-        order: of the Butterworth filter, which acts twice.
-        trajectory: that each sample belongs to (default: all to one).
+        values: columns of any quantity linear in the unknowns: torques, or columns of a regressor.
+        rate: sampling rate, Hz.
+        cutoff: Hz; infinite returns the values unchanged.
+        order: order of the Butterworth filter, which is applied twice.
+        trajectory: trajectory of every sample (default: one).
 
     Raises:
-        InputError: a cut-off that is not below half the rate, or an order below 1.
+        InputError: the cut-off is not below half the rate, or the order is below 1.
     """
     require_positive(rate=rate, cutoff=cutoff, order=order)
     if np.isinf(cutoff):
@@ -72,10 +74,10 @@ def low_pass(
 
 
 def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"]:
-    """The polynomial of degree 5 with the values' own value, slope and curvature at both ends, from `near` samples.
+    """The quintic with the values' own value, slope and curvature at both ends, estimated from `near` samples.
 
-    Without it values are straight at their ends, where a filter extends them by turning them round; it is so slow that
-    every filter lets it through. Zero for fewer samples than twice that.
+    Without it the values are straight at their ends, where the filter extends them by reflection; it is slow enough to
+    pass every filter. Zero for fewer samples than twice `near`.
     """
     near = max(near, 2 * END_DEGREE)
     if len(values) < 2 * near:
@@ -84,7 +86,7 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
     powers = range(6)
     conditions, found = [], []
     for samples, end in ((slice(None, near), 0.0), (slice(-near, None), 1.0)):
-        # In units of the part that is looked at, where the fit is well conditioned.
+        # Scale x by the length of the fit, which keeps the fit well conditioned.
         length = x[near - 1]
         local = np.vander((x[samples] - end) / length, END_DEGREE + 1, increasing=True)
         coefficients = np.linalg.lstsq(local, values[samples], rcond=None)[0]
@@ -97,14 +99,14 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
 
 
 def _falling(power: int, order: int) -> float:
-    """power (power - 1) ..., so many factors; zero where the derivative of x^power is."""
+    """Factor of the derivative of x^power: power (power - 1) ... with `order` factors, zero if power < order."""
     return float(np.prod([power - k for k in range(order)])) if power >= order else 0.0
 
 
 def derivatives(
     q: Float[np.ndarray, "n k"], *, rate: float
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-    """qd and qdd of one stretch at equal steps, of the quintic spline through its samples.
+    """qd and qdd of one segment at equal steps, from the quintic spline through its samples.
 
     Raises:
         InputError: fewer than six samples.

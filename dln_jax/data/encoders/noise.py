@@ -1,8 +1,8 @@
-"""How noisy a channel is, from what changes between neighbouring samples.
+"""Noise of a channel, estimated from differences of neighbouring samples.
 
 Differences of order m of white noise of standard deviation s have the variance s² C(2m, m), while those of a slow
-signal vanish as (2 pi f / rate)^m. Their median size is deaf to rare jumps, such as those of dry friction when a joint
-turns round. The smallest of several orders is taken: what a signal leaves in one makes it larger.
+signal vanish as (2 pi f / rate)^m. Their median size is insensitive to rare jumps, such as those of dry friction when a
+joint reverses. The smallest estimate of several orders is used, since any remaining signal increases an estimate.
 """
 
 import math
@@ -14,18 +14,18 @@ from dln_jax.data.schema import Trajectories
 
 ORDERS = (2, 3, 4, 5, 6)
 NORMAL = 0.67448975
-"""Median size of a normal variable, in standard deviations."""
+"""Median absolute value of a standard normal variable."""
 
 SLOW = 5e-3
-"""Share of the positions' standard deviation that differences of a log take for noise, above which it is sampled so
-slowly that they are differences of the motion."""
+"""If differences of a log give a noise above this fraction of the positions' standard deviation, sampling is so slow
+that they are differences of the motion."""
 
 
 def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]) -> Float[np.ndarray, " k"]:
-    """Standard deviation of the white noise of each channel, in its unit, at least that of its steps, step / √12.
+    """Standard deviation of the white noise of every channel, in its unit, at least that of its steps, step / √12.
 
-    Samples are at equal steps but for gaps, whose differences are rare; trajectories of fewer than seven samples are
-    left out. Zero where a channel does not vary, infinite where there are no such trajectories.
+    Samples are at equal steps except for gaps, which are rare; trajectories of fewer than seven samples are ignored.
+    Zero for a constant channel, infinite if there are no such trajectories.
     """
     parts = [part for part in np.split(values, np.flatnonzero(np.diff(trajectory)) + 1) if len(part) > max(ORDERS)]
     if not parts:
@@ -38,9 +38,9 @@ def noise_of(values: Float[np.ndarray, "N k"], trajectory: Int[np.ndarray, " N"]
 
 
 def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
-    """Standard deviation of the white noise of each torque, N m or N; `None` if the samples are too far apart to tell.
+    """Standard deviation of the white noise of every torque, N m or N; `None` if the sampling is too slow to tell.
 
-    Differences of positions, which are measured far better than torques, show whether they are.
+    The noise of the positions, which are measured much better than torques, shows whether it is.
     """
     spread = data.q.std(axis=0)
     moving = spread > 0
@@ -50,17 +50,18 @@ def torque_noise(data: Trajectories) -> Float[np.ndarray, " d"] | None:
 
 
 def step_of(values: Float[np.ndarray, "N k"]) -> Float[np.ndarray, " k"]:
-    """The step in which each channel moves, as an encoder does; zero where it has no levels."""
+    """Step size of every channel, such as an encoder's resolution; zero for a channel without levels."""
     return np.array([_step(channel) for channel in values.T])
 
 
 def _step(channel: np.ndarray) -> float:
     size = np.abs(channel).max(initial=0.0)
+    # Twelve significant digits, so that rounding errors do not split a level.
     levels = np.unique(np.round(channel, 12 - int(np.ceil(np.log10(size)))) if size > 0 else channel)
     if len(levels) < 3:
         return 0.0
     distances = np.diff(levels)
     smallest = float(distances.min())
     multiples = distances / smallest
-    # Rounding of the log moves levels a little.
+    # Rounding in the log moves levels slightly.
     return smallest if np.mean(np.abs(multiples - np.round(multiples)) < 0.05) > 0.99 else 0.0

@@ -1,9 +1,9 @@
-"""Rows that a log repeats, and the log without them.
+"""Finds repeated rows of a log and removes them.
 
-A logger that is faster than its source, or that misses a message, writes the last row once more. Differences across
-such a row are wrong by a whole step, which noise of an encoder never is. Two cases are told apart by the step that
-follows: after a *lost* row the next one is on time, so the joint has moved twice as far as usual; after an *inserted*
-row it has moved as far as always, because the source is slower than the times in the log claim.
+A logger that is faster than its source, or that misses a message, writes the last row again. Differences across such a
+row are wrong by a whole step, far more than encoder noise. The step after the repeat tells two cases apart. After a
+*lost* row the next one is on time, so the joint has moved twice as far as usual. After an *inserted* row it has moved
+the usual distance, because the source is slower than the log's times claim.
 """
 
 from typing import NamedTuple
@@ -16,17 +16,17 @@ from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import select_samples
 
 LONGEST = 5
-"""Rows in a row that count as repeats; a longer standstill is a joint at rest or a gap in the messages."""
+"""Longest run of rows that counts as repeats; a longer standstill is a joint at rest or a gap in the messages."""
 COMPARABLE = 0.3
 """The steps before and after a repeat must be at least this fraction of the step that ends it."""
 CLEAR = 3.0
-"""Steps of the encoder by which a joint must move on, so that equal readings are no matter of resolution."""
+"""Encoder steps by which a joint must move on, so that resolution cannot explain equal readings."""
 CHANCE = 3.0
-"""Times as many rows have to be equal as would be by chance, were the channels independent."""
+"""Equal rows must exceed the number expected by chance, for independent channels, by this factor."""
 NEAR = 5
-"""Steps on either side of a repeat that say how far a joint usually moves in one."""
+"""Number of steps on either side of a repeat from which the usual step is computed."""
 LOST = 1.5
-"""Times the usual step, from which on the step after a repeat says that a row was lost."""
+"""If the step after a repeat is at least this multiple of the usual one, a row was lost."""
 
 
 class Repeats(NamedTuple):
@@ -37,23 +37,23 @@ class Repeats(NamedTuple):
     tau: Bool[np.ndarray, " N"]
     """All torques repeat."""
     inserted: bool
-    """Whether the rows were inserted, so that all later samples carry times that are too late."""
+    """Whether rows were inserted, so that the times of all later samples are too late."""
 
     @property
     def rows(self) -> Bool[np.ndarray, " N"]:
-        """Coordinates and torques repeat together."""
+        """Samples whose coordinates and torques both repeat."""
         return self.q & self.tau
 
 
 def find_repeats(
     q: Float[np.ndarray, "N d"], tau: Float[np.ndarray, "N d"], trajectory: Int[np.ndarray, " N"]
 ) -> Repeats:
-    """Finds repeated samples of q and of tau; torques that never vary repeat with q."""
+    """Finds repeated samples of q and of tau; torques that never vary count as repeating with q."""
     of_q, after = _repeating(q, trajectory)
     if not np.ptp(tau, axis=0).any():
         return Repeats(of_q, of_q, after < LOST)
     of_tau, _ = _repeating(tau, trajectory)
-    # A torque may stand still by itself, so a whole row needs coordinates that repeat.
+    # A torque may be constant by itself, so a repeated row requires repeated coordinates.
     same = np.r_[False, (np.diff(tau, axis=0) == 0).all(axis=1)]
     of_tau = of_tau | (of_q & same)
     both = of_q & of_tau
@@ -61,10 +61,10 @@ def find_repeats(
 
 
 def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
-    """The log without its repeats, and which they were.
+    """The log without its repeats, and the repeats.
 
-    Whole rows that repeat are left out; rows that were inserted also give their time back: the steps between the
-    others are stretched to the same total. Where q or tau repeat alone they are interpolated.
+    Repeated rows are removed. If they were inserted, their time is removed too and the remaining steps are stretched to
+    the same total. If q or tau repeat alone, they are interpolated.
     """
     repeats = find_repeats(data.q, data.tau, data.trajectory)
     if not (repeats.q.any() or repeats.tau.any()):
@@ -78,12 +78,12 @@ def without_repeats(data: Trajectories) -> tuple[Trajectories, Repeats]:
 
 
 def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, float]:
-    """Which rows repeat the one before, and how far the values move after a repeat, in usual steps."""
+    """Mask of the rows that repeat the one before, and the size of the step after a repeat in usual steps."""
     found = np.zeros(len(values), bool)
     changes = np.diff(values, axis=0)
     inside = np.diff(trajectory) == 0
     same = (changes == 0).all(axis=1) & inside
-    # Channels with few levels are equal now and then, and all of them by chance.
+    # Channels with few levels are sometimes equal, and all of them at once by chance.
     others = changes[inside & ~same] == 0
     by_chance = float(np.prod(others.mean(axis=0))) * len(changes) if len(others) else np.inf
     if same.sum() <= CHANCE * by_chance:
@@ -102,7 +102,7 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
         usual, ending, following = changes[before], changes[last], changes[after]
         smaller = np.minimum(usual * np.sign(ending), following * np.sign(ending))
         moving = (np.abs(ending) > CLEAR * levels) & (smaller > COMPARABLE * np.abs(ending) / (last - first + 1))
-        # Noise without levels is never twice the same.
+        # Noise without levels never repeats exactly.
         noisy = (levels == 0) & (noise > 0.1 * np.abs(usual)) & (noise < np.inf)
         if not (moving | noisy).any():
             continue
@@ -114,7 +114,7 @@ def _repeating(values: np.ndarray, trajectory: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wrong: np.ndarray) -> np.ndarray:
-    """Values with the wrong samples replaced by a cubic spline through the others of their trajectory."""
+    """Replaces the wrong samples by a cubic spline through the others of their trajectory."""
     if not wrong.any():
         return values
     from scipy.interpolate import make_interp_spline
@@ -128,7 +128,7 @@ def _interpolated(t: np.ndarray, values: np.ndarray, trajectory: np.ndarray, wro
 
 
 def _source_times(t: np.ndarray, trajectory: np.ndarray, repeated: np.ndarray) -> np.ndarray:
-    """Times of the rows by their source's clock: a repeat takes none, and each trajectory lasts as long as before."""
+    """Times of the rows on the source's clock: a repeat takes no time, and each trajectory keeps its duration."""
     t = t.copy()
     for each in np.unique(trajectory[repeated]):
         here = np.flatnonzero(trajectory == each)

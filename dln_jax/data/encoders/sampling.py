@@ -1,4 +1,4 @@
-"""Samples in time: their rate and gaps, and a stretch at equal steps."""
+"""Sampling times: rate, gaps, and resampling to equal steps."""
 
 from typing import NamedTuple
 
@@ -9,28 +9,28 @@ from dln_jax.data.stretches import GAP
 from dln_jax.types import InputError
 
 BRIDGED = 3.5
-"""Times the median time step: gaps up to it are interpolated, longer ones cut a trajectory."""
+"""Gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory."""
 EVEN = 1e-3
-"""Deviation from equal steps, relative to the step, below which samples are left where they are."""
+"""Relative deviation from equal steps up to which samples are not resampled."""
 
 
 class Timing(NamedTuple):
-    """How a log was sampled."""
+    """Sampling rate, jitter and gaps of a log."""
 
     rate: float
-    """Hz: the median over trajectories of each one's median step."""
+    """Hz, from the median over trajectories of their median steps."""
     jitter: float
-    """Standard deviation of the steps without gaps, relative to the median step; the worst trajectory's."""
+    """Standard deviation of the steps without gaps, relative to the median step; largest over trajectories."""
     gaps: int
-    """Steps longer than `GAP` median ones."""
+    """Number of steps longer than `GAP` times the median."""
     longest: float
     """s, the longest step."""
     rates: Float[np.ndarray, " K"]
-    """Hz, of each trajectory with two samples or more."""
+    """Hz, for every trajectory with two samples or more."""
 
 
 def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Timing:
-    """Rate, jitter and gaps.
+    """Computes rate, jitter and gaps.
 
     Raises:
         InputError: no trajectory has two samples.
@@ -52,7 +52,8 @@ def timing(t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"]) -> Tim
 def even(
     t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], rate: float
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
-    """One stretch at equal steps from its first sample: as it is where it has them, else a cubic spline through it."""
+    """One segment at equal steps from its first sample: unchanged if equally spaced, else by a cubic spline."""
+    # The margins keep the last sample if rounding puts it just below a whole step.
     count = int(np.floor((t[-1] - t[0]) * rate * (1 + 1e-9) + 1e-6)) + 1
     uniform = t[0] + np.arange(count) / rate
     if count == len(t) and np.abs(t - uniform).max() * rate < EVEN:
@@ -63,5 +64,5 @@ def even(
 
 
 def _parts(values: np.ndarray, trajectory: np.ndarray) -> list[np.ndarray]:
-    """The values of each trajectory, whose samples are together."""
+    """Values of every trajectory; their samples are contiguous."""
     return np.split(values, np.flatnonzero(np.diff(trajectory)) + 1)

@@ -1,14 +1,14 @@
-"""From q, t and tau of a log to trajectories with rates.
+"""Converts q, t and tau of a log to trajectories with derivatives.
 
-1. Rows that repeat the one before are left out (see `repeats`). Gaps cut a trajectory, short ones are bridged; samples
-   at unequal steps are interpolated to one rate.
-2. The noise of each channel is estimated, and from it and the spectra of q the cut-off, unless that is given.
-3. q is filtered without delay, and qd and qdd are derivatives of the result; tau is filtered too where samples are left
-   out, which it has to be, and where one asks for it.
-4. Ends are trimmed, where a filter knows one side only, and every k-th sample is kept.
+1. Repeated rows are removed (see `repeats`). Long gaps cut a trajectory, short ones are bridged; samples at unequal
+   steps are interpolated to one rate.
+2. The noise of every channel is estimated. The noise and the spectra of q determine the cut-off, unless it is set.
+3. q is filtered without delay; qd and qdd are derivatives of the result. tau is filtered too if samples are dropped,
+   which requires it, or on request.
+4. Ends, where a filter knows one side only, are trimmed, and every k-th sample is kept.
 
-Torques are left as they are by default: least squares average their noise away, while filtered torques of a model with
-dry friction belong to no state, see `filters`: on a simulated seven-axis arm they cost a factor of 1.6
+Torques are not filtered by default: least squares average out their noise, while filtered torques of a model with dry
+friction belong to no state, see `filters`. On a simulated seven-axis arm filtering them cost a factor of 1.6
 (`scripts.reports.encoder_data`).
 """
 
@@ -28,41 +28,41 @@ from dln_jax.data.stretches import stretches
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 4.0
-"""Periods of the cut-off: shorter stretches are left out."""
+"""Shortest segment kept, in periods of the cut-off."""
 TRIMMED = 1.5
-"""Periods of the cut-off, from which on accelerations are as good as in the middle."""
+"""Trimmed length in periods of the cut-off, beyond which accelerations are as accurate as in the middle."""
 PART = "/"
-"""Between a trajectory's label and the number of its part."""
+"""Separator between a trajectory's label and the number of its part."""
 
 
 class Smoothed(NamedTuple):
-    """Trajectories whose rates come from filtered coordinates, and how they came about."""
+    """Trajectories with derivatives of filtered coordinates, and the settings used."""
 
     data: Trajectories
-    """q, qd, qdd and tau at equal steps; what else the log had is left out."""
+    """q, qd, qdd and tau at equal steps; other arrays of the log are dropped."""
     cutoff: float
-    """Hz, of the filter; infinite where there was none."""
+    """Cut-off of the filter, Hz; infinite without a filter."""
     rate: float
-    """Hz, of the samples before decimation."""
+    """Sampling rate before decimation, Hz."""
     noise_q: Float[np.ndarray, " d"]
-    """Standard deviation of each encoder's noise, rad or m."""
+    """Standard deviation of every encoder's noise, rad or m."""
     noise_tau: Float[np.ndarray, " d"]
-    """That of each torque of `data`, N m or N: its square root is the weight of an equation. Zero without torques."""
+    """Standard deviation of the noise of every torque of `data`, N m or N; zero without torques."""
     choice: Choice | None
-    """What the cut-off was chosen from; `None` where it was given."""
+    """Data behind the choice of the cut-off; `None` if the cut-off was set."""
     order: int
     filtered_torque: bool
     decimate: int
     trim: float
-    """s, at both ends of each part."""
+    """Time trimmed at both ends of every part, s."""
     bridged: int
-    """Gaps that were interpolated."""
+    """Number of interpolated gaps."""
     parts: int
-    """Trajectories, after cuts at longer gaps."""
+    """Number of trajectories after cuts at longer gaps."""
     left_out: int
-    """Stretches that were too short."""
+    """Number of segments that were too short."""
     repeats: Repeats
-    """Samples of the log that repeat the one before; they were resampled over."""
+    """Repeated samples of the log, which were resampled over."""
 
 
 def smooth(
@@ -76,29 +76,29 @@ def smooth(
     trim: float | None = None,
     bridged: float = sampling.BRIDGED,
 ) -> Smoothed:
-    """Trajectories of q, t and tau with rates that are fit to be learned from; rates that they had are not used.
+    """Estimates derivatives and smooths a log's q, t and tau for learning; existing rates are not used.
 
     Args:
-        data: a log.
+        data: the log.
         cutoff: Hz, infinite for none (default: chosen from the data, see `cutoff`).
-        order: of the Butterworth filter, which acts twice.
-        rate: Hz, of equal steps (default: the median of the data's own).
-        filter_torque: whether tau goes through the same filter (default: only where samples are left out).
-        decimate: every so manyth sample is kept.
-        trim: s that are cut off at both ends of each part (default: 1.5 periods of the cut-off).
-        bridged: times the median step, up to which a gap is interpolated; longer ones cut a trajectory in parts that
-            are named LABEL/1, LABEL/2, ...
+        order: order of the Butterworth filter, which is applied twice.
+        rate: rate of the equal steps, Hz (default: the median of the data).
+        filter_torque: whether to filter tau as well (default: only if samples are dropped).
+        decimate: keep every `decimate`-th sample.
+        trim: time cut off at both ends of every part, s (default: 1.5 periods of the cut-off).
+        bridged: gaps up to this multiple of the median step are interpolated; longer ones cut a trajectory into parts
+            named LABEL/1, LABEL/2, ...
 
     Raises:
-        InputError: settings out of range, a decimation that leaves less than twice the cut-off, or no stretch that is
-            long enough.
+        InputError: settings out of range, a decimation to less than twice the cut-off, or no segment that is long
+            enough.
     """
     require_positive(order=order, decimate=decimate)
     if trim is not None and not trim >= 0:
         raise InputError(f"trim is {trim}; expected seconds >= 0")
     data, repeats = without_repeats(data)
     if rate is None:
-        # Differences of times are rounded.
+        # Rounding removes the rounding errors of time differences.
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
     pieces = stretches(data.t, data.trajectory, gap=bridged)
@@ -134,7 +134,7 @@ def smooth(
 
 
 def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
-    """The labels that these have become where gaps have cut their trajectories; what is unknown stays as it is."""
+    """Labels after smoothing: the label of a trajectory that was cut becomes those of its parts; others stay."""
     found: list[str] = []
     for label in labels:
         parts = [each for each in data.label if each.rpartition(PART)[0] == label]
@@ -143,7 +143,7 @@ def labels_of_parts(data: Trajectories, labels: Sequence[str]) -> list[str]:
 
 
 class _Uniform(NamedTuple):
-    """Stretches at equal steps, end to end."""
+    """Segments at equal steps, concatenated."""
 
     t: np.ndarray
     q: np.ndarray
@@ -171,7 +171,7 @@ def _filtered(
     trim: float,
     decimate: int,
 ) -> Trajectories:
-    """The kept stretches with rates, trimmed and decimated, each a trajectory of its own."""
+    """Filters, differentiates, trims and decimates the kept segments, which become trajectories."""
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "q", "qd", "qdd", "tau")}
     of = [int(data.trajectory[pieces[index][0]]) for index in kept]
     for index in kept:

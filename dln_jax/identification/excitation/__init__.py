@@ -1,4 +1,4 @@
-"""Motions that show a robot's parameters, within its limits: Fourier series whose regressor is well conditioned."""
+"""Excitation: Fourier-series motions within a robot's limits that give a well-conditioned regressor."""
 
 from dln_jax.identification.excitation.candidates import Design, random_designs
 from dln_jax.identification.excitation.design import (

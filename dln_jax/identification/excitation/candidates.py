@@ -1,4 +1,4 @@
-"""Motions within a robot's limits, what they show of a model's parameters, and random ones.
+"""Candidate motions: check them against the limits, measure their information, and draw random ones.
 
 A motion is checked at ten times the samples at which it is designed, and keeps a margin for the times between.
 """
@@ -17,38 +17,38 @@ from dln_jax.identification.excitation.task import Task
 from dln_jax.types import InputError, require_positive, require_seed
 
 FINER = 10
-"""Times as many samples where motions are checked."""
+"""Refinement of the time grid on which motions are checked."""
 MARGIN = 1e-3
-"""Of every limit, in m of clearances, that the samples checked keep free for the times between them."""
+"""Margin kept to every limit at the checked samples (relative; m for clearances) to cover the times between them."""
 DRAWS = 50
-"""Of a random motion, before none is said to be within the limits."""
+"""Failed draws, per motion found, after which drawing is given up."""
 SMALLEST, BISECTIONS = 0.05, 8
-"""Amplitude, relative to that drawn, to which a motion is shrunk at most to keep the limits, and how closely."""
+"""Smallest amplitude to which a motion is shrunk, relative to the original, and the number of bisection steps."""
 
 
 class Design(NamedTuple):
-    """A motion that keeps the limits, and what it shows."""
+    """A motion within the limits, and how informative it is."""
 
     motion: FourierMotion
     information: Float[np.ndarray, "B B"]
-    """A, on average of one sample."""
+    """A, averaged over samples."""
     condition: float
-    """Of the regressor of base parameters, columns of unit length."""
+    """Condition of the regressor of base parameters with columns of unit length."""
     log_determinant: float
-    """Of A."""
+    """log det A."""
     slack: float
-    """Smallest distance to a limit, relative to it."""
+    """Smallest relative distance to a limit."""
     nearest: str
-    """Limit that it is closest to."""
+    """Limit with the smallest distance."""
 
 
 def functions_at(task: Task, t: Float[np.ndarray, " N"]) -> list[np.ndarray]:
-    """Harmonic functions and their derivatives at all times, each [N, 2 H]."""
+    """Harmonic functions and their first two derivatives at all times, [N, 2 H] each."""
     return [np.asarray(each) for each in jax.vmap(lambda t: harmonic_functions(task.harmonics, task.period, t))(t)]
 
 
 def grid(task: Task, finer: int = 1) -> Float[np.ndarray, " N"]:
-    """Times where motions are designed, or as many times more: one period, equally spaced, without its end."""
+    """Times of one period, equally spaced and without its end: the design grid, refined by a factor `finer`."""
     return task.period * np.arange(finer * task.steps) / (finer * task.steps)
 
 
@@ -59,16 +59,16 @@ def states(functions: list[np.ndarray], offset: Any, coefficients: Any) -> tuple
 
 
 def furthest(task: Task, motion: FourierMotion) -> tuple[float, str]:
-    """The largest excess on the fine grid, and of which limit."""
+    """The largest excess on the fine grid, and the name of that limit."""
     motions = states(functions_at(task, grid(task, FINER)), motion.offset, motion.coefficients)
     parts = zip(*(np.split(np.asarray(each), FINER) for each in motions), strict=True)
     return max(worst(task.samples(*part)[2]) for part in parts)
 
 
 def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
-    """The motion as a design, shrunk towards its mean posture as little as its limits ask for; `None` if too little.
+    """Shrinks a motion towards its mean posture until it keeps the limits; `None` if even the smallest breaks them.
 
-    In words, which limit is the last that it breaks.
+    The second result is the limit broken at the smallest amplitude, as text.
     """
 
     def shrunk(amplitude: float) -> FourierMotion:
@@ -91,12 +91,12 @@ def kept(task: Task, motion: FourierMotion) -> tuple[Design | None, str]:
 
 
 def weighted(task: Task, Phi: Any) -> Any:
-    """Rows over the noise of their joint, of the base parameters alone: [N, d, B] of [N, d, P]."""
+    """Regressor of the base parameters with rows divided by the joint's noise: [N, d, P] -> [N, d, B]."""
     return Phi[..., task.columns] / task.noise[:, None]
 
 
 def measured(task: Task, motion: FourierMotion) -> Design:
-    """A motion and what it shows."""
+    """Computes information, condition and slack of a motion."""
     at = states(functions_at(task, grid(task)), motion.offset, motion.coefficients)
     W = weighted(task, np.asarray(task.samples(*at)[0])).reshape(-1, task.columns.size)
     lengths = np.linalg.norm(W, axis=0)
@@ -109,10 +109,10 @@ def measured(task: Task, motion: FourierMotion) -> Design:
 
 
 def random_designs(task: Task, count: int, *, seed: int = 0) -> list[Design]:
-    """Random motions that use the limits: each joint as far as one of its own allows, then all as forces ask for.
+    """Draws random motions, with every joint scaled to its limits and the whole motion to those of force and clearance.
 
     Raises:
-        InputError: 50 draws gave no motion within the limits, with the one that was broken.
+        InputError: too few draws are within the limits (50 failures per motion found); the message names the limit.
     """
     require_positive(count=count)
     require_seed(seed)
@@ -133,7 +133,7 @@ def _draws(task: Task, random: np.random.Generator) -> Iterator[FourierMotion]:
     limits, basis = task.limits, rest_basis(task.harmonics)
     functions = functions_at(task, grid(task, FINER))
     lower, upper = limits.position.T
-    # Velocities of all harmonics are alike.
+    # Dividing by the order gives all harmonics the same velocity.
     spectrum = 1 / np.tile(np.arange(1, task.harmonics + 1), 2)
     while True:
         coefficients = random.normal(size=(len(lower), 2 * task.harmonics)) * spectrum @ basis @ basis.T

@@ -1,13 +1,14 @@
-"""Motions that show a model's parameters best, within a robot's limits, by gradients.
+"""Optimal excitation: gradient-based design of informative motions within a robot's limits.
 
-Unknowns are the series of each joint. The criterion is one of A, the information of a sample (`excitation_task`):
+The unknowns are the Fourier coefficients of the joints. The criterion is a function of A, the information of a sample
+(`excitation.task`):
 
-    information    log det A: all parameters' errors in product, whatever their units (D-optimal)
+    information    log det A: the product of all parameters' errors, independent of units (D-optimal)
     condition      largest over smallest singular value of the regressor with columns of unit length
 
-and every limit at every sample is an inequality of an augmented Lagrangian. Both have many minima: several random
-starts are taken. What is returned keeps the limits at ten times as many samples, designed anew with more margin or
-shrunk where it does not.
+Every limit at every sample is an inequality constraint of an augmented Lagrangian. Both criteria have many local
+minima, so several random starts are optimised. The result keeps the limits at ten times as many samples; a motion that
+does not is designed again with a larger margin or shrunk.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,30 +38,30 @@ from dln_jax.solvers.augmented_lagrangian import make_minimiser
 from dln_jax.types import InputError, Needs, Scalar, require_positive
 
 SHARPNESS = 4
-"""Power of the means that stand for the largest and the smallest eigenvalue."""
+"""Exponent of the power means that approximate the largest and the smallest eigenvalue."""
 FIRST_MARGIN, TIGHTENINGS = 0.01, 3
-"""Of limits, relative to them, where a motion is designed, for what it does between its samples; and how often it is
-designed, with more where that was too little."""
+"""Initial margin to the limits, relative to them, for excursions between samples; and the number of designs, with a
+larger margin after each that exceeds the limits."""
 Criterion = Callable[[Array], Array]
-"""A [B, B] -> scalar, smaller is better."""
+"""A [B, B] -> scalar to minimise."""
 Optimiser = Callable[[Design, Any], Design | None]
-"""(start, information that is there already [B, B]) -> design within the limits, `None` if it came to none."""
+"""(start, information already available [B, B]) -> design within the limits, or `None` if there is none."""
 
 
 def _scaled(A: Float[Array, "B B"]) -> tuple[Float[Array, "B B"], Float[Array, " B"]]:
-    """A with ones on its diagonal, and the roots of that which it had."""
+    """A scaled to a unit diagonal, and the square roots of its diagonal."""
     lengths = jnp.sqrt(jnp.diagonal(A))
     return A / lengths[:, None] / lengths, lengths
 
 
 def information(A: Float[Array, "B B"]) -> Scalar:
-    """-log det A / 2 B: the mean logarithm of standard errors, along axes in which they are independent."""
+    """-log det A / 2 B: the mean logarithm of the standard errors along uncorrelated axes."""
     scaled, lengths = _scaled(A)
     return -(0.5 * jnp.linalg.slogdet(scaled)[1] + jnp.sum(jnp.log(lengths))) / A.shape[0]
 
 
 def condition(A: Float[Array, "B B"]) -> Scalar:
-    """Logarithm of the condition of the regressor with columns of unit length, by smooth means of eigenvalues."""
+    """Logarithm of the regressor's condition with unit-length columns; smooth means replace extreme eigenvalues."""
     sizes = jnp.log(jnp.maximum(jnp.linalg.eigvalsh(_scaled(A)[0]), jnp.finfo(A.dtype).eps))
     largest, smallest = (jax.nn.logsumexp(sign * SHARPNESS * sizes) / SHARPNESS for sign in (1, -1))
     return 0.5 * (largest + smallest)
@@ -70,20 +71,20 @@ CRITERIA: dict[str, Criterion] = {"information": information, "condition": condi
 
 
 class _Scale(NamedTuple):
-    """Of the unknowns, which are dimensionless."""
+    """Scale that makes the unknowns dimensionless."""
 
     middle: np.ndarray
     half: np.ndarray
 
 
 def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterations: int = 60) -> Optimiser:
-    """An optimiser that is compiled once for all starts.
+    """Makes an optimiser that is compiled once for all starts.
 
     Args:
-        task: limits, model, series.
-        criterion: of the information, such as one of `CRITERIA`.
-        rounds: of the augmented Lagrangian, at most.
-        iterations: of L-BFGS in each.
+        task: limits, model and series.
+        criterion: function of the information, such as one of `CRITERIA`.
+        rounds: upper limit of rounds of the augmented Lagrangian.
+        iterations: L-BFGS iterations per round.
     """
     functions, basis = functions_at(task, grid(task)), rest_basis(task.harmonics)
     scale = _Scale(task.limits.position.mean(axis=1), np.diff(task.limits.position, axis=1)[:, 0] / 2)
@@ -123,14 +124,14 @@ def make_optimiser(task: Task, criterion: Criterion, *, rounds: int = 8, iterati
 def best_design(
     task: Task, optimise: Optimiser, criterion: Criterion, starts: Sequence[Design], *, known: Any = None
 ) -> Design:
-    """The best of what several starts come to; a start itself where nothing is better.
+    """The best design among the optimised starts and the starts themselves.
 
     Args:
-        task: of the starts.
-        optimise: by `make_optimiser`, of the same task and criterion.
-        criterion: to choose by.
+        task: task of the starts.
+        optimise: from `make_optimiser`, for the same task and criterion.
+        criterion: criterion of the selection.
         starts: such as `random_designs`.
-        known: information that is there already, from other motions [B, B].
+        known: information already available from other motions [B, B].
 
     Raises:
         InputError: no starts.
@@ -156,14 +157,14 @@ def design_set(
     criterion: str = "information",
     say: Callable[[int, str], None] = lambda done, text: None,
 ) -> tuple[list[Design], Design]:
-    """Motions to identify from, each the best beside those before it, and one to validate on, from starts of its own.
+    """Designs motions for identification, each complementing those before it, and a separate one for validation.
 
     Args:
-        task: limits, model, series.
-        drawn: starts, such as `random_designs`, of which each motion has as many.
-        trajectories: to identify from.
+        task: limits, model and series.
+        drawn: starts such as `random_designs`, divided equally among the motions.
+        trajectories: number of motions for identification.
         criterion: a name in `CRITERIA`.
-        say: is told how many of all motions are done, and what came of the last.
+        say: called with the number of finished motions and the last result as text.
 
     Raises:
         InputError: an unknown criterion, no trajectories, or fewer starts than motions.
@@ -186,7 +187,7 @@ def design_set(
 
 
 def together(designs: Sequence[Design]) -> tuple[float, float]:
-    """Condition and log det A of several motions of one length, taken as one."""
+    """Condition and log det A of several motions of equal length taken together."""
     A = np.mean([each.information for each in designs], axis=0)
     lengths = np.sqrt(np.diag(A))
     sizes = np.linalg.eigvalsh(A / lengths[:, None] / lengths)
@@ -196,7 +197,7 @@ def together(designs: Sequence[Design]) -> tuple[float, float]:
 
 
 def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
-    """Standard errors after some motions over those after others, as many: their geometric mean over parameters."""
+    """Geometric mean over parameters of the standard errors from `designs` over those from `others`, equally many."""
     count = designs[0].information.shape[0]
     return float(np.exp((together(others)[1] - together(designs)[1]) / (2 * count)))
 
@@ -204,15 +205,15 @@ def error_ratio(designs: Sequence[Design], others: Sequence[Design]) -> float:
 def as_trajectories(
     designs: Sequence[Design], labels: Sequence[str], model: Model, parameters: Parameters, *, rate: float, needs: Needs
 ) -> Trajectories:
-    """The motions at equal steps, from rest to rest, with the forces that the nominal model takes for them.
+    """Samples motions from rest to rest at equal steps, with the torques of the nominal model.
 
     Args:
-        designs: of one period.
-        labels: a name for each.
-        model: of the parameters.
-        parameters: nominal ones.
-        rate: samples in a second.
-        needs: of the data, whose torques are with friction if the model's are.
+        designs: designs of one period.
+        labels: a name for each design.
+        model: model of the parameters.
+        parameters: nominal parameters.
+        rate: samples per second.
+        needs: `Needs` of the dataset; its torques include friction if the model does.
 
     Raises:
         InputError: the rate is too low for the harmonics.

@@ -3,9 +3,9 @@
     q(t) = offset + sum over k = 1..H of s_k sin(k w t) + c_k cos(k w t),   w = 2 pi / period
 
 after Swevers, Ganseman, Tukel, De Schutter and Van Brussel (1997, IEEE T-RA 13, "Optimal robot excitation and
-identification"): rates are exact, the spectrum is known, and a motion may be repeated for ever. Velocity and
-acceleration vanish at both ends exactly if sum k s_k = 0 and sum k² c_k = 0, two equations for each joint that
-`rest_basis` solves once and for all.
+identification"). Rates are exact, the spectrum is known, and a motion can be repeated indefinitely. Velocity and
+acceleration vanish at both ends exactly if sum k s_k = 0 and sum k² c_k = 0. `rest_basis` spans the solutions of these
+two equations per joint.
 """
 
 from typing import Any, NamedTuple
@@ -19,14 +19,14 @@ from jaxtyping import Float
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 MOST_HARMONICS = 50
-"""Of a motion that is designed: more are no smooth motion, and take hours."""
+"""Upper limit of harmonics for a design: more give no smooth motion and take hours."""
 
 
 class FourierMotion(NamedTuple):
-    """A periodic motion of d joints, of H harmonics."""
+    """A periodic motion of d joints with H harmonics."""
 
     offset: Any
-    """[d], the mean posture, rad or m."""
+    """[d], mean posture, rad or m."""
     coefficients: Any
     """[d, 2 H]: s_1 .. s_H, c_1 .. c_H; rad or m."""
     period: float
@@ -39,19 +39,19 @@ class FourierMotion(NamedTuple):
 
 
 def state(motion: FourierMotion, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
-    """q, qd and qdd [d] at one time, s."""
+    """q, qd and qdd [d] at a time t, s."""
     values = harmonic_functions(motion.harmonics, motion.period, t)
     q, qd, qdd = (motion.coefficients @ each for each in values)
     return motion.offset + q, qd, qdd
 
 
 def sampled(motion: FourierMotion, t: Any) -> tuple[Float[Array, "N d"], Float[Array, "N d"], Float[Array, "N d"]]:
-    """q, qd and qdd at many times."""
+    """q, qd and qdd at the times t [N], s."""
     return jax.vmap(lambda each: state(motion, each))(jnp.asarray(t))
 
 
 def harmonic_functions(harmonics: int, period: float, t: Scalar | float) -> tuple[Vector, Vector, Vector]:
-    """sin(k w t) for k = 1..H, then cos(k w t), and their first and second derivatives; each [2 H]."""
+    """sin(k w t) for k = 1..H, then cos(k w t), and their first and second derivatives; [2 H] each."""
     rates = 2 * np.pi / period * np.arange(1, harmonics + 1)
     sines, cosines = jnp.sin(rates * t), jnp.cos(rates * t)
     values = jnp.concatenate([sines, cosines])
@@ -60,10 +60,10 @@ def harmonic_functions(harmonics: int, period: float, t: Scalar | float) -> tupl
 
 
 def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
-    """Orthonormal columns [2 H, 2 H - 2] that span all coefficients of a joint that rests at both ends.
+    """Orthonormal columns [2 H, 2 H - 2] that span the coefficients of a joint at rest at both ends.
 
     Raises:
-        InputError: fewer than two harmonics, of which none moves from rest to rest, or more than `MOST_HARMONICS`.
+        InputError: fewer than two harmonics, which cannot move from rest to rest, or more than `MOST_HARMONICS`.
     """
     if not 2 <= harmonics <= MOST_HARMONICS:
         raise InputError(
@@ -80,7 +80,7 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "F K"]:
 
 
 def require_sampling(*, period: float, harmonics: int, rate: float) -> None:
-    """Raises `InputError` unless the highest harmonic is below half the sampling rate, in Hz."""
+    """Raises `InputError` unless the highest harmonic is below half the sampling rate (Hz)."""
     require_positive(seconds=period, harmonics=harmonics, rate=rate)
     highest = harmonics / period
     if highest >= rate / 2:

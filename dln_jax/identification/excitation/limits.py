@@ -1,6 +1,6 @@
-"""What a motion must keep to, and by how much it keeps to it.
+"""Limits of a motion, and how far a state exceeds them.
 
-Every limit is a number that is at most zero where it is kept, relative to the size of the limit:
+The excess of a limit is relative to its size and at most zero while the limit is kept:
 
     |x - middle| / half - 1   for positions, velocities, accelerations and forces,   -clearance / 1 m
 """
@@ -19,13 +19,13 @@ from dln_jax.mechanics.trees import Tree, world_frames
 from dln_jax.types import InputError, Vector
 
 SECONDS_TO_SPEED = 0.2
-"""s in which a joint is assumed to reach full velocity, where no acceleration is stated."""
+"""s: assumed time to full velocity if no acceleration limit is stated."""
 Clearance = Callable[[Array], Array]
-"""q -> [K], m, each to stay positive: such as heights of the links above a table."""
+"""q -> [K], m, that must stay positive, such as heights of the links above a table."""
 
 
 class MotionLimits(NamedTuple):
-    """Of d joints."""
+    """Limits of d joints."""
 
     position: Float[np.ndarray, "d 2"]
     """Lower and upper, rad or m; finite."""
@@ -34,11 +34,11 @@ class MotionLimits(NamedTuple):
     acceleration: Float[np.ndarray, " d"]
     """1/s² or m/s²; finite."""
     force: Float[np.ndarray, "d 2"]
-    """Lower and upper, N m or N; infinite, both, where a joint has none."""
+    """Lower and upper, N m or N; both infinite for a joint without a limit."""
 
 
 class Excess(NamedTuple):
-    """By how much one state is beyond each limit, relative to it; negative inside, `None` where there is no limit."""
+    """Excess of one state over each limit, relative to it; negative inside, `None` without such a limit."""
 
     position: Any
     """[d]."""
@@ -53,7 +53,7 @@ class Excess(NamedTuple):
 
 
 def require_limits(limits: MotionLimits, degrees_of_freedom: int, names: tuple[str, ...] = ()) -> None:
-    """Raises `InputError` that names the first joint whose limits are absent, empty or not numbers."""
+    """Raises `InputError` that names the first joint with missing, empty or NaN limits."""
     d = degrees_of_freedom
     for kind, shape in (("position", (d, 2)), ("velocity", (d,)), ("acceleration", (d,)), ("force", (d, 2))):
         array = np.asarray(getattr(limits, kind))
@@ -78,23 +78,23 @@ def limits_of_robot(
     force: Any = None,
     allow_unlimited: Sequence[str] = (),
 ) -> tuple[MotionLimits, list[str]]:
-    """The limits that a robot's file states, those given in their place, and in words what is assumed of others.
+    """Limits of a robot, from its file and the arguments (which take precedence), and the assumptions made, as text.
 
-    A revolute joint that may be unlimited turns by pi to either side, and its force is free. Each joint takes at least
-    `SECONDS_TO_SPEED` to its full velocity. Velocities are not assumed.
+    A revolute joint that may be unlimited gets a range of pi to either side and free force. Accelerations default to
+    reaching full velocity in `SECONDS_TO_SPEED`. Velocity limits are never assumed.
 
     Args:
-        robot: as read.
-        position: half the range, about zero, rad or m; like all others one for all joints, or [d].
+        robot: from `read_robot`.
+        position: half the range, about zero, rad or m; this and the following are one number for all joints, or [d].
         velocity: 1/s or m/s.
         acceleration: 1/s² or m/s².
         force: N m or N, in either direction.
-        allow_unlimited: names of joints that may lack limits of position (revolute ones) and force, with * and ? as in
-            file names.
+        allow_unlimited: names of joints that may lack limits of position (revolute ones) and force, with the wildcards
+            * and ?.
 
     Raises:
-        InputError: a joint without limits that is not allowed to be, no limit of velocity, a prismatic joint without
-            one of position, a name in `allow_unlimited` that no joint has, or another number of limits.
+        InputError: a joint that is not in `allow_unlimited` lacks a limit, a limit of velocity or of a prismatic
+            joint's position is missing, a pattern matches no joint, or an argument has the wrong number of limits.
     """
     tree, said = robot.tree, []
     d, names = tree.degrees_of_freedom, tree.names or tuple(map(str, range(tree.degrees_of_freedom)))
@@ -130,7 +130,7 @@ def limits_of_robot(
 
 
 def _matching(patterns: Sequence[str], names: tuple[str, ...]) -> np.ndarray:
-    """Which joints one of the patterns names."""
+    """Mask of the joints that match one of the patterns."""
     for pattern in patterns:
         if not fnmatch.filter(names, pattern):
             raise InputError(f"there is no joint '{pattern}' to allow without limits; it has {', '.join(names)}")
@@ -138,7 +138,7 @@ def _matching(patterns: Sequence[str], names: tuple[str, ...]) -> np.ndarray:
 
 
 def _require_allowed(kind: str, which: np.ndarray, names: tuple[str, ...]) -> None:
-    """Raises `InputError` that names the first joint that lacks a limit and may not."""
+    """Raises `InputError` that names the first joint with a missing limit."""
     if which.any():
         name, option = names[int(np.argmax(which))], {"position": "--position", "force": "--torque"}[kind]
         raise InputError(
@@ -152,17 +152,17 @@ def _listed(names: tuple[str, ...], which: np.ndarray) -> str:
 
 
 def heights_above(tree: Tree, height: float) -> Clearance | None:
-    """How far the origins of links are above a plane z = height, m, of those that can rise and sink; `None` without."""
+    """Heights above the plane z = height (m) of all link origins that can move vertically; `None` if none can."""
     drawn = np.random.default_rng(0).uniform(-1, 1, (20, tree.degrees_of_freedom))
     rising = np.ptp([world_frames(tree, jnp.asarray(q))[1][:, 2] for q in drawn], axis=0) > 1e-9
     return (lambda q: world_frames(tree, q)[1][rising, 2] - height) if rising.any() else None
 
 
 def used(limits: MotionLimits, share: float) -> MotionLimits:
-    """The limits of which a motion uses a share, in (0, 1]; ranges shrink towards their middles.
+    """Limits reduced to a share in (0, 1]; ranges shrink towards their middles.
 
     Raises:
-        InputError: another share.
+        InputError: the share is outside (0, 1].
     """
     if not 0 < share <= 1:
         raise InputError(f"share is {share}; expected a number in (0, 1], of the limits that may be used")
@@ -174,7 +174,7 @@ def used(limits: MotionLimits, share: float) -> MotionLimits:
 def excess(
     limits: MotionLimits, clearance: Clearance | None, q: Vector, qd: Vector, qdd: Vector, tau: Vector
 ) -> Excess:
-    """Of one state and its force."""
+    """Excess of one state and its force."""
     bounded = np.isfinite(limits.force).all(axis=1)
     return Excess(
         position=_beyond(limits.position, q),
@@ -191,7 +191,7 @@ def _beyond(bounds: np.ndarray, x: Array) -> Array:
 
 
 def worst(found: Excess) -> tuple[float, str]:
-    """The largest excess of all samples, and of which limit; the last axis of each is that of `excess`."""
+    """The largest excess over all samples, and its limit; fields as of `excess`, with sample axes in front."""
     largest = {kind: float(np.max(each)) for kind, each in found._asdict().items() if each is not None}
     kind = max(largest, key=lambda each: largest[each])
     return largest[kind], kind

@@ -1,7 +1,7 @@
-"""What a motion shows of a model's parameters, and whether a robot can do it.
+"""Excitation task: the information that a motion gives on a model's parameters, and the robot's limits.
 
-With Phi the derivative of the model's force by its parameters, of which only independent columns ("base parameters")
-are kept, and the deviation of each joint's noise as weights, the information of one sample of a motion is on average
+Phi is the derivative of the model's force by its parameters, restricted to independent columns ("base parameters").
+Rows are weighted by the noise of their joint. The mean information of one sample is
 
     A = 1 / N sum over samples of Phiᵀ diag(1 / noise²) Phi,   so that least squares has the covariance A⁻¹ / N
 """
@@ -25,27 +25,27 @@ from dln_jax.precision import require_double_precision
 from dln_jax.types import InputError, require_positive, require_seed
 
 SAMPLES = 20
-"""Of the shortest period, where motions are designed."""
+"""Samples per shortest period on the design grid."""
 DEPENDENT = 1e-2
-"""Part of a column that others do not explain, relative to it, up to which it is taken to depend on them: right angles
-that a file writes as 1.57 leave 8e-4 each."""
+"""A column counts as dependent if the part that others do not explain is below this fraction of it: right angles that a
+file writes as 1.57 leave 8e-4 each."""
 NEGLIGIBLE = 1e-12
-"""Columns shorter than this times the longest are zeros that terms leave which cancel."""
+"""Columns shorter than this fraction of the longest are zero up to rounding: their terms cancel."""
 STATES = 300
-"""Random ones that tell which columns are independent."""
+"""Number of random states from which the independent columns are found."""
 
 
 class Task(NamedTuple):
-    """A model whose parameters are wanted, and what the motions that show them must keep to."""
+    """A model to identify, and the constraints on the motions."""
 
     observe: Callable[..., tuple[Array, Array, Excess]]
-    """(q, qd, qdd) -> of one state Phi [d, P], tau [d] and how far it is beyond the limits; differentiable."""
+    """(q, qd, qdd) -> Phi [d, P], tau [d] and the excess over the limits, for one state; differentiable."""
     samples: Callable[..., tuple[Array, Array, Excess]]
     """The same for `steps` states at once, compiled."""
     steps: int
-    """N, samples of one period where motions are designed."""
+    """N, samples of one period on the design grid."""
     columns: Int[np.ndarray, " B"]
-    """Places of the base parameters among all of the model's."""
+    """Indices of the base parameters among all parameters of the model."""
     noise: Float[np.ndarray, " d"]
     limits: MotionLimits
     period: float
@@ -65,23 +65,23 @@ def make_task(
     dependent: float = DEPENDENT,
     seed: int = 0,
 ) -> Task:
-    """A task for a model whose force is linear in its parameters, such as `models.rigid_tree.make_rigid_tree`.
+    """Makes a task for a model whose force is linear in its parameters, such as `models.rigid_tree.make_rigid_tree`.
 
-    Friction with a sharp step at rest is best smoothed here, on a scale of velocities that motions pass slowly.
+    Smooth any friction that has a step at rest, on a scale of velocities that motions pass slowly.
 
     Args:
-        model: whose parameters the motions are to show.
-        parameters: nominal ones, which tell the forces that the limits are for.
-        limits: of joints.
-        period: of the motions, s.
-        harmonics: of their series, at least 2.
-        clearance: q -> [K], m, that are to stay positive.
-        noise: deviation of the measured force of each joint [d], or one for all; only their ratios matter.
-        dependent: as `DEPENDENT`; what shows by less is not designed for.
-        seed: of the states that tell the base parameters.
+        model: model to identify.
+        parameters: nominal parameters, which give the forces to compare with their limits.
+        limits: limits of the joints.
+        period: period of the motions, s.
+        harmonics: harmonics of the series, at least 2.
+        clearance: q -> [K], m, that must stay positive.
+        noise: standard deviation of the measured force of each joint [d], or one for all; only ratios matter.
+        dependent: as `DEPENDENT`; the design ignores weaker columns.
+        seed: seed of the random states that determine the base parameters.
 
     Raises:
-        InputError: limits that are absent, a setting out of range, or no parameter that shows.
+        InputError: missing limits, a setting out of range, or no identifiable parameter.
     """
     require_double_precision("excitation")
     limits = MotionLimits(*(np.asarray(each, float) for each in limits))
@@ -115,8 +115,8 @@ def make_task(
 def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Array], Float[np.ndarray, " P"]]:
     """(q, qd, qdd) -> Phi [d, P], and theta, with tau = Phi theta.
 
-    The slope of a function of Phi by the state is that of d forces, with its slopes by the rows of Phi as parameters:
-    a third of the program that derivatives of derivatives would be.
+    The gradient of a function of Phi by the state equals that of d forces whose parameters are the function's gradients
+    by the rows of Phi. This custom rule makes the program a third as large as derivatives of derivatives.
     """
     theta, unravel = ravel_pytree(parameters)
 
@@ -141,7 +141,7 @@ def linear_force(model: Model, parameters: Parameters) -> tuple[Callable[..., Ar
 
 
 def independent_columns(A: Float[np.ndarray, "N P"], *, dependent: float = DEPENDENT) -> Int[np.ndarray, " B"]:
-    """Places, sorted, of columns that are independent and explain all others, by QR with pivoting of scaled columns."""
+    """Sorted indices of independent columns that span all others, by QR with pivoting of unit-length columns."""
     from scipy.linalg import qr
 
     lengths = np.linalg.norm(A, axis=0)

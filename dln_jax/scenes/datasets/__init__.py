@@ -1,4 +1,4 @@
-"""Data that are generated from scenes, and the published tasks."""
+"""Datasets generated from scenes, and the published tasks."""
 
 from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST
 from dln_jax.scenes.datasets.generators import characters, free_swing, uniform, uniform_tests

@@ -1,4 +1,4 @@
-"""Data sets sampled from scenes, with exact rates, torques and decomposition, in float64."""
+"""Datasets sampled from scenes, with exact rates, torques and decomposition, in float64."""
 
 import functools
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 @in_float64
 def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Trajectories:
-    """The two-link arm's tip writes letters, one trajectory each, sampled every `dt` s.
+    """Letters written by the tip of the two-link arm, one trajectory each, sampled every `dt` s.
 
-    The outlines come from matplotlib's bundled font, smoothed; angles, rates and torques are exact derivatives of
-    the tip's path through the inverse kinematics and the closed-form equations of motion.
+    The outlines come from matplotlib's bundled font, smoothed. Angles, rates and torques are exact derivatives of the
+    tip's path through the inverse kinematics and the closed-form equations of motion.
     """
     require_positive(dt=dt)
     _require_finite(dt=dt)
@@ -45,7 +45,7 @@ def characters(*, letters: Sequence[str] = LETTERS, dt: float = 0.04) -> Traject
 
         return jax.vmap(motion)(t)
 
-    # One length for all, so that letters share a compilation; a path rests beyond its end.
+    # All letters use the longest duration and thus share a compilation; a path rests beyond its end.
     longest = max(map(len, times))
     motions = [states(path.position, dt * np.arange(longest)) for path in paths]
     q, qd, qdd = (
@@ -67,10 +67,10 @@ def uniform(
     control_bound: float = 10.0,
     seed: int = 0,
 ) -> Trajectories:
-    """Independent random states, each a trajectory of its own, uniform in a box symmetric about zero.
+    """Independent random states, one per trajectory, uniform in a box symmetric about zero.
 
-    Bounds are in rad or m, 1/s, 1/s² and N m or N. A fully actuated scene draws accelerations; an under-actuated one
-    draws controls, from which the accelerations follow.
+    Bounds are in rad or m, 1/s, 1/s² and N m or N. Accelerations are drawn if the scene is fully actuated; otherwise
+    controls are drawn and accelerations follow from them.
     """
     bounds = {
         "position_bound": position_bound,
@@ -107,9 +107,9 @@ def free_swing(
     tolerance: float = 1e-10,
     seed: int = 0,
 ) -> Trajectories:
-    """Motions from rest without torque, integrated adaptively (Dormand-Prince 8) to the given tolerance.
+    """Motions from rest without torque, integrated adaptively (Dormand-Prince 8) to `tolerance`.
 
-    Without `starts` [K, d], as many starting postures as asked for are drawn within ±π/2 (rad, or m).
+    Without `starts` [K, d], `trajectories` starting postures are drawn within ±π/2 (rad or m).
 
     Raises:
         InputError: the integration does not finish.
@@ -131,7 +131,7 @@ def _require_room(samples: int, scene: Scene) -> None:
 
 
 def swings(scene: Scene, t, q: Float[np.ndarray, "K T d"], qd: Float[np.ndarray, "K T d"]) -> Trajectories:
-    """Motions without torque at common times t [T]; accelerations are the scene's at these states."""
+    """Motions without torque at common times t [T]; accelerations are those of the scene at these states."""
     count, times, d = q.shape
     q, qd = q.reshape(-1, d), qd.reshape(-1, d)
     qdd = np.asarray(_batched(closed_form_forward_dynamics, scene)(q, qd, np.zeros_like(q)))
@@ -149,7 +149,11 @@ def rollouts(
     *,
     tolerance: float = 1e-10,
 ) -> tuple[Float[np.ndarray, "K T d"], Float[np.ndarray, "K T d"]]:
-    """Reference motions of a scene without torque from K states: q and qd at the times t, which start at 0."""
+    """Reference motions of a scene without torque from K states: q and qd at the times t, which start at 0.
+
+    Raises:
+        InputError: the integration does not finish.
+    """
     field = second_order(lambda t, q, qd: closed_form_forward_dynamics(scene, q, qd, jnp.zeros_like(q)))
 
     @jax.jit
@@ -164,17 +168,17 @@ def rollouts(
 
 
 STARTS = np.array([[np.pi / 4, np.pi / 4], [-np.pi, -np.pi / 2], [-np.pi / 4, np.pi / 2]])
-"""Postures at rest of the published test, q2 relative to link 1 and zero horizontal, rad."""
+"""Postures at rest of the published test, rad: q2 is relative to link 1, zero is horizontal."""
 
 
 @in_float64
 def uniform_tests() -> Trajectories:
     """The published test motions of the two-link arm (Lutter et al. 2019, the `uniform` experiment), from `STARTS`.
 
-    Three free swings from rest, 400 samples at 0.02 s, integrated by symplectic Euler at 2 ms. That integrator is part
-    of the data: it is of order 1, so that an accurate rollout of the true plant leaves these motions after some seconds
-    (valid prediction time 6.47 s). Angle zero is horizontal, as in the letters: the published results hold these
-    motions, and the arm so turned repeats them to 8e-5 rad. Accelerations are those of the plant at the stored states.
+    Three free swings from rest, 400 samples at 0.02 s, integrated by symplectic Euler at 2 ms. The integrator is part
+    of the data: it is of order 1, so an accurate rollout of the true plant departs from these motions after some
+    seconds (valid prediction time 6.47 s). Angle zero is horizontal, as in the letters: the published results contain
+    these motions, and this arm reproduces them to 8e-5 rad. Accelerations are those of the plant at the stored states.
     """
     scene, t = two_link_arm(), 0.02 * np.arange(400)
     step = symplectic_euler(
@@ -186,7 +190,7 @@ def uniform_tests() -> Trajectories:
 
 
 def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
-    """Adds exact torques, momenta and the decomposition to a motion of a scene; arrays as in the schema."""
+    """Completes a motion of a scene with exact torques, momenta and the decomposition; arrays as in the schema."""
 
     def momentum(scene: Scene, q, qd, qdd):
         return jax.jvp(functools.partial(lagrangian.momentum, scene.lagrangian), (q, qd), (qd, qdd))
@@ -194,7 +198,7 @@ def completed(scene: Scene, t, q, qd, qdd, trajectory, label) -> Trajectories:
     def forces(function):
         return _batched(lambda scene, *state: function(scene.closed_form, *state), scene)(q, qd, qdd)
 
-    # Each compiled by itself, as fusing them would change the last digits of data sets.
+    # Compiled separately, since fusing them would change the last digits of datasets.
     tau, parts = np.asarray(forces(closed_form.inverse_dynamics)), map(np.asarray, forces(closed_form.decompose))
     p, pd = map(np.asarray, _batched(momentum, scene)(q, qd, qdd))
     inertial, coriolis, gravity = parts

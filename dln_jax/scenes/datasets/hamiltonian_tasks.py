@@ -1,4 +1,4 @@
-"""The data of Hamiltonian tasks: four published ones, the damped oscillators, and two with two coordinates.
+"""Datasets of Hamiltonian tasks: four published ones, damped oscillators, and two systems with two coordinates.
 
 Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 
@@ -9,25 +9,25 @@ Published (Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"):
 | `two_body` | ½ p² - 1/r | 1000 x 50 | 0..20 | ±x, x in [0.5, 1.5]² | none | the first fifth |
 | `three_body` | ½ p² - sum 1/r_ij | 5000 x 20 | 0..5 | equilateral, 0.9..1.2 from the centre | none | the first fifth |
 
-Directions of (q, p), and of the triangle, are those of a point drawn in a square, so that diagonals are likelier. Two
-bodies start on a circular orbit with speeds times 1 + 0.05 normal; three with each component of each velocity times
-1 + 0.2 uniform(-1, 1), so that their centre drifts. All times are evenly spaced, both ends included.
+Directions of (q, p), and of the triangle, are those of a point drawn in a square, so diagonals are more likely. Two
+bodies start on a circular orbit with speeds multiplied by 1 + 0.05 normal. Three bodies start with every velocity
+component multiplied by 1 + 0.2 uniform(-1, 1), so their centre of mass drifts. All times are evenly spaced, both ends
+included.
 
-The convention of derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p beside them are
-noisy. The true field therefore misses them by the noise: with seed 0 its test loss is 3.82e-2 on the spring and
-3.56e-2 on the pendulum. What tells models apart is `field`, the exact field at the noisy point. Units are those of the
-table, with masses and G of one.
+Convention of the derivatives: `qd` and `pd` are the exact field at the NOISELESS point, while q and p are noisy. The
+true field therefore has a test loss due to the noise: 3.82e-2 on the spring and 3.56e-2 on the pendulum with seed 0. To
+compare models, use `field`, the exact field at the noisy point. Units are those of the table, with unit masses and G.
 
-Of this project, by the same conventions: `damped_spring` and `damped_pendulum` (the first two with a friction of 0.1 by
-velocity), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
+Added by this project, with the same conventions: `damped_spring` and `damped_pendulum` (the first two with a viscous
+friction of 0.1), and, without noise, 100 trajectories x 50 samples each, the first fifth for the test:
 
 | task | starts | t |
 |---|---|---|
 | `henon_heiles` | within 0.25 of the centre, with an energy of 0.05..0.125 (it escapes from 1/6 on) | 0..10 |
 | `double_pendulum` | at rest, each angle within 1.2 rad of hanging | 0..2.5 |
 
-The draws are made in the published order from the generator that numpy keeps frozen, so that a seed gives the
-published starts and noise. The published motions were integrated to about 1e-6; here energies are constant to 1e-9.
+Random numbers are drawn in the published order from NumPy's frozen generator, so a seed gives the published starts and
+noise. The published motions were integrated to about 1e-6; here energies are constant to 1e-9.
 """
 
 import functools
@@ -53,7 +53,7 @@ from dln_jax.types import Hamiltonian, InputError, Potential, Scalar, Vector
 def spring(
     seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
 ) -> Task:
-    """The mass on a spring, H = q² + p²: mass ½, stiffness 2; with `friction` (force by velocity) damped."""
+    """Mass on a spring, H = q² + p²: mass ½, stiffness 2; damped by `friction` (force over velocity)."""
     scene = mass_spring(mass=0.5, stiffness=2.0, friction=friction)
     return _oscillator(scene, _circle, _circle, 30, (0.1, 1.0), seed, trajectories, noise, tolerance)
 
@@ -62,14 +62,14 @@ def spring(
 def pendulum(
     seed: int = 0, *, trajectories: int = 50, friction: float = 0.0, noise: float = 0.1, tolerance: float = 1e-12
 ) -> Task:
-    """The pendulum, H = 3 (1 - cos q) + p²: mass ½, length 1, acceleration 6; with `friction` damped."""
+    """Pendulum, H = 3 (1 - cos q) + p²: mass ½, length 1, acceleration 6; damped by `friction`."""
     scene = pendulum_scene(mass=0.5, length=1.0, acceleration=6.0, friction=friction)
     return _oscillator(scene, _swing, _circle, 45, (1.3, 2.3), seed, trajectories, noise, tolerance)
 
 
 @in_float64
 def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-12) -> Task:
-    """Two bodies on orbits that are almost circular; q = (x1, y1, x2, y2), and p is the velocity."""
+    """Two bodies on almost circular orbits; q = (x1, y1, x2, y2), and p is the velocity."""
     random = np.random.RandomState(seed)
     starts = []
     for _ in range(trajectories):
@@ -81,7 +81,7 @@ def two_body(seed: int = 0, *, trajectories: int = 1000, tolerance: float = 1e-1
 
 @in_float64
 def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e-12) -> Task:
-    """Three bodies that leave a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
+    """Three bodies that depart from a rotating triangle; q = (x1, y1, x2, y2, x3, y3), and p is the velocity."""
     random = np.random.RandomState(seed)
     third = 2 * np.pi / 3
     starts = []
@@ -89,7 +89,7 @@ def three_body(seed: int = 0, *, trajectories: int = 5000, tolerance: float = 1e
         direction = 2 * random.rand(2) - 1
         radius = 0.9 + 0.3 * random.rand()
         x = direction * radius / np.hypot(*direction)
-        # Each is pulled inward by 1 / (sqrt(3) radius²), which a circle takes at this velocity.
+        # The inward pull on a body is 1 / (sqrt(3) radius²), which keeps it on a circle at this velocity.
         velocity = _turned(x, np.pi / 2) / (radius**1.5 * 3**0.25)
         change = 1 + 0.2 * (2 * random.rand(3, 2) - 1)
         q, p = (np.array([_turned(vector, k * third) for k in range(3)]) for vector in (x, velocity))
@@ -103,7 +103,7 @@ damped_pendulum = functools.partial(pendulum, friction=0.1)
 
 @in_float64
 def henon_heiles(seed: int = 0, *, trajectories: int = 100, tolerance: float = 1e-12) -> Task:
-    """A unit mass in the well of Hénon and Heiles, on orbits that stay in it."""
+    """A unit mass in the Hénon-Heiles potential, on orbits that stay in the well."""
     scene, H = _system(henon_heiles_scene)
     random = np.random.default_rng(seed)
     angle, direction = random.uniform(0, 2 * np.pi, (2, trajectories))
@@ -126,11 +126,11 @@ def _without_noise(scene: Scene, H: Hamiltonian, starts: np.ndarray, t: np.ndarr
     return make_task(scene, H, H, starts, None, t, slice(len(starts) // 5, None), tolerance)
 
 
-# One object for each, by which compiled functions are found again.
+# One cached object per system, by which jit finds functions already compiled.
 @functools.cache
 def _system(make: Callable[[], Scene]) -> tuple[Scene, Hamiltonian]:
     scene = make()
-    # Exact in one step: the kinetic energy is quadratic.
+    # One Newton step is exact: the kinetic energy is quadratic.
     return scene, hamiltonian.legendre(scene.lagrangian, iterations=1)
 
 
@@ -198,4 +198,4 @@ PROTOCOLS: dict[str, Protocol] = {
     "two-body": two_body,
     "three-body": three_body,
 }
-"""By the names that command lines use."""
+"""Tasks by their names on the command line."""

@@ -1,10 +1,10 @@
-"""Letters as smooth tip paths in the plane: what an arm that writes has to follow.
+"""Letters as smooth tip paths in the plane, for an arm that writes.
 
-The outline of a glyph (DejaVu Sans, the font that comes inside matplotlib) is traced contour by contour:
+The outline of a glyph (DejaVu Sans, matplotlib's bundled font) is traced contour by contour:
 
 1. each closed contour is resampled by arc length and smoothed by a Gaussian, which rounds the corners;
-2. it is sampled again, densely where it is curved, by the weight `(1 + (curvature bend_radius)²)^(1/4)`,
-   blurred: at a constant rate of that phase the pen brakes ahead of bends. (Without the blur its centripetal
+2. it is resampled densely where it is curved, by the weight `(1 + (curvature bend_radius)²)^(1/4)`, blurred:
+   at a constant rate of that phase the pen brakes ahead of bends. (Without the blur its centripetal
    acceleration would be at most `straight_speed² / bend_radius`.) People write like this: speed falls with a
    power of the curvature (Lacquaniti, Terzuolo and Viviani, 1983, "The law relating the kinematic and figural
    aspects of drawing movements");
@@ -12,7 +12,7 @@ The outline of a glyph (DejaVu Sans, the font that comes inside matplotlib) is t
 4. the rate of the phase rises and falls like a minimum-jerk motion (Flash and Hogan, 1985), for contours and
    the straight pen-up moves between them. All are joined at rest: velocity and acceleration are continuous.
 
-The shapes come from the font's own integer coordinates: no machine, rasteriser or setting changes them.
+The shapes come from the font's own integer coordinates, so they do not depend on machine, rasteriser or settings.
 """
 
 import math
@@ -33,12 +33,12 @@ from matplotlib.textpath import TextToPath
 from dln_jax.types import InputError, Scalar
 
 LETTERS = "abcdeghlmnopqrsuvwyz"
-"""The letters of the embedded data set `characters`."""
+"""Letters of the embedded dataset `characters`."""
 
 _SAMPLES = 4096
-"""Points per contour before they become a Fourier series."""
+"""Points per contour from which the Fourier series is computed."""
 _HARMONICS = 96
-"""Highest harmonic of that series; with the default smoothing the rest is below a micrometre."""
+"""Highest harmonic of the series; with the default smoothing the remainder is below a micrometre."""
 
 
 class LetterPath(NamedTuple):
@@ -49,8 +49,8 @@ class LetterPath(NamedTuple):
     position: Callable[[Scalar], Float[Array, "2"]]
     """Time in s -> tip (x, y) in m; `jax.jvp` of it gives the velocity, and once more the acceleration.
 
-    It is a pytree: given to a jitted function as an argument, all letters with equally many strokes share one
-    compilation. It holds still outside 0..duration and computes in the default float of JAX.
+    It is a pytree: passed to a jitted function as an argument, all letters with the same number of strokes share one
+    compilation. It is constant outside 0..duration and computes in JAX's default float.
     """
 
 
@@ -66,13 +66,13 @@ class _Stroke(NamedTuple):
 
 
 class _TimedStrokes(NamedTuple):
-    """All strokes of a letter, stacked, and when they happen; times are relative to the duration."""
+    """All strokes of a letter, stacked, and their timing; times are relative to the duration."""
 
     duration: Float[Array, ""]
     starts: Float[Array, "strokes"]
     shares: Float[Array, "strokes"]
     ramps: Float[Array, "strokes"]
-    """Part of its own time that a stroke spends on speeding up, and again on slowing down; at most 1/2."""
+    """Fraction of its own time in which a stroke speeds up, and again slows down; at most 1/2."""
     cosines: Float[Array, "strokes harmonics 2"]
     sines: Float[Array, "strokes harmonics 2"]
     displacements: Float[Array, "strokes 2"]
@@ -97,16 +97,16 @@ def outline(character: str) -> list[Float[np.ndarray, "_ 2"]]:
         raise InputError(f"character is {character!r}, a {type(character).__name__}; {expected}")
     if len(character) != 1:
         raise InputError(f"character is {character!r}, {len(character)} characters; {expected}")
-    # By file and not by name: a name would find a user's font of that name first.
+    # By file, not by name: a name would match a user's font of that name first.
     file = str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"))
     if not character.isprintable() or get_font(file).get_char_index(ord(character)) == 0:
         raise InputError(f"character is {character!r}, which the font lacks; {expected}")
     font = FontProperties(family="DejaVu Sans", fname=file)
     vertices, codes = _DesignUnits().get_text_path(font, character)
-    # The font's points are integers, those that TrueType implies between them halves.
+    # The font's points are integers, and the points that TrueType implies between them are halves.
     exact = np.round(2.0 * np.asarray(vertices, np.float64).reshape(-1, 2)) / 2.0
     outlines = Outline(exact, codes).to_polygons() if len(exact) > 0 else []
-    # Fonts keep lone points as anchors; they draw nothing.
+    # Fonts contain lone anchor points, which draw nothing.
     polygons = [polygon for polygon in map(np.asarray, outlines) if np.ptp(polygon, axis=0).max() > 0.0]
     if not polygons:
         raise InputError(f"character is {character!r}, an empty glyph; {expected}")
@@ -133,7 +133,7 @@ def _contour(
     stretch = np.abs(first)
     curvature = np.imag(np.conj(first) * second) / stretch**3
     weight = stretch * (1.0 + (curvature * bend_radius) ** 2) ** 0.25
-    # Blurred as well, so that the pen brakes ahead of a bend and not in it.
+    # Also blurred, so that the pen brakes ahead of a bend and not in it.
     weight = np.fft.ifft(np.fft.fft(weight) * blur).real
     top_left = np.argmax(curve.imag - 0.5 * curve.real)
     start = top_left if pen is None else np.argmin(np.abs(curve - pen @ np.array([1.0, 1.0j])))
@@ -154,7 +154,7 @@ def _pen_up(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> _Stro
 
 
 def _minimum_jerk_phase(time: Scalar, ramp: Scalar) -> Scalar:
-    """Phase 0..1 at relative time 0..1: its rate rises during `ramp`, stays, and falls during `ramp`."""
+    """Phase 0..1 at relative time 0..1: its rate rises during `ramp`, stays constant, and falls during `ramp`."""
     # The second half mirrors the first.
     early = jnp.where(time > 0.5, 1.0 - time, time)
     rising = jnp.where(early < ramp, early, ramp) / ramp
@@ -184,16 +184,16 @@ def letter_path(
     bend_radius: float = 0.3,
     ramp_length: float = 0.2,
 ) -> LetterPath:
-    """The tip's motion along the outline of a character; the head of this module has the steps.
+    """The tip's motion along the outline of a character; the module docstring describes the steps.
 
     Args:
         character: one printable character of DejaVu Sans that has an outline.
         height: height of a lower-case x, m; characters share this scale and keep the font's proportions.
         centre: (x, y) in m of the point midway across the character and half an x-height above the baseline.
-        mean_speed: length of the path over its duration, m/s; it scales time and changes nothing else.
-        smoothing: standard deviation of the Gaussian along the contour, m: corners are rounded by about this.
+        mean_speed: length of the path over its duration, m/s; it only scales time.
+        smoothing: standard deviation of the Gaussian along the contour, m; corners are rounded by about this.
         bend_radius: the pen slows down where the radius of curvature falls below this, m.
-        ramp_length: what one start and one stop cost, as a way at full speed, m.
+        ramp_length: cost of one start and one stop as an equivalent distance at full speed, m.
 
     Raises:
         InputError: the character has no outline, or a number is not finite or not positive.

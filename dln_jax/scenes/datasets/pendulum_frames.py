@@ -1,13 +1,14 @@
-"""A swinging rod as small pictures: the renderer, and the data set of the pixel pendulum (Greydanus, Dzamba and
-Yosinski 2019, "Hamiltonian Neural Networks", after the pendulum of OpenAI's gym).
+"""A swinging rod as small images: the renderer, and the dataset of the pixel pendulum.
 
-The body is gym's: a uniform rod of 1 kg and 1 m that hangs from its end, in g = 10 m/s². It swings as a point mass of
-3/4 kg on 2/3 m does, so that H = qd²/6 + 5 (1 - cos q), in J, with q = 0 hanging. There is no torque. Frames are 0.05 s
-apart. Motions start at an angle drawn evenly below π/6 and, as in gym, a velocity drawn evenly below 1 rad/s.
+The task is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks", after OpenAI gym's pendulum.
+
+The body is gym's: a uniform rod of 1 kg and 1 m that hangs from its end, in g = 10 m/s². It moves like a point mass of
+3/4 kg on 2/3 m, so H = qd²/6 + 5 (1 - cos q), in J, with q = 0 hanging. There is no torque. Frames are 0.05 s apart.
+Motions start at an angle drawn uniformly within ±π/6 and, as in gym, a velocity drawn uniformly within ±1 rad/s.
 
 A pixel at distance d from the rod's axis has the intensity exp(-(d / w)⁴), w = 0.12 m: 1 on the rod, 0 away from it,
 and smooth between and in q. The frame shows 1.6 m x 1.6 m, with the pivot in the middle, 0.4 m below its upper edge.
-Published frames are gym's own pictures; these need no window and have a derivative.
+The published frames are gym's own images; these need no window and are differentiable.
 """
 
 from typing import NamedTuple
@@ -24,32 +25,32 @@ from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError, Scalar, Vector, require_positive
 
 SIDE = 28
-"""Pixels of a side."""
+"""Pixels per side."""
 PIXELS = SIDE * SIDE
 FRAME_TIME = 0.05
 """Seconds between frames."""
 TRAJECTORIES, FRAMES = 200, 103
-"""As published."""
+"""Numbers of the published dataset."""
 LARGEST_ANGLE, LARGEST_VELOCITY = np.pi / 6, 1.0
-"""Of the starts, in rad and rad/s."""
+"""Bounds of the initial states, in rad and rad/s."""
 _LENGTH, _WIDTH, _EXTENT, _ABOVE = 1.0, 0.12, 1.6, 0.4
 
 
 def rod() -> Scene:
-    """The point pendulum that swings as the rod does, with the same energies."""
+    """The point pendulum with the same motions and energies as the rod."""
     return pendulum(mass=0.75, length=2 / 3, acceleration=10.0)
 
 
 def energy(q: Float[Array, "*shape"], qd: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """H = qd²/6 + 5 (1 - cos q) of the rod, in J; written so that it keeps its digits near rest."""
+    """H = qd²/6 + 5 (1 - cos q) of the rod, in J, in a form without cancellation near rest."""
     return qd**2 / 6 + 10 * jnp.sin(q / 2) ** 2
 
 
 def render(q: Scalar) -> Float[Array, "side side"]:
-    """The frame [28, 28] of a rod at an angle in rad, upper row first; intensities in [0, 1]."""
+    """Renders the frame [28, 28] of a rod at an angle in rad, upper row first; intensities in [0, 1]."""
     pixel = (jnp.arange(SIDE, dtype=q.dtype) + 0.5) * (_EXTENT / SIDE)
     x, y = pixel - _EXTENT / 2, _ABOVE - pixel[:, None]
-    # Along the rod and across it; what lies beyond an end is as far as the end is.
+    # Coordinates along and across the rod; beyond an end, the distance is that to the end.
     along = x * jnp.sin(q) - y * jnp.cos(q)
     across = x * jnp.cos(q) + y * jnp.sin(q)
     beyond = along - jnp.clip(along, 0, _LENGTH)
@@ -58,7 +59,7 @@ def render(q: Scalar) -> Float[Array, "side side"]:
 
 
 class Frames(NamedTuple):
-    """Motions of the rod, as states and as pictures."""
+    """Motions of the rod, as states and as images."""
 
     t: Float[np.ndarray, " T"]
     """s."""
@@ -71,12 +72,12 @@ class Frames(NamedTuple):
 
     @property
     def pairs(self) -> Float[np.ndarray, "K pairs input"]:
-        """Two frames after each other [K, T - 1, 2 * 784], what an autoencoder reads: one frame shows no velocity."""
+        """Pairs of successive frames [K, T - 1, 2 * 784], the input of an autoencoder: one frame shows no velocity."""
         return np.concatenate([self.frames[:, :-1], self.frames[:, 1:]], axis=2)
 
 
 class FrameSplit(NamedTuple):
-    """Three disjoint sets of trajectories: fitted to, selected by, and reported on."""
+    """Three disjoint sets of trajectories: for training, for model selection and for the final test."""
 
     train: Frames
     validation: Frames
@@ -85,10 +86,10 @@ class FrameSplit(NamedTuple):
 
 @in_float64
 def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int = FRAMES) -> Frames:
-    """The data set; states are integrated adaptively to 1e-10 in float64.
+    """Generates the dataset; states are integrated adaptively to 1e-10 in float64.
 
     Raises:
-        InputError: no trajectory, or fewer than three frames, of which a pair and its successor consist.
+        InputError: no trajectory, or fewer than three frames (a pair and its successor).
     """
     require_positive(trajectories=trajectories)
     if frames < 3:
@@ -102,17 +103,17 @@ def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int
 
 
 def pictures(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]:
-    """Frames of angles of any shape, each as one row of 784 pixels, float32."""
+    """Frames for angles of any shape, each as one row of 784 pixels, float32."""
     with jax.enable_x64(True):
         drawn = _pictures(jnp.asarray(q, float).ravel())
     return np.asarray(drawn).reshape(*np.shape(q), PIXELS)
 
 
 def split(data: Frames, *, validation_share: float = 0.1, test_share: float = 0.2, seed: int = 0) -> FrameSplit:
-    """Trajectories drawn by the seed, at least one for each part.
+    """Splits trajectories by the seed, with at least one in each set.
 
     Raises:
-        InputError: shares that leave nothing for training.
+        InputError: the shares leave none for training.
     """
     require_positive(validation_share=validation_share, test_share=test_share)
     count = len(data.q)
@@ -128,7 +129,7 @@ def split(data: Frames, *, validation_share: float = 0.1, test_share: float = 0.
 
 
 def choose(data: Frames, indices: np.ndarray) -> Frames:
-    """Some of the trajectories."""
+    """Selects trajectories by index."""
     return data._replace(q=data.q[indices], qd=data.qd[indices], frames=data.frames[indices])
 
 

@@ -1,4 +1,4 @@
-"""Samples of a phase space with their exact field: motions of a Hamiltonian system."""
+"""Samples in phase space with the exact field, from motions of a Hamiltonian system."""
 
 import functools
 from typing import NamedTuple
@@ -28,7 +28,7 @@ class Part(NamedTuple):
     """One side of the published split; all members have the same N samples."""
 
     data: Trajectories
-    """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0, which is exact."""
+    """As published: q and p with noise; qd, pd (and qdd) of the noiseless motion; tau = 0 exactly."""
     clean: Trajectories
     """The same samples without noise."""
     field: Field
@@ -36,15 +36,15 @@ class Part(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A published data set, and what it was made from."""
+    """A published dataset and the system it was made from."""
 
     scene: Scene
     hamiltonian: Hamiltonian
-    """(q, p) -> H of one state: the textbook's."""
+    """(q, p) -> the textbook H of one state."""
     published_energy: Hamiltonian
-    """(q, p) -> the quantity whose error was published as that of the energy: q² + p² for the pendulum, else H."""
+    """(q, p) -> the quantity published as the energy: q² + p² for the pendulum, else H."""
     t: np.ndarray
-    """Times of each trajectory [T], in s."""
+    """Times of every trajectory [T], s."""
     train: Part
     test: Part
 
@@ -59,7 +59,7 @@ def make_task(
     trained: slice,
     tolerance: float,
 ) -> Task:
-    """Motions from starts (q, p) [K, 2, d] at the times t [T], with noise on both [K, 2, T, d], `None` for none.
+    """Makes a task from starts (q, p) [K, 2, d] at the times t [T], with noise on both [K, 2, T, d], or `None`.
 
     Raises:
         InputError: no trajectories on one side of the split.
@@ -116,10 +116,10 @@ def reference_motion(
     Between steps states are interpolated, with an error of a few hundred times the tolerance.
 
     Raises:
-        InputError: an integration does not finish, as where bodies meet.
+        InputError: an integration does not finish, for example where bodies meet.
     """
     require_positive(tolerance=tolerance)
-    # Motions of one call take as many steps as the slowest of them: in groups, fewer wait. The last group is filled up.
+    # All motions of a call take as many steps as the slowest; groups reduce the waiting. The last group is padded.
     size = min(len(q), _GROUP)
     groups = [np.minimum(np.arange(first, first + size), len(q) - 1) for first in range(0, len(q), size)]
     solved = [_solve(H, dissipation, tolerance, q[group], p[group], t) for group in groups]
@@ -129,7 +129,7 @@ def reference_motion(
     return next(motions), next(motions)
 
 
-# Compiled once for each Hamiltonian, so that further seeds start at once.
+# Compiled once per Hamiltonian, so further seeds start at once.
 @functools.partial(jax.jit, static_argnames=("H", "dissipation", "tolerance"))
 def _solve(H: Hamiltonian, dissipation: Dissipation | None, tolerance: float, q, p, t):
     def rate(t, state):

@@ -1,7 +1,7 @@
-"""Motions of arms by sums of sines, and the torques that they take: the protocol of the LIP paper.
+"""Sum-of-sines motions of robot arms and their torques: the protocol of the LIP paper.
 
 Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO 2024 (arXiv 2310.06585; merlresearch/LIP4RobotInverseDynamics): 50 s,
-torque noise of 0.01 N m, seed 0 trains and 101 to 150 test; every tenth of 5,001 samples is fitted.
+torque noise of 0.01 N m, seed 0 for training and 101 to 150 for the test; every tenth of 5,001 samples is fitted.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 SINES = 50
 TRIES = 10
-"""Draws of a joint's motion after which the next are smaller."""
+"""Draws of a joint's motion after which amplitudes are reduced."""
 
 
 class Motion(NamedTuple):
-    """Of an arm, at equal steps of time."""
+    """Motion of an arm at equal steps of time."""
 
     t: Float[np.ndarray, " N"]
     q: Float[np.ndarray, "N d"]
@@ -32,17 +32,17 @@ class Motion(NamedTuple):
 
 
 def sum_of_sines(arm: Arm, *, seed: int, duration: float = 50.0, dt: float = 0.01, span: float = 0.5) -> Motion:
-    """qd = sum over k = 1 .. 50 of a_k cos(k w t) + b_k sin(k w t), one joint after the other, w = 2 pi / 50 s.
+    """qd = sum over k = 1 .. 50 of a_k cos(k w t) + b_k sin(k w t), drawn joint by joint, w = 2 pi / 50 s.
 
-    a_k and b_k are uniform in ±0.1 r per second, r the `span` of half a joint's limits. A draw that leaves
-    q_middle ± r, or is too fast, is drawn again, after ten tries from a range 0.8 times as wide, and so on.
+    a_k and b_k are uniform in ±0.1 r per second, with r the `span` of half a joint's limits. A draw that leaves
+    q_middle ± r, or is too fast, is repeated; after every ten tries the range shrinks by a factor 0.8.
 
     Args:
-        arm: whose limits count.
-        seed: of the draws.
+        arm: arm whose limits apply.
+        seed: seed of the draws.
         duration: s; both ends are samples.
         dt: s.
-        span: share of the limits, in (0, 1].
+        span: fraction of the limits, in (0, 1].
 
     Raises:
         InputError: a setting out of range.
@@ -78,7 +78,7 @@ def sum_of_sines(arm: Arm, *, seed: int, duration: float = 50.0, dt: float = 0.0
 
 @in_float64
 def arm_torques(arm: Arm, q: Any, qd: Any, qdd: Any, *, friction: bool) -> Float[np.ndarray, "N d"]:
-    """tau of states [N, d] without noise; dry friction has the sign of the rate."""
+    """Noiseless tau of states [N, d]; dry friction has the sign of the rate."""
     tau = np.asarray(jax.jit(jax.vmap(lambda *state: newton_euler(arm.tree, *state)))(q, qd, qdd))
     return tau + arm.viscous * qd + arm.coulomb * np.sign(qd) + arm.offset if friction else tau
 
@@ -93,16 +93,16 @@ def lip_trajectories(
     duration: float = 50.0,
     span: float = 0.5,
 ) -> Trajectories:
-    """One trajectory for each seed, as `sum_of_sines`, thinned out.
+    """One trajectory per seed from `sum_of_sines`, subsampled.
 
     Args:
-        arm: moved.
-        seeds: of the motions and their noise.
-        friction: whether that of the arm acts.
-        noise: standard deviation of the torques' noise, N m or N; it is drawn for all samples, kept or not.
-        every: samples of 10 ms, of which one is kept.
+        arm: the arm.
+        seeds: seeds of the motions and their noise.
+        friction: whether the arm's friction acts.
+        noise: standard deviation of the torques' noise, N m or N; drawn for all samples, also those not kept.
+        every: keep every `every`-th sample (10 ms apart).
         duration: s.
-        span: share of the joints' limits that motions have.
+        span: fraction of the joints' limits that the motions use.
 
     Raises:
         InputError: no seeds, or a setting out of range.

@@ -1,1 +1,1 @@
-"""Training models of a robot's torques: options, data, model, fit, evaluation."""
+"""Trains models of a robot's torques: options, data, model, fit and evaluation."""

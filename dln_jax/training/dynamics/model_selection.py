@@ -1,4 +1,4 @@
-"""--model auto: the ladder of models for these data, and the one that validation chooses."""
+"""--model auto: fits a sequence of candidate models and selects one by validation."""
 
 import dataclasses
 import math
@@ -38,18 +38,18 @@ from dln_jax.training.identification.task import Case, Sets, with_description, w
 from dln_jax.zoo.descriptions import Description, build, describe
 
 LADDER_SECONDS, RUNG_SECONDS = 300.0, 120.0
-"""Of the whole ladder, and of one search or training of a network in it, where --seconds says nothing."""
+"""Default time limits, s: for the whole selection, and for one search or network in it."""
 MOST_SAMPLES = 4_000
-"""That networks beside other models are fitted to."""
+"""Largest number of samples to which residual networks are fitted."""
 EXPLICIT, KERNEL = "trigonometric", "trigonometric-kernel"
 BESIDE = "-residual"
-"""Behind the name of a model to which a network is added."""
+"""Suffix of the name of a model with a residual network."""
 
 
 def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """The model that validation chooses, trained; prints the ladder, and writes it as `ladder.json`.
+    """Trains the model selected by validation; prints all candidates and writes them to `ladder.json`.
 
-    Devices of a mesh share the network of the last rung; the others are fits that one device does.
+    The devices of a mesh share the final network; all other candidates are fitted on one device.
 
     Raises:
         InputError: no model could be fitted.
@@ -57,7 +57,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | 
     train_set, validation, _ = recorded.sets
     needs = recorded.needs
     if needs.friction:
-        # Every model has the same friction, so that none is better for that alone.
+        # All models get the same friction, so that none is better for that alone.
         laws = needs.joint_friction or USUAL
         recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
         print(f"friction of every model: {', '.join(laws)} in each joint")
@@ -76,7 +76,7 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | 
 
 
 def report(step: Step) -> None:
-    """Prints a rung as soon as it is done with."""
+    """Prints the result of a candidate as soon as it is available."""
     if not step.tried:
         return
     if step.nmse is None:
@@ -87,7 +87,7 @@ def report(step: Step) -> None:
 
 
 def print_ladder(found: Climb) -> None:
-    """The table of all rungs, and why the climb ended."""
+    """Prints a table of all candidates, and why the selection ended."""
     title = "the ladder, by errors on validation motions"
     table = Table("model", "nMSE, mean", "nMSE, worst joint", "s", "", title=title)
     for step in found.steps:
@@ -102,7 +102,7 @@ def print_ladder(found: Climb) -> None:
 
 
 def as_json(found: Climb) -> dict[str, Any]:
-    """What `ladder.json` holds."""
+    """Contents of `ladder.json`."""
     rungs = []
     for step in found.steps:
         mean = None if step.nmse is None else float(step.nmse.mean())
@@ -113,7 +113,7 @@ def as_json(found: Climb) -> dict[str, Any]:
 
 
 def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Rung]:
-    """Those that state most first."""
+    """The candidates, from the strongest prior knowledge to the weakest."""
     bases: dict[str, Fitted] = {}
 
     def both(name: str, fit: Callable[[float], Fitted]) -> list[Rung]:
@@ -130,7 +130,7 @@ def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) 
     known = [] if robot is None else both("rigid-tree", lambda left: _rigid_tree(given, recorded, robot))
     learned = both("learned-tree", by_name("learned-tree"))
     first, second = (parameters_of_degree(recorded.needs, degree) for degree in (1, 2))
-    # A small basis is fitted in a second, a tree of unknown frames in half a minute.
+    # A small basis is fitted within a second; a search for joint frames takes half a minute.
     small = second is not None and second <= MOST_PARAMETERS
     explicit = (
         both(EXPLICIT, by_name(EXPLICIT))
@@ -144,13 +144,13 @@ def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) 
 
 
 def _too_large(size: int | None) -> Callable[[float], str]:
-    """A rung of no model."""
+    """A candidate without a model, and the reason."""
     number = "too many" if size is None else f"{size:,}"
     return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
 
 def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
-    """A model that `--model` names, as it would be trained alone."""
+    """Trains a model as `--model NAME` would."""
     limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
     own, method = dataclasses.replace(given, model=name), METHODS[name]
     task, training = method.fit(planned(method, own, name, recorded, time.perf_counter() + limit), own, folder, mesh)
@@ -158,7 +158,7 @@ def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: 
 
 
 def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
-    """The robot's tree, identified as the command `identify` does."""
+    """Identifies the robot's tree as the command `identify` does."""
     needs = recorded.needs
     train_set, validation, _ = recorded.sets
     began = time.perf_counter()
@@ -174,7 +174,7 @@ def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
 
 
 def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitted | str:
-    """A network beside a model, if held-out motions ask for one."""
+    """Adds a residual network to a model if held-out motions justify it."""
     if base is None:
         return "there is no model to add a network to"
     began = time.perf_counter()
@@ -197,7 +197,7 @@ def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitte
 
 
 def _as_rigid(learned: Fitted, recorded: Recorded) -> Fitted:
-    """A learned tree as one of known frames."""
+    """Converts a learned tree to a tree with known frames."""
     task: Task = learned.outcome[0]
     needs, given, found = needs_of_tree(recorded.needs), task.description, learned.parameters
     tree = tree_of(found, needs, parents=given["parents"], acceleration=given["acceleration"])
@@ -216,6 +216,6 @@ def _as_rigid(learned: Fitted, recorded: Recorded) -> Fitted:
 def _as_training(
     recorded: Recorded, description: Description, model: Model, parameters: Parameters, seconds: float
 ) -> Fitted:
-    """A fit as a task and its training, as those of models by name."""
+    """Wraps a fit as a task and its training, as for models trained by name."""
     task = Task(recorded, description["name"], description, SCALED_TORQUE, None, 0, math.inf)
     return Fitted(model, parameters, (task, training_of(task, parameters, float("nan"), seconds)))

@@ -1,4 +1,4 @@
-"""Options of commands that train dynamics, and which of them a model reads."""
+"""Options of commands that train dynamics, and which of them a model uses."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 
 NETWORK, AUTO = "structured-delan", "auto"
-"""The model that embedded data train by default, and that which the ladder chooses, the default for files."""
+"""The default model of the embedded data, and the model selection that is the default for files."""
 OF_NETWORKS = ("width", "depth", "activation")
 OF_ADAM = ("batch", "learning_rate", "weight_decay", "patience")
 OF_TRAININGS = ("steps", "target", "samples", "precision", "processes", "objective")
@@ -101,9 +101,9 @@ class ArmOptions(Options):
 
 
 def with_model(given: Options) -> tuple[Options, str]:
-    """The options with the model that is learned, and a sentence for the user where that needs one.
+    """Completes the options with a model, and explains the choice if the user should know about it.
 
-    By default a file is given to the ladder. Options that only networks read choose a network, as do the embedded data.
+    For files the default is model selection. Options used by networks only select a network, as do the embedded data.
     """
     if given.model is not None:
         return given, ""
@@ -120,7 +120,7 @@ def with_model(given: Options) -> tuple[Options, str]:
 
 
 def check_direct_options(given: Options, others: tuple[str, ...], model: str, why: str) -> None:
-    """Refuses the options of networks and optimisers, and others, for a model that is fitted without them."""
+    """Refuses the options of networks and optimisers, and `others`, for a model fitted without them."""
     if given.seeds > 1:
         raise InputError(f"--seeds is {given.seeds}, but {model} {why} and has no seeds; leave it out")
     of_networks = (*OF_NETWORKS, *OF_ADAM, "steps", "target", "processes")
@@ -130,7 +130,7 @@ def check_direct_options(given: Options, others: tuple[str, ...], model: str, wh
 
 
 def check_arm_options(given: ArmOptions, kind: str) -> None:
-    """Refuses what is for arms where another model was asked for."""
+    """Refuses options for arms if another kind of model was selected."""
     require_positive_if_given(given, ["velocity_scale"])
     if given.model == AUTO:
         return

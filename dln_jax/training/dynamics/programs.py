@@ -1,4 +1,4 @@
-"""The programs that evaluate a model of dynamics, with its parameters as arguments: they compile while it trains."""
+"""Programs that evaluate a model of dynamics, with its parameters as arguments so that they compile while it trains."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,25 +22,25 @@ from dln_jax.types import InputError
 from dln_jax.zoo.descriptions import build
 
 CHUNK = 256
-"""Samples whose torques are linearised in the parameters by one call."""
+"""Number of samples per call of the program that linearises the torques in the parameters."""
 
 
 class Programs(NamedTuple):
-    """What evaluates the model of a task, for any of its parameters."""
+    """Programs that evaluate the model of a task for any parameters."""
 
     model: Model
     double: Model
-    """The same in float64, whose torques are linearised in the parameters."""
+    """The same model in float64, whose torques are linearised in the parameters."""
     predict: Any
-    """(parameters, samples) -> answers for the validation and the test."""
+    """(parameters, samples) -> predictions for test and validation."""
     follow: Any
     """(parameters, records of the test) -> motions and energies."""
     ceilings: Callable[[], dict[str, float]]
-    """() -> metrics of the true plant's rollouts; none where the scene is unknown or the test has no motions."""
+    """() -> metrics of the true plant's rollouts; empty for an unknown scene or a test without motions."""
 
 
 def programs_of(task: Task, mesh: Mesh | None) -> Programs:
-    """Returns programs that compile when they are first called."""
+    """Returns programs that compile on their first call."""
     model = build(task.description)
     predict = prediction_program(model.energies, mesh=mesh)
     follow = motion_program(lambda parameters: dynamics(model.energies(parameters)))
@@ -49,16 +49,16 @@ def programs_of(task: Task, mesh: Mesh | None) -> Programs:
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """`jax.jit` for programs of which each runs once or twice."""
+    """`jax.jit` for programs that run once or twice each, with quick compilation."""
     return jax.jit(function, compiler_options=quick_compilation())
 
 
 def programs_ahead(task: Task, mesh: Mesh | None, *, uncertainty: bool) -> Programs:
-    """Returns programs that compile in a thread from now on, while the task's model trains.
+    """Returns programs that compile in a background thread while the model trains.
 
     Args:
-        task: a model that an optimiser trains, whose description stays as it is.
-        mesh: devices that share the samples; their programs compile when they are called.
+        task: a model that an optimiser trains, with a final description.
+        mesh: devices that share the samples; their programs compile on their first call.
         uncertainty: whether the torques will be linearised in the parameters.
     """
     programs = programs_of(task, mesh)
@@ -84,14 +84,14 @@ def programs_ahead(task: Task, mesh: Mesh | None, *, uncertainty: bool) -> Progr
 
 
 def judged_data(task: Task) -> Trajectories:
-    """Returns the samples of the test, followed by those of the validation: one program predicts both."""
+    """Returns the test samples followed by the validation samples, so that one program predicts both."""
     test, validation = task.sets.test, task.sets.validation
     keys = [key for key in ("q", "qd", "qdd", "tau", "p", "pd") if getattr(test, key) is not None]
     return test._replace(**{key: np.concatenate([getattr(test, key), getattr(validation, key)]) for key in keys})
 
 
 def records_or_none(task: Task) -> Records | None:
-    """Returns the test's motions as they were recorded; `None` for independent states or motions of one sample."""
+    """Returns the recorded test motions; `None` for independent states or motions of one sample."""
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
         return None
@@ -102,7 +102,7 @@ def records_or_none(task: Task) -> Records | None:
 
 
 def plant_metrics(task: Task) -> dict[str, float]:
-    """Returns the metrics of rollouts of the true plant, the ceiling of any model's."""
+    """Returns the rollout metrics of the true plant, the upper bound for any model."""
     test = task.sets.test
     if task.scene is None or records_or_none(task) is None:
         return {}
@@ -110,7 +110,7 @@ def plant_metrics(task: Task) -> dict[str, float]:
     motions, energies = compiled(motion_program(lambda _: plant))(None, records_of(test, None))
     try:
         return metrics_of_motions(motions, energies, test)
-    except InputError:  # a coordinate that rests; the model's own metrics say so
+    except InputError:  # a coordinate at rest; the metrics of the model report it
         return {}
 
 

@@ -1,4 +1,4 @@
-"""The data that a command names, and what they need: of joints, friction, a robot's file or a sketch of it."""
+"""Reads the data that a command names, with their `Needs`, robot file and kinematic prior."""
 
 from typing import NamedTuple
 
@@ -25,11 +25,11 @@ from dln_jax.types import InputError, Needs
 from dln_jax.zoo.catalogue import entry_of
 
 USES = ("training", "validation", "the test")
-"""Of the parts of a split, in their order."""
+"""Uses of the parts of a split, in their order."""
 
 
 class Recorded(NamedTuple):
-    """The data that the arguments name, and what they need."""
+    """The data that the arguments name, and what is known about the plant."""
 
     name: str
     sets: Split
@@ -37,16 +37,16 @@ class Recorded(NamedTuple):
     needs: Needs
     needs_origin: str
     said: tuple[str, ...]
-    """Where rates come from, and what is wrong with the data."""
+    """Lines for the user: the origin of the rates, and findings about the data."""
     cutoff: float | None
-    """Hz, of the filter that was applied to q; `None` without."""
+    """Cut-off of the filter applied to q, Hz; `None` without a filter."""
     robot: Robot | None
-    """Whose motions they are, where its file is given."""
+    """The robot that moved, if its file was stated."""
     parents: tuple[int, ...] | None
-    """Link that each hangs on, where that is given."""
+    """Parent link of every link, if stated."""
     sketch: Sketch | None
     torque: str = "measured torques"
-    """That models are fitted to and their bands are of."""
+    """The torques that models are fitted to and uncertainty bands refer to."""
 
 
 def read(given: Options) -> Recorded:
@@ -112,7 +112,7 @@ def read(given: Options) -> Recorded:
 
 
 def stated_needs(given: Options, scene: Scene | None, data: Trajectories, robot: Robot | None) -> tuple[Needs, str]:
-    """What the plant needs, and who says so: the command line, the scene, the file, the robot, or an assumption."""
+    """`Needs` of the plant and their origin: the command line, the scene, the file, the robot, or an assumption."""
     needs, origin = _needs_and_origin(given, scene, data, robot)
     scale = given.velocity_scale if isinstance(given, ArmOptions) else None
     if scale is None:
@@ -142,7 +142,7 @@ def _needs_and_origin(
 
 
 def robot_of(given: Options) -> Robot | None:
-    """The robot of --robot."""
+    """Reads the robot of --robot."""
     if not isinstance(given, ArmOptions) or given.robot is None:
         if isinstance(given, ArmOptions):
             refuse_given(given, ["hold"], "for joints of --robot")
@@ -151,7 +151,7 @@ def robot_of(given: Options) -> Robot | None:
 
 
 def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
-    """The parents of --parents, counted from 0 as everywhere else."""
+    """Parses --parents into parents counted from 0, as everywhere else in the code."""
     if not isinstance(given, ArmOptions) or given.parents is None:
         return None
     try:
@@ -167,7 +167,7 @@ def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
 
 
 def sketch_of(given: Options, d: int, parents: tuple[int, ...] | None) -> Sketch | None:
-    """The sketch of --sketch."""
+    """Reads the kinematic prior of --sketch."""
     if not isinstance(given, ArmOptions) or given.sketch is None:
         return None
     try:

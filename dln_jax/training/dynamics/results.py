@@ -1,4 +1,4 @@
-"""What a training of dynamics comes to: its test errors and speed, figures and tables."""
+"""Evaluates a training of dynamics: test errors, speed, figures and tables."""
 
 from pathlib import Path
 from typing import Any
@@ -30,14 +30,14 @@ from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.run import load
 
 SUMMARIES = {"median": np.median, "mean": np.mean, "standard_deviation": np.std, "largest": np.max}
-"""Of the seeds' test errors."""
+"""Statistics over the seeds' test errors."""
 CEILINGS = {
     "vpt_seconds": "vpt_ceiling_seconds",
     "vpt_interpolated_seconds": "vpt_ceiling_interpolated_seconds",
     "normalised_state_error": "normalised_state_error_ceiling",
     "energy_error_j": "energy_error_ceiling_j",
 }
-"""Metrics of a rollout, and the names of what the true plant gets."""
+"""Rollout metrics and the names of the true plant's values."""
 MEANINGS = {
     "torque_mse": "torque, mean square error",
     "test_nmse": "torque, error over variance, mean of joints",
@@ -68,7 +68,7 @@ MEANINGS = {
     "one_step_low_latency_p50_us": "one call in low-latency mode, median",
     "one_step_low_latency_p99_us": "one call in low-latency mode, 99 %",
 }
-"""Of the metrics' names; others say it themselves."""
+"""Labels of metrics; other names are self-explanatory."""
 
 
 def evaluate(
@@ -81,11 +81,11 @@ def evaluate(
     figures: bool,
     low_latency: bool,
 ) -> tuple[dict[str, float | int], Judged]:
-    """Loads the stored model as a user would, measures it on the test trajectories, judges it, and draws it."""
+    """Loads the stored model as a user would, evaluates it on the test trajectories, judges it and draws figures."""
     run = load(folder)
     functions, test = run.dynamics, task.sets.test
     latency = latency_of(functions, task)
-    # Another process times the low-latency mode, while this one evaluates and draws.
+    # Another process times the low-latency mode while this one evaluates and draws.
     timed = in_background(low_latency_metrics, folder, latency_states(task), print) if low_latency else dict
     samples = samples_of(judged_data(task), data_type(task.precision))
     answers = as_arrays(programs.predict(run.parameters, samples))
@@ -118,7 +118,7 @@ def evaluate(
 
 
 def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[Any, int]:
-    """Parameters and index of the chosen seed, by default the one with the lowest validation error."""
+    """Parameters and index of the selected seed, by default the one with the lowest validation error."""
     if seeds == 1:
         return training.parameters, 0
     if best is None or not np.isfinite(training.validation[best]):
@@ -127,7 +127,7 @@ def best_seed(training: Training, seeds: int, best: int | None = None) -> tuple[
 
 
 def validation_metrics(training: Training, seeds: int, best: int | None) -> dict[str, float]:
-    """The validation error of the model that is kept."""
+    """Validation error of the model that is kept."""
     errors = np.ravel(training.validation)
     return {"validation_error": float(errors[best_seed(training, seeds, best)[1]])} if training.history else {}
 
@@ -138,19 +138,19 @@ def parameters_of(training: Training, index: int) -> Any:
 
 
 def latency_of(functions: Dynamics | PlainDynamics, task: Task, *, calls: int = 5000) -> Latency:
-    """Of one inverse-dynamics call."""
+    """Latency of one inverse-dynamics call."""
     states = list(zip(*map(jnp.asarray, latency_states(task)), strict=True))
     return one_step(functions.inverse_dynamics, states, calls=calls)
 
 
 def latency_states(task: Task) -> tuple[np.ndarray, ...]:
-    """q, qd and qdd of the test, in the precision of the model."""
+    """Up to 512 test states q, qd and qdd, in the precision of the model."""
     test, dtype = task.sets.test, data_type(task.precision)
     return tuple(np.asarray(array[:512], dtype) for array in (test.q, test.qd, test.qdd))
 
 
 def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Trajectories) -> Definiteness | None:
-    """Of the mass matrices at the states of the data; `None` for a model that has a definite one by its structure."""
+    """Definiteness of the mass matrices along the data; `None` for a model without energy or definite by structure."""
     properties = CATALOGUE[task.kind].properties
     if properties.definite or not properties.energy:
         return None
@@ -158,16 +158,16 @@ def definiteness_of(functions: Dynamics | PlainDynamics, task: Task, data: Traje
 
 
 def definiteness_metrics(functions: Dynamics | PlainDynamics, task: Task) -> dict[str, float]:
-    """What the mass matrices of a model without structure are like on the test."""
+    """Metrics on the mass matrices of an unstructured model over the test states."""
     found = definiteness_of(functions, task, task.sets.test)
     names = {"smallest_eigenvalue": "smallest_mass_eigenvalue"}
     return {} if found is None else {names.get(key, key): value for key, value in found._asdict().items()}
 
 
 def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Motion], dict[str, float]]:
-    """Motions of the test under interpolated torques, valid prediction times, and the true plant's as their ceiling.
+    """Test rollouts under interpolated torques, and valid prediction times with the true plant's as the upper bound.
 
-    None for independent states, which are no motion.
+    Empty for independent states, which are no motion.
     """
     test = task.sets.test
     if len(np.unique(test.trajectory)) == len(test.t):
@@ -176,7 +176,7 @@ def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Moti
         motions, energies = programs.follow(parameters, records_of(test, data_type(task.precision)))
         found = metrics_of_motions(motions, energies, test)
     except InputError as error:
-        # The model is trained: what its test cannot tell is left out, not refused.
+        # The model is trained, so metrics that the test cannot provide are left out instead of refused.
         print(f"no rollouts: {error}")
         return [], {}
     plant = programs.ceilings()
@@ -185,7 +185,7 @@ def rollouts(parameters: Any, task: Task, programs: Programs) -> tuple[list[Moti
 
 
 def draw(folder: Path, task: Task, training: Training, motions: list[Motion], predicted: dict[str, np.ndarray]) -> None:
-    """Writes what there is to draw; `motions` are the model's of the test, or none."""
+    """Writes all applicable figures; `motions` are the model's rollouts of the test, possibly none."""
     test = task.sets.test
     write_figure(folder / "decomposition.png", drawing.force_decomposition(test, predicted, model=task.kind))
     if training.history and task.solver is not None:
@@ -199,7 +199,7 @@ def draw(folder: Path, task: Task, training: Training, motions: list[Motion], pr
 
 
 def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
-    """The figures that a user wants to see, with units, and beside those of rollouts what the true plant gets."""
+    """Prints the metrics with units, and next to rollout metrics the true plant's values."""
     force = "N m" if set(task.needs.joints) == {"revolute"} else "N m or N"
     units = dict.fromkeys((key for key in metrics if "_mse" in key), f"({force})²")
     units |= {key: "1" for key in metrics if key.endswith("_nmse")}
@@ -219,7 +219,7 @@ def print_metrics(metrics: dict[str, float | int], task: Task) -> None:
 
 
 def number(metric: str, value: int | float) -> str:
-    """As a user wants to see it."""
+    """Formats a metric for the table."""
     if isinstance(value, int):
         return f"{value:,}"
     tiny = any(word in metric for word in ("_mse", "_nmse", "error", "eigenvalue", "condition"))

@@ -1,4 +1,4 @@
-"""Training a task of dynamics into a run folder: the model, its errors, its speed, and what is to be said of it."""
+"""Trains a task of dynamics into a run folder: the model, its errors, its speed and its verdict."""
 
 from pathlib import Path
 
@@ -31,12 +31,12 @@ from dln_jax.zoo.run import load, save
 
 
 def run(given: Options, command: str) -> None:
-    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ...
+    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ...
 
     Raises:
-        InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
-        FitRefused: the model predicts held-out torques no better than a constant, and neither --steps nor --seconds
-            cut its training short; the run folder is complete.
+        InputError: no validation error is finite, or the loss became non-finite; the last good parameters are kept.
+        FitRefused: the model predicts held-out torques no better than a constant, and neither --steps nor --seconds cut
+            its training short; the run folder is complete.
     """
     given, chosen_for = with_model(given)
     mesh, recorded = mesh_of(given), read(given)
@@ -53,7 +53,7 @@ def run(given: Options, command: str) -> None:
             programs = programs_of(task, mesh)
         else:
             announce_model(chosen)
-            fixed = chosen.solver is not None and given.target is None  # its description is that of the model to come
+            fixed = chosen.solver is not None and given.target is None  # the fit does not change its description
             ahead = programs_ahead(chosen, mesh, uncertainty=given.uncertainty) if fixed else None
             task, training = METHODS[chosen.kind].fit(chosen, given, folder, mesh)
             programs = ahead or programs_of(task, mesh)
@@ -85,7 +85,7 @@ def run(given: Options, command: str) -> None:
 
 
 def announce(recorded: Recorded, chosen_for: str) -> None:
-    """Says what is trained on, and what was assumed."""
+    """Prints the data used for training and the assumptions made."""
     counts = ", ".join(f"{len(part.t)} {role}" for role, part in recorded.sets._asdict().items())
     needs = recorded.needs
     terms = [name for name in ("gravity", "friction") if getattr(needs, name)] or ["no potential, no friction"]
@@ -98,7 +98,7 @@ def announce(recorded: Recorded, chosen_for: str) -> None:
 
 
 def announce_model(task: Task) -> None:
-    """Says what is trained, and how."""
+    """Prints the model to train and its optimiser."""
     if CATALOGUE[task.kind].properties.canonical and task.objective.of_torques:
         print("no momenta p in the data: the Hamiltonian is fitted to torques")
     if task.solver is not None:
@@ -109,7 +109,7 @@ def announce_model(task: Task) -> None:
 
 
 def warn(task: Task, training: Training, folder: Path) -> None:
-    """Says what a user should know about how training ended, and of what came of it."""
+    """Warns about indefinite mass matrices and about a training that ended early."""
     found = definiteness_of(load(folder).dynamics, task, merged(task.sets))
     if found is not None and found.share_not_definite > 0:
         properties = CATALOGUE[task.kind].properties

@@ -24,59 +24,59 @@ class Solver(NamedTuple):
 
     optimiser: Optimiser
     reason: str
-    """Why it is that one; empty where the user chose."""
+    """Reason for this optimiser; empty if the user chose it."""
     problem: Problem
     samples: int | None
     """Number of training samples that are drawn for it; `None` for all."""
 
 
 class Task(NamedTuple):
-    """What the arguments come to: the data, what they need, and the model to train."""
+    """A resolved task: the data, their `Needs`, and the model to train."""
 
     recorded: Recorded
     kind: str
     description: dict[str, Any]
-    """Of the model, for `dln_jax.zoo.build`."""
+    """Description of the model, for `dln_jax.zoo.build`."""
     objective: Objective
     solver: Solver | None
     """`None` for models that are fitted without an optimiser."""
     seeds: int | tuple[int, ...]
-    """One, or several in one program."""
+    """One seed, or several that train in one program."""
     until: float
     """Reading of `time.perf_counter` at which training stops, for the command or a candidate of model selection."""
     search: TreeFit | None = None
     """Outcome of the search for the joint frames of a learned tree."""
     best: int | None = None
-    """Index of the seed that cross-validation prefers; `None` where that was not asked."""
+    """Index of the seed selected by cross-validation; `None` without cross-validation."""
 
     @property
     def seconds(self) -> float:
-        """Seconds that are left for fits."""
+        """Seconds left for fits."""
         return seconds_left(self.until)
 
     @property
     def name(self) -> str:
-        """Of the data."""
+        """Name of the data."""
         return self.recorded.name
 
     @property
     def sets(self) -> Split:
-        """The data."""
+        """Training, validation and test data."""
         return self.recorded.sets
 
     @property
     def scene(self) -> Scene | None:
-        """Of the data, where it is known."""
+        """Scene of the data, if known."""
         return self.recorded.scene
 
     @property
     def needs(self) -> Needs:
-        """Of the plant."""
+        """`Needs` of the plant."""
         return self.recorded.needs
 
     @property
     def precision(self) -> str:
-        """f32 or f64, of the model and its training."""
+        """f32 or f64, for the model and its training."""
         return self.description["precision"]
 
 

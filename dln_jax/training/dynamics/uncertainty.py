@@ -1,4 +1,4 @@
-"""What a training of dynamics does not know: estimated, stored with the run, held against the test, and drawn."""
+"""Uncertainty of a trained model of dynamics: estimated, stored with the run, tested and drawn."""
 
 from functools import partial
 from pathlib import Path
@@ -24,9 +24,9 @@ from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 
 def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -> None:
-    """Estimates it by the training and validation trajectories; of models that are fitted to torques alone.
+    """Estimates and stores the uncertainty of a model fitted to torques alone, from training and validation data.
 
-    `model` is the task's in float64.
+    `model` is the task's model in float64.
     """
     if not task.objective.of_torques:
         print(f"a {task.kind} is not fitted to torques alone: the run does not say what it does not know")
@@ -45,7 +45,7 @@ def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -
             negligible=1e-12 * tree,
         )
     except (InputError, np.linalg.LinAlgError) as error:
-        # The model is trained: what its data cannot tell is left out, not refused.
+        # The model is trained, so an estimate that its data cannot provide is left out instead of refused.
         print(f"the run does not say what it does not know: {error}")
         return
     facts = {"ridge": found.ridge, "degrees_of_freedom": found.degrees_of_freedom.tolist()}
@@ -56,8 +56,10 @@ def store_uncertainty(folder: Path, task: Task, model: Model, parameters: Any) -
 def uncertainty_metrics(
     folder: Path, run: Run, task: Task, programs: Programs, predicted: np.ndarray, *, figures: bool
 ) -> dict[str, float]:
-    """How often test torques are within the bands of 95 %, in all and at the joint where that is furthest from it, and
-    the share of test states that are outside the training data; draws `uncertainty.png`. None for a run without."""
+    """Coverage of the 95 % bands on test torques (mean, worst joint), and the share of test states out of distribution.
+
+    Draws `uncertainty.png`. Empty for a run without uncertainty.
+    """
     if run.uncertainty is None:
         return {}
     test = task.sets.test
@@ -73,9 +75,9 @@ def uncertainty_metrics(
 
 
 def bands(model: Model, parameters: Any, uncertainty: Uncertainty, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of the torques [N, d] at the samples, and whether each is outside the training data [N].
+    """Standard deviations of the torques [N, d], and whether the samples are out of distribution [N].
 
-    The estimate has compiled the program that linearises the torques, which `Run.torque_std` would compile again.
+    Reuses the program that the estimate compiled to linearise the torques; `Run.torque_std` would compile it again.
     """
     found, first = [], 0
     with jax.enable_x64(True):

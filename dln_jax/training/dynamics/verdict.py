@@ -1,4 +1,4 @@
-"""Whether a trained model of dynamics may be used: its torques in motions that it was not fitted to, and its search."""
+"""Judges a trained model of dynamics by its torques on held-out motions and by its search for joint frames."""
 
 from typing import NamedTuple
 
@@ -17,28 +17,28 @@ from dln_jax.training.dynamics.options import Options
 from dln_jax.training.dynamics.task import Task
 
 AT_NOISE, FAR_FROM_NOISE = 2.0, 4.0
-"""Held-out errors of a tree of unknown frames, in units of the noise's variance: up to the first its frames are right,
+"""Held-out errors of a tree with unknown frames, in units of the noise variance: up to the first its frames are right,
 above the second they may be wrong."""
 
 
 class Judged(NamedTuple):
-    """A verdict, and the numbers that it rests on."""
+    """A verdict and the numbers behind it."""
 
     verdict: Verdict | None
     """`None` for a model that is not fitted to torques alone."""
     metrics: dict[str, float | int]
     """Entries of metrics.json."""
     validation_nmse: float
-    """Mean over joints of the squared error over the torque's variance."""
+    """Mean over joints of the squared error, relative to the torque's variance."""
 
 
 def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) -> Judged:
-    """The graver verdict of the test and the validation motions, and of what a search for joint frames says of itself.
+    """The most severe verdict from test motions, validation motions and the search for joint frames.
 
     Args:
-        task: the data.
-        on_test: the model's torques in the test motions [N, d].
-        on_validation: those in the validation motions.
+        task: the task with its data.
+        on_test: the model's torques on the test motions [N, d].
+        on_validation: the model's torques on the validation motions.
     """
     if not task.objective.of_torques:
         return Judged(None, {}, float("nan"))
@@ -58,7 +58,7 @@ def judge_torques(task: Task, on_test: np.ndarray, on_validation: np.ndarray) ->
 
 
 def say(judged: Judged) -> None:
-    """Prints the verdict, and in words an error that is no better than that of a constant torque."""
+    """Prints the verdict, and a warning if the error is no better than that of a constant torque."""
     if judged.verdict is None:
         return
     if not judged.validation_nmse <= 1:
@@ -72,7 +72,7 @@ def say(judged: Judged) -> None:
 def refuse(judged: Judged, task: Task, given: Options) -> None:
     """Raises `FitRefused` for a model that must not be used.
 
-    There is one exception: a network whose training ended at the user's own --steps or --seconds may be trained on. The
+    A network whose training ended at the user's own --steps or --seconds is exempt, since training can continue. The
     command then says so and succeeds.
     """
     if judged.verdict is None or judged.verdict.level != "refused":
@@ -90,7 +90,7 @@ def _nmse(found: HeldOut) -> float:
 
 
 def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
-    """Torques [N, d] of the robot as its file describes it, friction included."""
+    """Torques [N, d] by the robot's file, friction included."""
     motion = dynamics(tree_system(robot.tree, joint_dissipation(robot.damping, robot.coulomb)))
     every = jax.jit(jax.vmap(motion.inverse_dynamics), compiler_options=quick_compilation())
     return np.asarray(every(data.q, data.qd, data.qdd))
@@ -99,12 +99,12 @@ def torques_of(robot: Robot, data: Trajectories) -> np.ndarray:
 def searched(
     losses: np.ndarray, agreeing: int, agreement: int, found: HeldOut
 ) -> tuple[Verdict | None, dict[str, float | int]]:
-    """What a search for joint frames says of itself: whether descents agree, and how far from the noise they end.
+    """Verdict and metrics of a search for joint frames: agreement of its descents, and their errors over the noise.
 
     Args:
-        losses: of all descents.
-        agreeing: descents that reached the lowest.
-        agreement: how many the search wanted to.
+        losses: losses of all descents.
+        agreeing: number of descents that reached the lowest loss.
+        agreement: number of agreeing descents that the search aims for.
         found: errors on held-out motions.
     """
     numbers: dict[str, float | int] = {"descents": len(losses), "descents_agreeing": agreeing}

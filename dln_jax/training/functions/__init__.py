@@ -1,1 +1,1 @@
-"""Training differential networks on functions."""
+"""Trains differential networks on functions."""

@@ -1,4 +1,4 @@
-"""Training a differential network, or an ensemble, into a run folder: the model, its errors, its speed and pictures."""
+"""Trains a differential network, or an ensemble, into a run folder: the model, its errors, its speed and figures."""
 
 import re
 from pathlib import Path
@@ -39,7 +39,7 @@ RELU = (
 
 
 def run(given: Options, command: str) -> None:
-    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ..."""
+    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ..."""
     task, mesh = prepare(given), mesh_of(given)
     with command_folder(given, command) as folder:
         announce(task)
@@ -63,7 +63,7 @@ def run(given: Options, command: str) -> None:
 
 
 def announce(task: Task) -> None:
-    """Says what is trained on what."""
+    """Prints the data, the network and the training method."""
     data, network = task.sets.train, task.network
     counts = f"{len(data.x)} training, {len(task.sets.validation.x)} validation, {len(task.test.x)} test samples"
     terms = ["value", *(["gradient"] if network.loss == "type1" else []), *(["Hessian"] * (network.derivative == 2))]
@@ -80,7 +80,7 @@ def announce(task: Task) -> None:
 
 
 def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[Network, Training, list[Trial]]:
-    """Trains at the width asked for, or at growing ones: the network chosen, its training, and all trials."""
+    """Trains at the requested width or at growing ones; returns the selected network, its training, and all trials."""
     standard = SampleSplit(*(to_units(part, task.units) for part in task.sets))
     optimiser, total = task.optimiser, task.optimiser.steps
     if isinstance(optimiser, GaussNewton) and optimiser.has_coarse_stage(len(standard.train.x)):
@@ -109,10 +109,10 @@ def fit(task: Task, folder: Path, *, resume: bool, mesh: Mesh | None) -> tuple[N
 def evaluate(
     folder: Path, task: Task, training: Training, trials: list[Trial], *, figures: bool
 ) -> dict[str, float | int]:
-    """Loads the stored model as a user would, measures it on the test samples, and draws what fits its inputs."""
+    """Loads the stored model as a user would, evaluates it on the test samples, and draws the applicable figures."""
     loaded, function = load(folder), activation(task.network.activation)
     tested = predictions(loaded.parameters, task.test.x, activation=function)
-    # Without a bound, what is shown is the test.
+    # Without a bound, the figures show the test samples.
     shown = tested if task.bound is None else predictions(loaded.parameters, task.shown.x, activation=function)
     metrics = errors(tested.mean, task.test)
     if task.bound is not None and shown.spread is not None:
@@ -129,7 +129,7 @@ def evaluate(
 
 
 def drawings(task: Task, shown: Prediction, training: Training, trials: list[Trial]) -> dict[str, Figure]:
-    """What fits the number of inputs, by name."""
+    """Figures by name, as applicable to the number of inputs."""
     drawn = {"training": training_figure(training, trials)} if training.history else {}
     if task.test.inputs == 1:
         drawn["curves"] = drawing.function_curves(task.shown, shown.mean)
@@ -144,7 +144,7 @@ def drawings(task: Task, shown: Prediction, training: Training, trials: list[Tri
 
 
 def training_figure(training: Training, trials: list[Trial]) -> Figure:
-    """The losses of every width that was tried, one after the other."""
+    """Figure of the losses of all widths tried, in sequence."""
     before, histories = 0, []
     for trial in trials:
         if trial.outcome is training:
@@ -165,11 +165,11 @@ UNITS = {
     "spread_outside": "y",
     "validation_loss": "units of the fit",
 }
-"""Of metrics, in those of the data."""
+"""Units of metrics, in those of the data."""
 
 
 def number(metric: str, value: int | float) -> str:
-    """As a user wants to see it."""
+    """Formats a metric for the table."""
     if isinstance(value, int):
         return f"{value:,}"
     return f"{value:.2e}" if re.search("_mse|_loss|spread", metric) else f"{value:,.1f}"

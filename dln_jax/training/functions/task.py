@@ -1,4 +1,4 @@
-"""From options to a differential network's task: the samples of a function, and how it is trained on them."""
+"""Builds a differential network's task from options: the samples of a function and the training method."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
@@ -20,12 +20,12 @@ NAMED = {
     "sin": (functions.sine, functions.sine_grid),
     "cos_sin": (functions.cosine_sine, functions.cosine_sine_grid),
 }
-"""Generator and test grid of each named function."""
+"""Generator and test grid of every named function."""
 OF_NAMED = {"samples": 25_600, "noise": 1e-3}
 OF_ADAM = ("epochs", "batch", "learning_rate", "weight_decay")
 OF_NEWTON = ("steps", "coarse_steps")
 SHARE_OF_DATA = 0.75
-"""Width of the training box over that of the shown one, for ensembles."""
+"""For ensembles: width of the training box relative to that of the box shown."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +73,20 @@ class Options(Resumable, Drawn, Scaled):
 
 
 class Task(NamedTuple):
-    """What the arguments come to."""
+    """A resolved task: samples, network and optimiser."""
 
     name: str
     sets: SampleSplit
     test: FunctionSamples
     shown: FunctionSamples
-    """What the figures show: the test, or a wider grid for an ensemble."""
+    """Samples shown in figures: the test, or a wider grid for an ensemble."""
     bound: float | None
-    """Half the width of the box of the training data, where the shown grid is wider."""
+    """Half the width of the training box if the grid shown is wider."""
     units: Units
     network: Network
     optimiser: Optimiser
     grown: bool
-    """Whether the width is chosen by validation."""
+    """Whether validation selects the width."""
 
 
 def prepare(given: Options) -> Task:
@@ -117,12 +117,12 @@ def prepare(given: Options) -> Task:
 
 
 def of_named(given: Options) -> dict[str, Any]:
-    """How the data of a named function are drawn; nothing for a file."""
+    """Settings for drawing the samples of a named function; empty for a file."""
     return resolved(given, OF_NAMED) if given.function in NAMED else {}
 
 
 def network_from(given: Options) -> Network:
-    """The network that the arguments name, with the defaults of the optimiser; the depth is up to the data."""
+    """The network that the arguments name, with the optimiser's defaults; the depth is set from the data later."""
     newton = given.optimizer == "gauss-newton"
     own = {"width": WIDTHS[0] if newton else 128, "precision": "f64" if newton else "f32", "depth": 1}
     defaults = {key: value for key, value in Network._field_defaults.items() if hasattr(given, key)}
@@ -130,7 +130,7 @@ def network_from(given: Options) -> Network:
 
 
 def optimiser_from(given: Options, samples: int, precision: str) -> Optimiser:
-    """The optimiser that the arguments name, for so many samples."""
+    """The optimiser that the arguments name, for this number of samples."""
     newton = given.optimizer == "gauss-newton"
     refuse_given(given, *((OF_ADAM, "for adam: add --optimizer adam") if newton else (OF_NEWTON, "for gauss-newton")))
     stated = {name: value for name in (*OF_ADAM, *OF_NEWTON) if (value := getattr(given, name)) is not None}

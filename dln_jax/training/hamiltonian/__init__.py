@@ -1,1 +1,1 @@
-"""A user's motions and the published Hamiltonian tasks: what is measured, which model suits it, and its training."""
+"""Hamiltonian training on a user's motions and the published tasks: measurements, model selection and fits."""

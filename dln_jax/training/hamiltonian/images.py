@@ -1,4 +1,4 @@
-"""Models of pictures: from options to a run folder."""
+"""Trains models of images, from options to a run folder."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ class Options(Resumable, Drawn):
 
 
 def run(given: Options, command: str) -> None:
-    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ..."""
+    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ..."""
     require_seed(given.seed)
     require_positive_if_given(given, ["steps", "trajectories"])
     kind, optimiser, data = given.model, pixel_task.optimiser_of(given.steps), pixel_task.pixel_data(given.trajectories)

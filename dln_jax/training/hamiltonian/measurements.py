@@ -1,7 +1,7 @@
-"""What a file of measured motions gives a Hamiltonian task: parts to fit and to predict, rates, and how noisy each is.
+"""Prepares measured motions for a Hamiltonian task: training and test parts, rates, and noise levels.
 
-Motions whose states carry noise are fitted through an integrator, weighted by that noise; where states and rates are
-free of it, a fit of the rates is all that they need.
+Motions with noisy states are fitted through an integrator, weighted by that noise. If states and rates are free of
+noise, a fit of the rates is sufficient.
 """
 
 from typing import NamedTuple
@@ -23,54 +23,53 @@ from dln_jax.types import InputError, Needs
 
 REAL, MEASURED = "real-pendulum", "measured"
 TEST_SHARE = 0.2
-"""Of a single measured trajectory: its last samples, as published."""
+"""Fraction of a single measured trajectory, at its end, used for the test, as published."""
 HORIZON_WINDOWS = 20
-"""Most windows that a measured motion is predicted for; a longer gap ends a recording."""
+"""Largest number of windows predicted for a measured motion; a longer gap ends a recording."""
 LEAST_NOISE = 1e-6
-"""Of the spread of a measurement: what has less noise is exact."""
+"""Measurements with noise below this fraction of their spread count as exact."""
 FREE_OF_NOISE = 1e-3
-"""Noise of states over their spread, below which the bias of a fit of rates, its square, does not matter."""
+"""Noise of the states over their spread below which the bias of a fit of rates, its square, is negligible."""
 LEAST_RATE_NOISE = 0.01
-"""Of the spread of measured rates: they are trusted no further, since no model has them exactly."""
+"""Lower limit of the noise of measured rates, relative to their spread, since no model has them exactly."""
 ANCHOR = 30.0
-"""How much less estimated momenta count than measured ones: their noise is amplified, but without any a model is free
+"""Noise assigned to estimated momenta, in units of their spread. They are noisy, but without any weight a model is free
 to choose its own momentum."""
 SURVEYED = 1_500
-"""Samples from which noise is estimated, about: its standard deviation is then known to 2 %."""
+"""Approximate number of samples used to estimate noise; this gives its standard deviation to 2 %."""
 WINDOW = {REAL: 30, MEASURED: 30}
-"""Samples of a window of measurements; shorter trajectories than two of them are taken whole."""
+"""Samples per window of measurements; trajectories shorter than two windows are used as one."""
 
 
 class Stated(NamedTuple):
-    """What is known of measurements beside their file."""
+    """Facts about measurements that the user states in addition to their file."""
 
     needs: Needs | None = None
-    """Of the plant (default: what the file states, else bodies whose forces balance, else revolute joints with a
-    potential and friction)."""
+    """`Needs` of the plant. Default: those in the file, else bodies whose forces balance, else revolute joints with a
+    potential and friction."""
     test: str | None = None
-    """Labels of the test trajectories, separated by commas, or another file of them."""
+    """Labels of the test trajectories, separated by commas, or an npz file with test trajectories."""
     noise: tuple[float, ...] | None = None
-    """Standard deviation of q, one for all or one each; or, where the file has p, of q and then p (default:
-    estimated)."""
+    """Standard deviation of q, one for all or one each; or, if the file has p, of q and then p (default: estimated)."""
     rate: float | None = None
-    """Hz, of a file without t."""
+    """Sampling rate for a file without t, Hz."""
     units: str | None = None
-    """Of a CSV file's titles without a unit."""
+    """Units of CSV titles without one."""
 
 
 class Trust(NamedTuple):
-    """How far states and rates of a phase space are to be trusted."""
+    """How far the states and rates of a phase space can be trusted."""
 
     weights: Weights
     free_of_noise: bool
-    """Whether rates were measured and states have so little noise that motions need not be fitted."""
+    """Whether rates are measured and states have so little noise that fitting the rates is sufficient."""
 
 
 NOTHING = Stated()
 
 
 def needs_of(data: Trajectories, file: str, stated: Needs | None) -> Needs:
-    """Of a plant that moves by itself; `InputError` for one that does not, or is of another size than stated."""
+    """`Needs` of a plant without applied forces; `InputError` if forces act or the number of joints differs."""
     d = data.degrees_of_freedom
     if "tau" not in data.estimated and np.any(data.tau):
         raise InputError(f"{file} has applied forces tau; a phase field knows none: train it with train_hnn --data")
@@ -81,7 +80,7 @@ def needs_of(data: Trajectories, file: str, stated: Needs | None) -> Needs:
 
 
 def assumed_needs(data: Trajectories) -> Needs:
-    """Bodies in a plane or in space where the measured forces on them balance; else revolute joints with friction."""
+    """Prismatic coordinates if the measured forces balance as between bodies, else revolute joints with friction."""
     d = data.degrees_of_freedom
     if find_bodies(forces_of(data)) is not None:
         return Needs(joints=("prismatic",) * d)
@@ -89,12 +88,12 @@ def assumed_needs(data: Trajectories) -> Needs:
 
 
 def forces_of(data: Trajectories) -> np.ndarray:
-    """pd where it is known, else accelerations: forces up to the masses."""
+    """pd if known, else accelerations: forces up to the masses."""
     return data.qdd if data.pd is None else data.pd
 
 
 def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[Trajectories, Trajectories]:
-    """What is fitted, and what is predicted; `InputError` where one of them is not there, or in the other."""
+    """Training and test trajectories; `InputError` if one is missing or too short, or the test copies training data."""
     present = np.unique(data.trajectory)
     if test is not None and test.endswith(".npz"):
         other = schema.load(test)
@@ -118,10 +117,10 @@ def parted(name: str, data: Trajectories, file: str, test: str | None) -> tuple[
 
 
 def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Trajectories, Noise]:
-    """With velocities and accelerations of local polynomials where they were not measured; and the noise.
+    """Adds velocities and accelerations from local polynomials if they were not measured, and estimates the noise.
 
     Raises:
-        InputError: noise of another number of coordinates, or stretches that are too short.
+        InputError: noise for another number of coordinates, or segments that are too short.
     """
     d = data.degrees_of_freedom
     if noise is not None and len(noise) not in (1, d):
@@ -135,7 +134,7 @@ def with_rates(data: Trajectories, noise: tuple[float, ...] | None) -> tuple[Tra
 
 
 def with_momenta(data: Trajectories) -> Trajectories:
-    """With p, by default qd, and pd, by default the rate of p; `estimated` names those that are no measurements."""
+    """Adds p, by default qd, and pd, by default the rate of p; `estimated` names those that are not measured."""
     if data.p is None:
         own = tuple(key for key, source in (("p", "qd"), ("pd", "qdd")) if source in data.estimated)
         return data._replace(p=data.qd, pd=data.qdd, estimated=(*data.estimated, *own))
@@ -146,10 +145,10 @@ def with_momenta(data: Trajectories) -> Trajectories:
 
 
 def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | None:
-    """Weights of data with momenta, in `pieces`, by stated or else estimated noise; `None` if all pieces are short.
+    """Weights of data with momenta from stated or estimated noise; `None` if all segments are too short.
 
     Raises:
-        InputError: noise of another number of coordinates.
+        InputError: noise for another number of coordinates, or noise stated for segments that are too short.
     """
     d, own = data.degrees_of_freedom, "p" not in data.estimated
     if noise is not None and len(noise) not in ((1, d, 2 * d) if own else (1, d)):
@@ -185,13 +184,13 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
 
 
 def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
-    """The noise, or the least that counts."""
+    """The noise, limited below by `LEAST_NOISE` times the spread."""
     size = spread("q and qd", values)
     return tuple(np.maximum(noise, LEAST_NOISE * np.where(size > 0, size, 1.0)).tolist())
 
 
 def to_predict(test: Trajectories) -> MeasuredWindows | None:
-    """Whole recordings, across their gaps, for at most so many windows; `None` where none is longer than a window."""
+    """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if no segment exceeds one."""
     parts = stretches(test.t, test.trajectory)
     if max(map(len, parts)) <= WINDOW[MEASURED]:
         return None
@@ -200,12 +199,12 @@ def to_predict(test: Trajectories) -> MeasuredWindows | None:
 
 
 def gap_count(test: Trajectories) -> int:
-    """Gaps within trajectories."""
+    """Number of gaps within trajectories."""
     return len(stretches(test.t, test.trajectory)) - len(np.unique(test.trajectory))
 
 
 def motion_of(test: Trajectories) -> Motions:
-    """One trajectory as the motion that is to be predicted, up to a gap that is longer than any prediction."""
+    """One trajectory as the motion to predict, up to a gap longer than any prediction."""
     longest = np.diff(grid_places(test.t)) > HORIZON_WINDOWS * WINDOW[MEASURED]
     length = int(np.argmax(longest)) + 1 if longest.any() else len(test.t)
     t = test.t[:length] - test.t[0]
@@ -213,13 +212,13 @@ def motion_of(test: Trajectories) -> Motions:
 
 
 def samples_of(data: Trajectories, chosen: slice | np.ndarray) -> Trajectories:
-    """Some of the samples."""
+    """Selects samples."""
     arrays = {key: getattr(data, key) for key in PER_SAMPLE}
     return data._replace(**{key: array[chosen] for key, array in arrays.items() if array is not None})
 
 
 def pieces(data: Trajectories, length: int) -> Trajectories:
-    """Stretches without a gap, cut to the length of two windows, as trajectories of their own: some to validate by."""
+    """Segments cut to the length of two windows, as trajectories of their own, so that some can be held out."""
     parts = [
         each[at : at + 2 * length]
         for each in stretches(data.t, data.trajectory)

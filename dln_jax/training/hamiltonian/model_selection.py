@@ -1,4 +1,4 @@
-"""Which model a Hamiltonian task gets, by name or chosen by validation, and the description that builds it."""
+"""Selects the model of a Hamiltonian task, by name or by validation, and describes it."""
 
 import math
 import time
@@ -26,27 +26,28 @@ from dln_jax.zoo.catalogue import CATALOGUE, entry_of
 from dln_jax.zoo.descriptions import build, describe_for
 
 MODELS = ("black-box-hnn", "phase-network")
-"""Of every task in the table, beside the one that suits the scene."""
+"""Models of every task in the table, in addition to the one that suits the scene."""
 PAIRWISE, HELMHOLTZ = "pairwise-hnn", "helmholtz-hnn"
 POLYNOMIAL = "polynomial-hamiltonian"
-"""Of tasks with one coordinate and without friction, beside."""
+"""Additional model for tasks with one coordinate and without friction."""
 DEGREES = range(2, 7)
 FRICTION_WIDTH = 4
-"""Hidden units of the friction, where a scene has it; the model that is one network has one coefficient."""
+"""Hidden units of the friction network if a scene has friction; the black-box model has one coefficient instead."""
 VALIDATION_SHARE = 0.15
-"""Of the trajectories for training."""
+"""Fraction of the training trajectories used for validation."""
 EXACT = 1e-8
-"""Of the mean square of measured rates: what leaves no more of them needs no other model, and no fit of motions."""
+"""Target error, relative to the mean square of the measured rates, below which neither another model nor a fit of
+motions is needed."""
 TRIED_DEGREES = (2, 4)
-"""Of a polynomial, where the model is to be chosen, too."""
+"""Degrees of the polynomial candidates in model selection."""
 TRIAL_STEPS = 20
-"""Iterations of Gauss-Newton by which candidates are compared."""
+"""Gauss-Newton iterations used to compare candidates."""
 MOST_POLYNOMIAL = 2
-"""Coordinates up to which a polynomial is tried: its terms grow with their power."""
+"""Largest number of coordinates for which a polynomial is a candidate: its number of terms grows with their power."""
 
 
 class Candidate(NamedTuple):
-    """A model that may suit measurements."""
+    """A candidate model for measurements."""
 
     name: str
     needs: Needs
@@ -54,22 +55,22 @@ class Candidate(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Its name, and what tells it from others of that name."""
+        """The name and the settings that distinguish it from candidates of the same name."""
         more = [f"{key} {value}" for key, value in self.keywords.items() if key != "friction_width"]
         return ", ".join([self.name, *more, *(["with friction"] if self.needs.friction else [])])
 
 
 def models_of(task: str) -> tuple[str, ...]:
-    """The models that the table gives a task to; the first is what suits the scene."""
+    """Models of a task in the table; the first is the one that suits the scene."""
     every = (RECIPES[task].suits, *MODELS)
     return (*every, POLYNOMIAL) if task in ("spring", "pendulum") else every
 
 
 def description_of(problem: Problem, model: str, *, precision: str = "f64", **keywords: Any) -> dict[str, Any]:
-    """The description of a model for a task, "auto" for what suits the scene.
+    """Description of a model for a task; "auto" selects the one that suits the scene.
 
-    `keywords` (width, depth, activation, degree, coordinates, order) replace the recipe's. What suits measurements is
-    chosen by `choose_model`.
+    `keywords` (width, depth, activation, degree, coordinates, order) override the recipe. For measurements "auto" calls
+    `choose_model`.
     """
     recipe = RECIPES[problem.name]
     if model == "auto" and problem.name == MEASURED:
@@ -100,15 +101,15 @@ def description_of(problem: Problem, model: str, *, precision: str = "f64", **ke
 
 
 def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
-    """How a pairwise model is to read the coordinates: what is stated, or what balances the measured forces.
+    """How a pairwise model reads the coordinates: as stated, or as balances the measured forces.
 
     Raises:
-        InputError: measurements that decide neither, and nothing was stated.
+        InputError: the order is neither stated nor determined by the measurements.
     """
     if problem.name != MEASURED:
         return {} if order is None else {"order": order}
     if set(problem.needs.joints) != {"prismatic"} or not arrangements(problem.needs.degrees_of_freedom):
-        return {}  # for the model itself to refuse
+        return {}  # the model itself refuses them
     found = find_bodies(forces_of(problem.fitted), order=order)
     if found is None:
         raise InputError(
@@ -119,7 +120,7 @@ def stated_bodies(problem: Problem, order: Order | None) -> dict[str, Any]:
 
 
 def polynomial_degree(problem: Problem) -> int:
-    """The degree that the validation trajectories call enough."""
+    """The smallest sufficient degree by validation trajectories."""
     fitted, validation = hold_out(problem.fitted, VALIDATION_SHARE, 0)
 
     def fit(degree: int):
@@ -137,13 +138,13 @@ def choose_model(
     report: Callable[[str], None] | None = None,
     **keywords: Any,
 ) -> dict[str, Any]:
-    """The smallest model of measurements whose errors of validation rates no other's betters significantly.
+    """The smallest model of measurements whose validation error no other candidate improves significantly.
 
     Args:
         problem: measured motions.
-        networks: whether only networks are to be chosen from.
-        seconds: after which no other model is tried.
-        report: called with one line for each model that was tried, or why none was.
+        networks: whether only networks are candidates.
+        seconds: time after which no other candidate is tried.
+        report: called with one line per candidate tried, or the reason for trying none.
         keywords: as for `description_of`.
     """
     began = time.perf_counter()
@@ -183,15 +184,16 @@ def choose_model(
 
 
 def rates_are_biased(problem: Problem) -> bool:
-    """Whether measured rates stand beside states whose noise a fit of rates would take for the field."""
+    """Whether rates were measured with states so noisy that a fit of the rates is biased."""
     return problem.noise is None and problem.trust is not None and not problem.trust.free_of_noise
 
 
 def candidates(problem: Problem, networks: bool) -> list[Candidate]:
-    """The models that may suit measurements, in order of size.
+    """Candidate models for measurements, in order of size.
 
-    Bodies whose forces balance are pairs. Models of accelerations are compared for data without momenta, and models of
-    rates for those with: but not where noise of the states biases all of them, the more flexible ones the least.
+    Bodies with balanced forces get pairwise models. Models of accelerations are compared for data without momenta,
+    models of rates for data with momenta. Noisy states rule out the comparison: they bias all fits, the more flexible
+    models the least.
     """
     needs, d = problem.needs, problem.needs.degrees_of_freedom
     free = needs._replace(friction=False)
@@ -202,7 +204,7 @@ def candidates(problem: Problem, networks: bool) -> list[Candidate]:
         names = ["structured-hnn"] if networks else [*chain, "trigonometric", "structured-hnn"]
         return [Candidate(name, needs) for name in names]
     if rates_are_biased(problem):
-        # Friction that is only assumed is one coefficient for each coordinate.
+        # Assumed friction has one coefficient per coordinate.
         friction = {"friction_width": 0} if problem.assumed else {}
         return [Candidate("separable-hnn" if d == 1 else "structured-hnn", needs, friction)]
     found = [Candidate(name, needs) for name in ("separable-hnn", "structured-hnn")]
@@ -214,7 +216,7 @@ def candidates(problem: Problem, networks: bool) -> list[Candidate]:
 def validation_errors(
     problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories]
 ) -> np.ndarray:
-    """Squared errors of validation rates after a short fit: of samples, or of stretches of time for estimated rates."""
+    """Squared errors of validation rates after a short fit: per sample, or per segment of time for estimated rates."""
     if description["name"] == POLYNOMIAL:
         return match_linear(build(description), parts[0], validation=parts[1])[1]
     task = first_problem(problem, description, parts, 0)
@@ -232,7 +234,7 @@ def validation_errors(
 
 
 def mean_square_rates(problem: Problem, description: dict[str, Any], data: Trajectories) -> float:
-    """What the errors of a fit of rates are to be compared with: those of a model that stands still."""
+    """Mean square of the rates, the reference for errors of a fit of rates."""
     if in_velocities(problem, description):
         return float(data.degrees_of_freedom)  # `accelerations` divides by the spread
     return float(np.mean(np.concatenate([data.qd, column(data, "pd")]) ** 2))

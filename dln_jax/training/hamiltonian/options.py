@@ -1,4 +1,4 @@
-"""Options of Hamiltonian trainings in a phase space, and the task, model and optimiser that they name."""
+"""Options of Hamiltonian trainings in a phase space, and the task, model and optimiser that follow from them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +25,9 @@ from dln_jax.types import InputError, require_seed
 from dln_jax.zoo.descriptions import build
 
 FILTERED_HERE = ("raw-differences",)
-"""Checks that say nothing here: estimated rates come from local polynomials, and motions are fitted to the states."""
+"""Checks that do not apply here: estimated rates come from local polynomials, and motions are fitted to the states."""
 CHOICE_SHARE = 0.2
-"""Share of a limit of time after which the choice of a model tries no further candidate."""
+"""Fraction of the time limit after which model selection starts no further candidate."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Options(Checked, Limited, Resumable, Drawn, SingleCalls, Scaled):
 
 
 def prepare(given: Options, until: float) -> tuple[Problem, dict[str, Any], dict[str, Any], list[str]]:
-    """The problem, the model's description, the keywords of `train`, and findings in the log.
+    """Resolves the options into the problem, the model's description, the keywords of `train`, and findings on the log.
 
     Everything is checked before anything is written, and the log before models are compared on it.
 
@@ -133,7 +133,7 @@ def prepare(given: Options, until: float) -> tuple[Problem, dict[str, Any], dict
 
 
 def check_suited(given: Options, problem: Problem, description: dict[str, Any]) -> None:
-    """Refuses what this task or its model does not take."""
+    """Refuses options that do not apply to the task or its model."""
     build(description)
     if problem.name != MEASURED:
         refuse_given(given, ["needs"], f"what the task '{problem.name}' decides itself")

@@ -1,7 +1,8 @@
-"""The pixel pendulum: data, models, training, errors, and what its pictures need, for the scripts that report them.
+"""The pixel pendulum: data, models, training, errors and images, for the scripts that report on it.
 
-Models: black-box-hnn (an energy in the latent plane) and phase-network (a network gives the rates there), with the same
-autoencoder, loss and budget. The data are those of seed 0; a seed is that of the parameters and of the samples' order.
+Models: black-box-hnn (an energy in the latent plane) and phase-network (a network for the rates there), with the same
+autoencoder, loss and budget. The data are those of seed 0; a seed determines the parameters and the order of the
+samples.
 """
 
 from functools import cache, partial
@@ -39,47 +40,47 @@ from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, FRAMES, TRAJECTO
 from dln_jax.zoo.descriptions import Description, build, describe
 
 MODELS: tuple[Field, ...] = ("black-box-hnn", "phase-network")
-"""In the latent plane."""
+"""Models in the latent plane."""
 MATCHING = Matching(weights=Weights(field=10.0))
-"""The same for both models. Weight, components and length of training were chosen with seed 0 by validation films; one
-step at a time, the published form, in place of windows of ten steps, with which both models were alike (1e-6 J² over a
-hundred frames, their decoder's error), with numbers of test films in view."""
+"""The same for both models. Weight, components and training length were chosen with seed 0 by validation films.
+Matching one step at a time, as published, was chosen over windows of ten steps, for which both models were alike (1e-6
+J² over a hundred frames, their decoder's error), with test films in view."""
 STEPS = 12_000
 COMPONENTS = 32
-"""Principal components of a frame, which keep all but 3e-7 of the variance; training on them takes half the time."""
+"""Principal components of a frame. They keep all but 3e-7 of the variance, and training on them takes half the time."""
 
 
 class SeenFrames(NamedTuple):
-    """What pictures show of a model."""
+    """A trained model of images and what figures show of it."""
 
     model: LatentModel
     parameters: Parameters
     motions: FrameMotions
-    """From the test starts."""
+    """Motions from the test starts."""
     components: Components
     history: list[Progress]
 
 
 def picture_description(field: Field, components: Components) -> Description:
-    """Of a model of pictures by their components."""
+    """Description of a model of images by their components."""
     count, pixels = components.basis.shape
     return describe("latent-phase", field=field, pixels=pixels, components=count, precision="f32")
 
 
 def picture_models(description: Description, components: Components) -> tuple[LatentModel, LatentModel]:
-    """One model with one set of parameters, from two sides: of the components' coefficients, and of pictures."""
+    """The model of the components' coefficients, and the same model, with the same parameters, of images."""
     inner = build(description).of_coefficients(components.scale)
     return inner, through_components(inner, components)
 
 
 @cache
 def pixel_data(trajectories: int | None = None, frames: int | None = None) -> FrameSplit:
-    """The data set of seed 0 in its three parts."""
+    """The dataset of seed 0, split into three parts."""
     return split(swinging_rod(0, trajectories=trajectories or TRAJECTORIES, frames=frames or FRAMES))
 
 
 def optimiser_of(steps: int | None = None) -> Adam:
-    """The same for both models, by default for `STEPS`."""
+    """Adam with the settings of both models, by default for `STEPS`."""
     steps = steps or STEPS
     return Adam(steps=steps, batch=50, learning_rate=2e-3, patience=steps, steps_per_dispatch=100)
 
@@ -93,7 +94,7 @@ def measure_pixels(
     checkpoint: Checkpoint | None = None,
     report: Report = silent,
 ) -> tuple[dict[str, float], SeenFrames]:
-    """A model's errors on the test trajectories and its times, and what pictures need of it."""
+    """Trains a model; returns its test errors and times, and what figures need."""
     components = principal_components(data.train.frames, COMPONENTS)
     inner, model = picture_models(picture_description(kind, components), components)
     fitted, held_out, tested = (compress(components, part.frames) for part in data)
@@ -113,14 +114,17 @@ def measure_pixels(
 
 
 def draw_pixels(seen: dict[str, SeenFrames], data: FrameSplit, folder: Path, *, shown: int = 0) -> list[Path]:
-    """Writes `pixels.gif`, the truth and each model's frames, and of an energy `pixels-injection.png`; gives paths."""
+    """Writes `pixels.gif` (truth and every model's frames) and, for an energy, `pixels-injection.png`.
+
+    Returns the paths of the files.
+    """
     times = data.test.frames.shape[1] - 1
     frames = {TRUTH: data.test.frames[shown, :times]}
     frames |= {name: each.motions.frames[shown] for name, each in seen.items()}
     written = [folder / "pixels.gif"]
     write_frame_gif(written[0], frames, FRAME_TIME * np.arange(times))
     if hnn := seen.get("black-box-hnn"):
-        # From the start with the least energy, so that three times as much is still what the decoder has seen.
+        # Start from a motion with little energy, so that three times as much is within the decoder's training data.
         ranges = np.abs(data.test.q).max(axis=1)
         quiet = int(np.argsort(ranges)[len(ranges) // 4])
         injected = inject_energy(hnn.model, hnn.parameters, data.test.pairs[quiet, 0], factor=3.0)

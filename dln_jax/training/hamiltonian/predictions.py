@@ -1,4 +1,4 @@
-"""What a trained Hamiltonian model predicts of a problem's motions: errors, times and the figure."""
+"""Predictions of a trained Hamiltonian model for the motions of a problem: errors, times and the figure."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -20,19 +20,19 @@ from dln_jax.training.hamiltonian.training import Trained
 from dln_jax.zoo.descriptions import build
 
 SUBSTEPS = 4
-"""Of RK4 between two samples of a measured motion."""
+"""RK4 substeps between two samples of a measured motion."""
 
 
 class Seen(NamedTuple):
-    """What a figure shows of a model."""
+    """Content of a figure for one model."""
 
     motions: Motions
-    """The first entry of the problem's, as predicted."""
+    """Prediction of the problem's first entry."""
     rates: Field
 
 
 def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float], Seen, list[Motions]]:
-    """Errors and times of one run, what a figure shows of it, and the motions that it predicts."""
+    """Errors and times of one run, what a figure shows of it, and the predicted motions."""
     model, parameters = build(trained.description), trained.result.parameters
     predicted, rates = predicted_motions(problem, trained), partial(field_rates, model, parameters)
     if in_velocities(problem, trained.description):
@@ -51,7 +51,7 @@ def measured_once(problem: Problem, trained: Trained) -> tuple[dict[str, float],
 
 
 def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
-    """The problem's motions from their first states, whose momenta are velocities where a model has its own."""
+    """Predicts the problem's motions from their first states; p is the velocity for models with their own momenta."""
     model, parameters = build(trained.description), trained.result.parameters
     if in_velocities(problem, trained.description):
         given = padded([on_grid(true.t, true.q[0], true.p[0]) for true in problem.truth])
@@ -60,7 +60,7 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
         kept = [np.flatnonzero(weight) for weight in given.weight]
         pairs = zip(problem.truth, moved.q, moved.qd, kept, strict=True)
         return [Motions(true.t, q[None, rows], qd[None, rows]) for true, q, qd, rows in pairs]
-    # Times of one length, so that one program predicts all.
+    # All times are padded to one length, so that one program predicts all motions.
     longest = max(len(true.t) for true in problem.truth)
     times = [np.pad(true.t, (0, longest - len(true.t)), mode="edge") for true in problem.truth]
     return [
@@ -70,12 +70,12 @@ def predicted_motions(problem: Problem, trained: Trained) -> list[Motions]:
 
 
 def first_samples(motions: Motions, count: int) -> Motions:
-    """The first samples of each motion."""
+    """The first `count` samples of every motion."""
     return Motions(motions.t[:count], motions.q[:, :count], motions.p[:, :count])
 
 
 def predicted_times(problem: Problem, trained: Trained) -> dict[str, float]:
-    """For how long measured motions are predicted right, whose starts are fitted to one window."""
+    """Valid prediction times on measured motions, with starts fitted to one window."""
     assert problem.tests is not None
     model, fitted = build(trained.description), WINDOW[MEASURED]
     known = {"fitted": fitted, "substeps": SUBSTEPS, "momenta": not in_velocities(problem, trained.description)}
@@ -94,7 +94,7 @@ def velocity_field(
 
 
 def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:
-    """The figure of a task: the first motion as each model has it, and its energy, or that of the first coordinate."""
+    """The figure of a task: the first motion by every model, and its energy or, if unknown, the first coordinate."""
     motions = {TRUTH: problem.truth[0], **{name: each.motions for name, each in seen.items()}}
     fields = {name: each.rates for name, each in seen.items()}
     H = problem.energy
@@ -104,6 +104,6 @@ def figure_of(problem: Problem, seen: Mapping[str, Seen]) -> Figure:
 
 
 def units_of(problem: Problem) -> tuple[str, str, str]:
-    """Of the first coordinate, of its momentum, and of what the task's figure shows over time."""
+    """Units of the first coordinate, of its momentum, and of the quantity that the task's figure shows over time."""
     of_q, of_p = {"revolute": ("rad", "kg m²/s"), "prismatic": ("m", "kg m/s")}[problem.needs.joints[0]]
     return (of_q, of_p, "J") if problem.energy is not None else (of_q, f"{of_q}/s", of_q)

@@ -1,4 +1,4 @@
-"""The sizes and steps of each Hamiltonian task's models."""
+"""Network sizes and training lengths of the models for every Hamiltonian task."""
 
 from typing import NamedTuple
 
@@ -7,31 +7,31 @@ from dln_jax.training.hamiltonian.tasks import MEASURED, REAL, WINDOW
 
 
 class Recipe(NamedTuple):
-    """The networks of a task, and how long they train; chosen by trial on seed 0, and the same for all seeds."""
+    """Networks of a task and their training; chosen by trial on seed 0, and the same for all seeds."""
 
     suits: str
     """The model that suits the scene."""
     width: int
-    """Hidden units per layer of that."""
+    """Hidden units per layer of that model."""
     depth: int
     network: int
-    """Hidden units per layer of the models that know less: a Hamiltonian that is one network, and the baseline."""
+    """Hidden units per layer of less structured models: a Hamiltonian that is one network, and the baseline."""
     network_depth: int
     steps: int
     """Iterations of Gauss-Newton on rates."""
     samples: int
     seconds: float
-    """At most, of both fits together, compilation included: the limit that `hnn_table` states, and nothing else has."""
+    """Time limit for both fits together, compilation included; only `hnn_table` applies it."""
     trajectory_steps: int = 0
-    """Iterations of Gauss-Newton on trajectories, afterwards."""
+    """Iterations of Gauss-Newton on trajectories after the fit of rates."""
     window: int = 0
-    """Samples of a window."""
+    """Samples per window."""
     weights: Weights | None = None
-    """Of the trajectories; `None` for the deviations of the data."""
+    """Weights of the trajectories; `None` for the standard deviations of the data."""
     substeps: int = 4
 
 
-# The noise of spring and pendulum has sd 0.1; their rates have none, and are trusted to 0.01.
+# The noise of spring and pendulum has sd 0.1; their rates are noiseless and get a weight of 0.01.
 _NOISY = Weights(state=0.1, rate=0.01)
 _SPRING = Recipe("separable-hnn", 8, 1, 16, 1, 40, 10_000, 60.0, 40, 30, _NOISY, 1)
 _PENDULUM = _SPRING._replace(trajectory_steps=50, window=15)

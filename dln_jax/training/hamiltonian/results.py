@@ -1,4 +1,4 @@
-"""Numbers and figures of a Hamiltonian training: what metrics.json holds, in words, and what is drawn."""
+"""Metrics and figures of a Hamiltonian training, with labels for metrics.json."""
 
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,13 @@ LOSSES = {
     RATES: "rates: mean square error of (qd, pd)",
     MOTIONS: "motions: mean square error of (q, p) over its weight",
 }
-"""The loss of each stage, in words."""
+"""Label of the loss of every stage."""
 
 
 def evaluate(
     folder: Path, problem: Problem, trained: Trained, *, low_latency: bool
 ) -> tuple[dict[str, float | int], Seen, Verdict]:
-    """Entries of metrics.json, what figures show, and the verdict of the predicted test motions."""
+    """Entries of metrics.json, what figures show, and the verdict on the predicted test motions."""
     truth = problem.truth[0]
     metrics, seen, predicted = measured_once(problem, trained)
     verdict = judge_motions(predicted, problem.truth, **units_of_judgement(problem))
@@ -48,7 +48,7 @@ def evaluate(
 
 
 def units_of_judgement(problem: Problem) -> dict[str, Any]:
-    """Spread of q and p, which of them are bounded, and their noise where it is known."""
+    """Spread of q and p, which of them are bounded, and their noise if known."""
     data, d = problem.fitted, problem.needs.degrees_of_freedom
     size = np.concatenate([spread("q", data.q), spread("p", column(data, "p"))])
     angles = [joint == "revolute" for joint in problem.needs.joints]
@@ -57,7 +57,7 @@ def units_of_judgement(problem: Problem) -> dict[str, Any]:
 
 
 def draw(folder: Path, problem: Problem, name: str, seen: Seen, trained: Trained) -> None:
-    """Writes what there is to draw."""
+    """Writes the applicable figures."""
     write_figure(folder / "motions.png", figure_of(problem, {name: seen}))
     truth = problem.truth[0]
     stride = max(1, len(truth.t) // GIF_FRAMES)
@@ -84,16 +84,16 @@ MEANINGS = {
     "energy_drift": ("energy error along predicted motions, over the largest kinetic energy", "1"),
     "validation_error": ("validation loss of the last stage", "see training.png"),
 }
-"""What a metric's name begins with, in words, and its unit; for an energy error 0 is that of the true plant."""
+"""Labels and units by the prefix of a metric's name; an energy error of 0 is that of the true plant."""
 ENDINGS = {
     **{"_standard_error": ": its standard error over starts", "_median": ": its median over starts"},
     **{"_seconds": "", "_median_seconds": ": its median", "_lyapunov": ", in Lyapunov times of the model"},
 }
-"""The rest of such a name, in words."""
+"""Labels of the suffixes of such names."""
 
 
 def line(metric: str, value: float) -> tuple[str, str, str]:
-    """A metric in words, its value and its unit."""
+    """A metric as label, value and unit."""
     quantity = next((key for key in MEANINGS if metric.startswith(key)), "")
     meaning, unit = MEANINGS.get(quantity, (metric, unit_of(metric, {})))
     rest = metric.removeprefix(quantity or metric)

@@ -1,4 +1,4 @@
-"""Training a Hamiltonian model of a phase space into a run folder: the model, its errors, speed and pictures."""
+"""Trains a Hamiltonian model of a phase space into a run folder: the model, its errors, speed and figures."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -29,10 +29,11 @@ from dln_jax.zoo.run import save
 
 
 def run(given: Options, command: str) -> None:
-    """Trains what the options name, evaluates it, and writes the run folder, by default runs/`command`-1, -2, ...
+    """Trains, evaluates and writes a run folder, by default runs/`command`-1, -2, ...
 
     Raises:
-        InputError: no error is finite, or the loss stopped being so; what was good before that is kept.
+        InputError: the validation error is not finite, or the loss became non-finite; the last good parameters are
+            kept.
         FitRefused: test motions are predicted badly, and neither --steps nor --seconds cut the training short; the run
             folder is complete.
     """
@@ -56,7 +57,7 @@ def run(given: Options, command: str) -> None:
         write_config(folder, given, **description, verdict=verdict._asdict())
         if given.figures:
             draw(folder, problem, description["name"], seen, trained)
-        numbers = [line(name, value) for name, value in metrics.items() if name != "verdict"]  # which has its own line
+        numbers = [line(name, value) for name, value in metrics.items() if name != "verdict"]  # it has its own line
         print_numbers(numbers, title=f"test motions of {problem.name}, f64")
         print(f"run folder: {folder}")
         print(verdict.line)
@@ -71,14 +72,14 @@ def run(given: Options, command: str) -> None:
 
 
 def save_first(folder: Path, description: dict[str, Any], trained: Trained) -> None:
-    """Saves the model of the fit of rates, which whatever ends the fit of motions then leaves."""
+    """Saves the model of the fit of rates, which survives any failure of the fit of motions."""
     save(folder, description, trained.result.parameters)
     print(f"{folder} holds the model of the fit of rates; the fit of motions begins")
 
 
 @contextmanager
 def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None]]:
-    """Yields `report(at)`: the stages, one after the other, each with a count of its own."""
+    """Yields `report(at)`, which shows the stages in sequence, each with its own count."""
     with ExitStack() as shown:
         current = next(iter(stages), "")
         show = shown.enter_context(progress(stages[current])) if stages else None
@@ -94,7 +95,7 @@ def stage_progress(stages: dict[str, int]) -> Iterator[Callable[[Progress], None
 
 
 def announce(problem: Problem, description: dict[str, Any], said: list[str]) -> None:
-    """Says what is trained on what, and what was assumed."""
+    """Prints the data used for training and the assumptions made."""
     data = problem.fitted
     trajectories = len(np.unique(data.trajectory))
     needs = needs_from_json(description["needs"])
@@ -117,7 +118,7 @@ def announce(problem: Problem, description: dict[str, Any], said: list[str]) -> 
 
 
 def assumptions(problem: Problem, description: dict[str, Any]) -> list[str]:
-    """What was read off measurements rather than stated."""
+    """Assumptions inferred from measurements rather than stated."""
     found = []
     if problem.assumed:
         found.append("nothing states the needs: joints, potential and friction above are assumed; --needs states them")

@@ -1,4 +1,4 @@
-"""The two fits of a training: of rates, then of motions; in coordinates and momenta, or in velocities."""
+"""The two stages of a training, on rates and then on motions, in coordinates and momenta or in velocities."""
 
 from typing import Any
 
@@ -19,19 +19,19 @@ from dln_jax.zoo.descriptions import build
 LINEAR = {"trigonometric": ("degree",), "planar-chain": ("coordinates",)}
 """Models of measured motions whose parameters enter linearly, and their keywords."""
 IN_VELOCITIES = ("structured-hnn", "structured-delan", *LINEAR)
-"""Models of measured motions that are fitted in coordinates and velocities, whose momenta are their own."""
+"""Models of measured motions that are fitted in coordinates and velocities and define their own momenta."""
 MOST_SUBSTEPS = 8
 INTEGRATION_SHARE = 0.1
-"""Of the noise: what integrating over a window may be off."""
+"""Largest integration error over a window, relative to the noise."""
 
 
 def in_velocities(problem: Problem, description: dict[str, Any]) -> bool:
-    """Whether a model is fitted in coordinates and velocities, rather than momenta."""
+    """Whether a model is fitted in coordinates and velocities instead of momenta."""
     return problem.noise is not None and description["name"] in IN_VELOCITIES
 
 
 def gauge_of(problem: Problem) -> Gauge:
-    """Unit inertia where revolute joints are at zero, and prismatic ones at their mean."""
+    """The gauge: unit inertia with revolute joints at zero and prismatic joints at their mean."""
     means = zip(problem.needs.joints, problem.fitted.q.mean(axis=0), strict=True)
     return Gauge(tuple(0.0 if joint == "revolute" else float(mean) for joint, mean in means))
 
@@ -50,7 +50,7 @@ def first_problem(
 def second_problem(
     problem: Problem, description: dict[str, Any], parts: tuple[Trajectories, Trajectories], start: Any, seed: int
 ) -> engine.Problem:
-    """The fit of motions, from parameters of the first fit."""
+    """The fit of motions, starting from parameters of the first fit."""
     recipe, model = RECIPES[problem.name], build(description)
     if problem.noise is not None and in_velocities(problem, description):
         known = {"noise": problem.noise, "gauge": gauge_of(problem), "substeps": recipe.substeps, "seed": seed}
@@ -63,16 +63,16 @@ def second_problem(
 
 
 def weights_of(problem: Problem, data: Trajectories) -> Weights:
-    """What residuals of motions are divided by: the recipe's, or the noise of the measurements."""
+    """Weights that divide the residuals of motions: the recipe's, or the noise of the measurements."""
     if problem.trust is not None:
         return problem.trust.weights
     return RECIPES[problem.name].weights or deviations(data)
 
 
 def substeps_of(windows: Windows, weights: Weights) -> int:
-    """Steps of RK4 between samples whose error over a window is small beside the noise, or else `MOST_SUBSTEPS`.
+    """RK4 steps between samples that keep the error over a window well below the noise, at most `MOST_SUBSTEPS`.
 
-    The error of a step h of an oscillation of angular frequency w is (w h)⁵ / 120 of its amplitude.
+    For an oscillation of angular frequency w, a step h has an error of (w h)⁵ / 120 times the amplitude.
     """
     size = windows.state.reshape(-1, windows.state.shape[2]).std(axis=0)
     change = np.diff(windows.state, axis=1)[windows.weight[:, 1:] > 0]
@@ -84,7 +84,7 @@ def substeps_of(windows: Windows, weights: Weights) -> int:
 
 
 def deviations(data: Trajectories) -> Weights:
-    """Weights by the spread of the data; velocities that are finite differences of q only anchor the scale of p."""
+    """Weights by the spread of the data; velocities from finite differences of q only anchor the scale of p."""
     p = column(data, "p")
     of_q, of_p = (np.where(size > 0, size, 1.0) for size in (spread("q", data.q), spread("p", p)))
     if "qd" in data.estimated and np.array_equal(p, data.qd):

@@ -1,10 +1,9 @@
-"""What a Hamiltonian task is, from its name: the data to fit, and the motions that a model has to predict.
+"""Builds a Hamiltonian task from its name: the data to fit, and the motions to predict.
 
-Generated tasks are those of `datasets.hamiltonian_tasks`. Where measurements have no momenta, models that have
-momenta p = dL/dqd of their own are fitted in coordinates and velocities, for others p is taken as qd, the momentum per
-unit of inertia. A single trajectory is predicted over its last fifth, of several every sixth, unless the
-test is stated; what is left is cut into stretches without a gap. Velocities that were not measured are those of local
-polynomials.
+Generated tasks are those of `datasets.hamiltonian_tasks`. For measurements without momenta, models with their own
+momenta p = dL/dqd are fitted in coordinates and velocities; for other models p is taken as qd, the momentum per unit of
+inertia. Unless the test is stated, it is the last fifth of a single trajectory, or every sixth of several. The training
+data are cut into segments without a gap. Velocities that were not measured come from local polynomials.
 """
 
 from pathlib import Path
@@ -43,57 +42,57 @@ from dln_jax.types import Hamiltonian, InputError, Needs
 PIXELS = "pixels"
 TASKS = (*PROTOCOLS, REAL, MEASURED)
 STARTS = 50
-"""Test motions that are predicted, at most."""
+"""Largest number of test motions predicted."""
 POINTS = 251
-"""Times at which they are compared."""
+"""Number of times at which they are compared."""
 HORIZONS = {
     **{"spring": 20.0, "pendulum": 20.0, "damped-spring": 20.0, "damped-pendulum": 20.0},
     **{"henon-heiles": 30.0, "double-pendulum": 5.0, "two-body": 25.0, "three-body": 3.0},
 }
-"""Time in s for which motions are predicted, as published for the bodies."""
+"""Prediction horizon in s, as published for the bodies."""
 
 
 class Problem(NamedTuple):
-    """A task's data, and the motions that a model has to predict from their first states."""
+    """The data of a task, and the motions that a model has to predict from their first states."""
 
     name: str
     needs: Needs
     fitted: Trajectories
-    """For training and validation: q, p, qd, pd."""
+    """Training and validation data with q, p, qd, pd."""
     train: Part | None
-    """With the exact field; `None` for measurements."""
+    """Training data with the exact field; `None` for measurements."""
     test: Part | None
     truth: tuple[Motions, ...]
-    """Motions with times of their own; those of one entry share theirs."""
+    """Motions to predict; the motions of an entry share their times."""
     energy: Hamiltonian | None
-    """The true one; `None` where nobody knows it."""
+    """The true energy; `None` if unknown."""
     published_energy: Hamiltonian | None
-    """Whose error was published as that of the energy."""
+    """The quantity published as the energy."""
     noise: Noise | None = None
-    """Of measurements without momenta; `None` for all else."""
+    """Noise of measurements without momenta; `None` otherwise."""
     tests: MeasuredWindows | None = None
-    """Recordings to predict, across their gaps, whose starts are fitted to their first `WINDOW` samples."""
+    """Recordings to predict, across their gaps, with starts fitted to their first `WINDOW` samples."""
     trust: Trust | None = None
-    """Of measurements, in coordinates and momenta."""
+    """Trust in measurements, in coordinates and momenta."""
     assumed: bool = False
-    """Whether nothing states the needs, so that what suits the data decides between them."""
+    """Whether the needs are not stated, so that the data decide between candidates."""
     gaps: int = 0
-    """In the test recordings."""
+    """Number of gaps in the test recordings."""
 
 
 def problem_of(
     name: str, *, trajectories: int | None = None, data: Path | None = None, stated: Stated = NOTHING
 ) -> Problem:
-    """The task of a name; generated data are those of seed 0.
+    """The task with this name; generated data are those of seed 0.
 
     Args:
         name: from `TASKS`.
-        trajectories: of generated data, in place of the task's own number.
-        data: file in the npz schema; only measurements take one, and they need it.
-        stated: of measured motions, beside.
+        trajectories: number of generated trajectories, in place of the task's own.
+        data: npz or CSV file; required for measurements, refused otherwise.
+        stated: further facts about measured motions.
 
     Raises:
-        InputError: an unknown name, too few trajectories, or a file that is missing or does not suit.
+        InputError: an unknown name, too few trajectories, or a file that is missing or unsuitable.
     """
     if name not in TASKS:
         raise InputError(f"task '{name}' is unknown; choose from {', '.join(TASKS)}")
@@ -112,7 +111,7 @@ def problem_of(
 
 
 def generated(name: str, trajectories: int | None) -> Problem:
-    """A task whose field is known."""
+    """A generated task, with a known field."""
     task = PROTOCOLS[name](0) if trajectories is None else PROTOCOLS[name](0, trajectories=trajectories)
     clean = task.test.clean
     first = np.flatnonzero(np.diff(clean.trajectory, prepend=-1))[:STARTS]
@@ -124,12 +123,12 @@ def generated(name: str, trajectories: int | None) -> Problem:
 
 
 def real_energy(q: Array, p: Array) -> Array:
-    """The published energy of the measured pendulum, in its units."""
+    """The published energy of the measured pendulum, in its own units."""
     return jnp.sum(2.4 * (1 - jnp.cos(q)) + p**2)
 
 
 def measured(name: str, data: Trajectories, file: str, stated: Stated = NOTHING) -> Problem:
-    """Motions that were measured, without applied forces."""
+    """A task of measured motions without applied forces."""
     needs = needs_of(data, file, stated.needs)
     fitted, test = parted(name, data, file, stated.test)
     energy = real_energy if name == REAL else None

@@ -1,8 +1,9 @@
-"""How each model is made and trained for a Hamiltonian task.
+"""Training of a model for a Hamiltonian task, in one or two stages.
 
-Spring and pendulum have noise on the states and none on the rates: models are fitted to rates first, and then to
-trajectories with free starts, which takes away the bias of the noise. The other generated tasks have no noise: rates
-alone. Measurements have no rates, only finite differences for a first fit: the result is that to trajectories.
+Spring and pendulum have noise on the states and none on the rates: models are fitted to rates first and then to
+trajectories with free starts, which removes the bias due to the noise. The other generated tasks have no noise and are
+fitted to rates alone. Measured rates are usually noisy or estimated and serve for a first fit; the result is then the
+fit to trajectories.
 """
 
 import math
@@ -35,30 +36,30 @@ RATES, MOTIONS = "rates", "motions"
 """The stages of a training."""
 OUT_OF_TIME = "out of time"
 WINDOWS_OF_A_STEP = 64
-"""Of Adam, when it fits motions."""
+"""Batch size of Adam, in windows, for the fit of motions."""
 
 
 MOTIONS_COMPILE = 6.0
-"""How much longer the program for motions compiles than that for rates, about (5 to 7): compiling cannot be stopped."""
+"""Approximate ratio of the compile times of motions and rates (5 to 7): a compilation cannot be interrupted."""
 FLAT = 1e-5
-"""Relative decrease of the loss in one iteration of Gauss-Newton on motions at which their fit ends."""
+"""Relative decrease of the loss per Gauss-Newton iteration below which the fit of motions ends."""
 
 
 class Trained(NamedTuple):
-    """A model and how it came about."""
+    """A trained model and its stages."""
 
     description: dict[str, Any]
-    """For `dln_jax.zoo.build`."""
+    """Description for `dln_jax.zoo.build`."""
     fits: dict[str, Training]
-    """By stage, one after the other; the last one's parameters are the result."""
+    """Trainings by stage, in sequence; the last one's parameters are the result."""
     stopped: str = ""
-    """Why a stage was left out, or ended before its time; empty where all went well."""
+    """Why a stage was skipped or ended early; empty if neither happened."""
     diverged: bool = False
-    """Whether that is a loss that stopped being finite."""
+    """Whether the loss became non-finite."""
 
     @property
     def out_of_time(self) -> bool:
-        """Whether a limit of time ended a fit, or left one out."""
+        """Whether the time limit ended or skipped a fit."""
         return self.stopped.startswith(OUT_OF_TIME)
 
     @property
@@ -68,20 +69,20 @@ class Trained(NamedTuple):
 
     @property
     def history(self) -> list[Progress]:
-        """Of all stages; their steps are counted on."""
+        """Progress of all stages, with a continuous count of steps."""
         named = ([at._replace(stage=stage) for at in fit.history] for stage, fit in self.fits.items())
         return engine.one_after_the_other(named)
 
 
 def stages_of(problem: Problem, description: dict[str, Any], steps: int | None = None) -> dict[str, int]:
-    """The stages of a training that take steps, and how many each."""
+    """Number of steps of every iterative stage of a training."""
     recipe = RECIPES[problem.name]
     most = {RATES: 0 if description["name"] == POLYNOMIAL else recipe.steps, MOTIONS: recipe.trajectory_steps}
     return {stage: steps or own for stage, own in most.items() if own}
 
 
 def check(problem: Problem, description: dict[str, Any], *, seed: int) -> None:
-    """Raises `InputError` for all that `train` would refuse in the data."""
+    """Raises `InputError` for anything in the data that `train` would refuse."""
     recipe = RECIPES[problem.name]
     parts = hold_out(problem.fitted, VALIDATION_SHARE, seed)
     fitted = first_problem(problem, description, parts, seed)
@@ -109,12 +110,12 @@ def train(
     keep: Callable[[Trained], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Trained:
-    """Fits a model to rates, and then to trajectories where the recipe says so, by as many steps as it or `steps` says.
+    """Fits a model to rates and then, if the recipe says so, to trajectories, by `steps` or the recipe's steps.
 
-    `seconds` are those of both, compilation included. Where fewer are left after the rates than compiling the next
-    program would take, or the fit of motions is not finite from its start, the fit of rates is the result; `keep` is
-    called with it before motions are fitted. Motions are left out where measured rates are exact. Devices of a mesh
-    share the samples of both.
+    `seconds` limits both fits together, compilation included. The fit of rates is the result if the time left is too
+    short to compile the next program, or if the fit of motions is not finite at its start. `keep` is called with it
+    before motions are fitted. Motions are not fitted if measured rates are exact. Devices of a mesh share the samples
+    of both fits.
     """
     began = time.perf_counter()
     recipe, model = RECIPES[problem.name], build(description)
@@ -125,7 +126,7 @@ def train(
         if isinstance(own, Adam):
             own = own._replace(patience=own.steps, batch=WINDOWS_OF_A_STEP if stage == MOTIONS else own.batch)
         elif stage == MOTIONS:
-            # One iteration a dispatch: it is what a limit of time is kept to, and each is judged by validation.
+            # One iteration per dispatch, so that the time limit is kept and validation judges every iteration.
             own = own._replace(improvement=FLAT, steps_per_dispatch=1)
         known = identity(own, numbers, model=description, seed=seed, samples=recipe.samples)
         kept = None if directory is None else Checkpoint(directory, known, resume, f"checkpoint_{file}")
@@ -158,7 +159,7 @@ def train(
 
 
 def rates_are_exact(problem: Problem, description: dict[str, Any], validation: Trajectories, fit: Training) -> bool:
-    """Whether measured rates are all that a model needs: states are free of noise, or the fit leaves nothing."""
+    """Whether a fit of measured rates is sufficient: states are free of noise, or its error is negligible."""
     own = ("qd", "qdd") if in_velocities(problem, description) else ("qd", "pd")
     if problem.trust is None or any(key in problem.fitted.estimated for key in own):
         return False
@@ -169,7 +170,7 @@ def rates_are_exact(problem: Problem, description: dict[str, Any], validation: T
 def _ended(
     description: dict[str, Any], fits: dict[str, Training], stage: str, last: Training, optimiser: Optimiser
 ) -> Trained:
-    """With what is to be said of how the last fit ended."""
+    """Adds a sentence on how the last fit ended."""
     at = f"after step {last.stop.step} of the fit of {stage}"
     remedy = (
         "lower --learning-rate" if isinstance(optimiser, Adam) else "state the plant's --needs, try another --model"

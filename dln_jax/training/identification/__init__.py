@@ -1,1 +1,1 @@
-"""Identifying the parameters of a robot from logs."""
+"""Identifies the parameters of a robot from logs."""

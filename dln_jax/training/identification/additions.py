@@ -1,4 +1,4 @@
-"""What identification adds to a rigid robot: a network for what that leaves unexplained, and how sure torques are."""
+"""Additions to an identified rigid robot: a residual network and the uncertainty of torques."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -28,22 +28,22 @@ from dln_jax.zoo.run import load
 from dln_jax.zoo.uncertainty_files import save_uncertainty
 
 ADDED = "with_residual"
-"""Name of predictions with the network."""
+"""Key of predictions with the residual network."""
 
 
 class Predictions(NamedTuple):
-    """Of held-out samples."""
+    """Predictions for held-out samples."""
 
     torque: Float[np.ndarray, "N d"]
     friction: Float[np.ndarray, "N d"]
-    """Its part."""
+    """Friction, which is part of `torque`."""
 
 
 Predict = Callable[[Parameters, np.ndarray, np.ndarray, np.ndarray], Predictions]
 
 
 def predictor(model: Model) -> Predict:
-    """(parameters, q, qd, qdd [N, d] each) -> torques, and friction among them; compiled once for one N."""
+    """(parameters, q, qd, qdd [N, d] each) -> torque and friction; compiled once per N."""
 
     def one(parameters: Parameters, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         motion = dynamics(model.energies(parameters))
@@ -54,24 +54,24 @@ def predictor(model: Model) -> Predict:
 
 
 def add_residual(case: Case, kept: Parameters) -> ResidualFit:
-    """A network on top of what is kept, or none."""
+    """Fits a residual network to the identified robot, or selects none."""
     train, validation = for_residual(case.sets.train)
     return fit_residual(case.model, kept, case.robot.tree.needs, train, validation)
 
 
 def stored_description(case: Case, added: ResidualFit | None) -> Description:
-    """Of the model that the run keeps."""
+    """Description of the model that the run keeps."""
     return case.description if added is None or not added.settings else with_network(case.description, added)
 
 
 def with_network(description: Description, added: ResidualFit) -> Description:
-    """Of a model with what was added to it."""
+    """Description of a model with its residual network."""
     keywords = {key: value for key, value in description.items() if key not in ("name", "precision")}
     return describe(f"{description['name']}-residual", precision="f64", **keywords, **added.settings)
 
 
 def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | int]) -> "Predictions":
-    """Held-out torques with the network, whose errors are put among the metrics."""
+    """Held-out torques with the residual network; adds their errors to the metrics."""
     test = case.sets.test
     predicted = predictor(added.model)(added.parameters, test.q, test.qd, test.qdd)
     errors = normalised_error(predicted.torque, test.tau)
@@ -81,7 +81,7 @@ def judge_residual(case: Case, added: ResidualFit, metrics: dict[str, float | in
 
 
 def shape_lines(case: Case) -> list[str]:
-    """What was found of friction beside its coefficients."""
+    """Fitted shape parameters of friction, in addition to its coefficients."""
     found = {name: case.description[name] for name in shape_of(case.laws) if isinstance(case.description[name], list)}
     units = {"sigmoid_slope": "s"}
     return [
@@ -91,7 +91,7 @@ def shape_lines(case: Case) -> list[str]:
 
 
 def residual_lines(added: ResidualFit | None) -> list[str]:
-    """Which networks were tried, and what was chosen."""
+    """Networks tried, and the one selected."""
     if added is None:
         return []
     tried = ", ".join(f"{_named(trial.candidate)}: {trial.validation:.3g}" for trial in added.trials)
@@ -105,9 +105,9 @@ def _named(candidate: Candidate) -> str:
 def store_uncertainty(
     folder: Path, case: Case, found: Identification, added: ResidualFit | None, *, figures: bool
 ) -> dict[str, float | int]:
-    """Stores it with the run, draws it, and says how often held-out torques are within the bands of 95 %.
+    """Stores the uncertainty with the run, draws it, and returns the coverage of the 95 % bands on held-out torques.
 
-    Calibrated on motions that the tree's few numbers were fitted to, too, and as if each had been left out.
+    The calibration includes the motions that the tree's few parameters were fitted to, as if each had been left out.
     """
     extended = added is not None and bool(added.settings)
     model, parameters = (

@@ -1,4 +1,4 @@
-"""Identifying a robot into a run folder: parameters and what is known of them, errors on what is held out, files."""
+"""Identifies a robot into a run folder: parameters and their uncertainty, held-out errors, and the robot's file."""
 
 import time
 from pathlib import Path
@@ -35,15 +35,15 @@ from dln_jax.types import InputError
 from dln_jax.zoo.run import save
 
 KEPT = "identified"
-"""Name of the parameters that are kept; the others are of the file, and of least squares."""
+"""Key of the parameters that are kept; the other keys are the file and least squares."""
 
 
 def run(given: Options, command: str) -> None:
-    """Identifies what the options name, and writes the run folder, by default runs/`command`-1, -2, ...
+    """Identifies a robot and writes the run folder, by default runs/`command`-1, -2, ...
 
     Raises:
-        InputError: a mistake in a file or an option; nothing is kept then.
-        FitRefused: the robot must not be used; the run folder is complete but for the robot's file.
+        InputError: a file or an option is wrong; nothing is kept.
+        FitRefused: the robot must not be used; the run folder is complete except for the robot's file.
     """
     case = prepare(given)
     with command_folder(given, command) as folder:
@@ -91,7 +91,7 @@ def run(given: Options, command: str) -> None:
 
 
 def announce(given: Options, case: Case) -> None:
-    """Says what is identified from what, and what was assumed."""
+    """Prints the robot, the data and the assumptions made."""
     train, test, blocks = case.sets
     print(f"{given.robot.name}: {len(case.names)} joints, {', '.join(case.names)}")
     held = "blocks of time of the one trajectory" if blocks else "trajectories"
@@ -107,7 +107,7 @@ def announce(given: Options, case: Case) -> None:
 def evaluate(
     case: Case, found: Identification, predict: Predict
 ) -> tuple[dict[str, float | int], dict[str, Predictions]]:
-    """Metrics of what was held out, and predictions by the file, by least squares, and by what is kept."""
+    """Metrics on held-out data, and predictions by the file, by least squares, and by the parameters kept."""
     test = case.sets.test
     sources = {"file": found.known, "least_squares": found.fit.theta, KEPT: found.theta}
     predicted = {
@@ -136,7 +136,7 @@ def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept
     test, names, units = case.sets.test, case.names, units_of(case)
     write_figure(folder / "torque.png", torque_by_joint(test, kept.torque, names, units))
     if case.laws:
-        # All joints at once, each through its own range: friction of one does not depend on others.
+        # All joints at once, each over its own range: friction in a joint does not depend on the others.
         rates = np.linspace(test.qd.min(axis=0), test.qd.max(axis=0), len(test.t))
         still = np.zeros_like(rates)
         curves = predict(parameters_of(found.theta, case.known), still, rates, still).friction
@@ -149,7 +149,7 @@ def draw(folder: Path, case: Case, found: Identification, predict: Predict, kept
 
 
 def write_file(folder: Path, given: Options, case: Case, found: Identification, verdict: Verdict) -> list[str]:
-    """Writes the robot's file with what is kept, and says what it lacks, or why there is none."""
+    """Writes the robot's file with the parameters kept; returns a line on what it lacks, or why there is none."""
     bodies = is_consistent(found.theta, found.columns)
     path = folder / f"{given.robot.stem}_identified{given.robot.suffix}"
     if verdict.level == "refused":
@@ -178,12 +178,12 @@ def write_file(folder: Path, given: Options, case: Case, found: Identification, 
 
 
 def units_of(case: Case) -> list[str]:
-    """Of each joint's force."""
+    """Units of the joints' forces."""
     return ["N m" if kind == "revolute" else "N" for kind in case.robot.tree.joints]
 
 
 def print_result(case: Case, found: Identification, predicted: dict[str, Predictions]) -> None:
-    """Errors of each joint on what was held out."""
+    """Prints the held-out errors of every joint."""
     tau = case.sets.test.tau
     errors = {name: normalised_error(each.torque, tau) for name, each in predicted.items()}
     rms = np.sqrt(np.mean((predicted[KEPT].torque - tau) ** 2, axis=0))

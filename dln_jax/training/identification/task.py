@@ -1,4 +1,4 @@
-"""From options to a robot that is to be identified: its file, the data, and what they are judged by."""
+"""Builds an identification task from options: the robot's file, its data, and the held-out part."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,14 +34,14 @@ from dln_jax.types import FrictionLaw, InputError
 from dln_jax.zoo.descriptions import Description, build, describe
 
 IDENTIFIED = tuple(law for law in LAWS if law != "load")
-"""Laws that forces are linear in the coefficients of."""
+"""Friction laws in whose coefficients forces are linear."""
 NO_FRICTION = "none"
 SETTLED = ("split", "friction", "condition")
-"""Checks of a log that the robot's file and this command answer."""
+"""Checks of a log that the robot's file and this command make unnecessary."""
 MOST_SAMPLES = 4_000
-"""Of which the shapes of friction are found."""
+"""Largest number of samples used to fit the shapes of friction."""
 HELD_OUT = slice(2, None, 5)
-"""Of trajectories or blocks: the third of every five."""
+"""Trajectories or blocks held out: the third of every five."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,16 +78,16 @@ class Options(Folder, Drawn, Filtered):
 
 
 class Sets(NamedTuple):
-    """Fitted to, and judged by."""
+    """Training and held-out data."""
 
     train: Trajectories
     test: Trajectories
     blocks: bool
-    """Whether they are blocks of one trajectory."""
+    """Whether the parts are blocks of one trajectory."""
 
 
 class Case(NamedTuple):
-    """A robot and its data, ready to be identified."""
+    """A robot and its data, ready for identification."""
 
     robot: Robot
     names: tuple[str, ...]
@@ -95,19 +95,19 @@ class Case(NamedTuple):
     description: Description
     model: Any
     known: Parameters
-    """Of the file."""
+    """Parameters in the robot's file."""
     noise: np.ndarray | None
-    """Where it is stated."""
+    """Noise of the torques, if stated."""
     held: tuple[str, ...]
-    """Joints that do not move."""
+    """Names of the locked joints."""
     said: tuple[str, ...]
-    """On where rates come from, and what was noticed of the log."""
+    """Lines for the user: the origin of the rates, and findings about the log."""
     torque: str = "measured torques"
-    """That the fit and its bands are of."""
+    """The torques that the fit and its uncertainty bands refer to."""
 
     @property
     def laws(self) -> tuple[FrictionLaw, ...]:
-        """Of the friction that is identified."""
+        """Friction laws that are identified."""
         return tuple(self.description["needs"]["joint_friction"])
 
 
@@ -140,7 +140,7 @@ def prepare(given: Options) -> Case:
 
 
 def with_description(case: Case, **changes: Any) -> Case:
-    """The case with other keywords of its model, which is built anew."""
+    """The case with changed keywords of its model, which is built again."""
     description = {**case.description, **changes}
     model = build(description)
     known = model.init(jax.random.key(0))
@@ -152,9 +152,9 @@ def with_description(case: Case, **changes: Any) -> Case:
 
 
 def with_shapes(velocity_scale: float | None, case: Case) -> Case:
-    """The case with friction curves whose shapes the training data show, and as it is where none is to be found.
+    """The case with friction curves whose shapes are fitted to the training data; unchanged if there is nothing to fit.
 
-    The velocity scale is fitted where it is not given.
+    The velocity scale is fitted unless it is stated.
     """
     held = () if velocity_scale is None else ("velocity_scale",)
     if not set(shape_of(case.laws)) - set(held):
@@ -168,7 +168,7 @@ def with_shapes(velocity_scale: float | None, case: Case) -> Case:
 
 
 def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
-    """What a residual is fitted to, and every fourth trajectory or block, by which its size is chosen."""
+    """Training data of a residual network, and every fourth trajectory or block as validation for its size."""
     present = np.unique(train.trajectory)
     chosen = present[1::4]
     if not len(chosen):
@@ -177,7 +177,7 @@ def for_residual(train: Trajectories) -> tuple[Trajectories, Trajectories]:
 
 
 def split(data: Trajectories, test: list[str] | None) -> Sets:
-    """Held-out trajectories, or blocks of time where there is one trajectory only."""
+    """Training and held-out trajectories, or blocks of time if there is only one trajectory."""
     if len(np.unique(data.trajectory)) == 1:
         if test is not None:
             raise InputError("--test names trajectories, and the data have one only; leave it out for blocks of time")
@@ -195,7 +195,7 @@ def split(data: Trajectories, test: list[str] | None) -> Sets:
 
 
 def noises(stated: str | None, d: int) -> np.ndarray | None:
-    """Of --noise."""
+    """Parses --noise."""
     if stated is None:
         return None
     return np.array(numbers_of("--noise", stated, [d], positive=True))

@@ -1,4 +1,4 @@
-"""Whether an identified robot may be used: its torques on held-out motions, and whether such a robot can exist."""
+"""Judges an identified robot: its torques on held-out motions, and its physical plausibility."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,17 +13,17 @@ from dln_jax.training.identification.task import Case
 
 HEAVIER, MUCH_HEAVIER = 5.0, 50.0
 """Factors by which the bodies' torques may differ from those of the robot's file: beyond the first the fit is doubtful,
-beyond the second refused. Payloads and rough files stay below; units (N mm, mN m) do not."""
+beyond the second refused. Payloads and rough files stay below; wrong units (N mm, mN m) do not."""
 IMPOSSIBLE = 0.1
-"""Mean nMSE that least squares explains and bodies that exist do not, from which no such robot exists."""
+"""Mean nMSE in excess of least squares at which a physically consistent robot is ruled out."""
 COUNTS = 0.02
-"""Share of a torque's standard deviation from which friction counts."""
+"""Friction is judged if its standard deviation exceeds this fraction of the torque's."""
 FAST = 0.9
-"""Quantile of a joint's speeds that its friction's velocity scale has to stay below."""
+"""Quantile of a joint's speed that must exceed the velocity scale of its friction."""
 SPIKE = 10.0
-"""Spreads from the median of five neighbours beyond which a single sample is a spike."""
+"""A spike deviates from the median of five neighbours by more than this many typical deviations."""
 SPIKES = 5e-4
-"""Share of samples that are spikes from which they are mentioned."""
+"""Fraction of spikes above which they are reported."""
 
 
 def judged(
@@ -35,9 +35,9 @@ def judged(
         case: the robot and its data.
         found: the fit.
         predict: torques by parameters.
-        torques: on the held-out motions [N, d], by "file", "least_squares" and `kept`.
+        torques: torques on the held-out motions [N, d], by "file", "least_squares" and `kept`.
         kept: key of the torques of the model that the run keeps.
-        robust: whether held-out samples that are spikes are left out.
+        robust: whether spikes in held-out samples are ignored.
     """
     test, d = case.sets.test, case.sets.test.degrees_of_freedom
     peaks = spikes(test.tau)
@@ -63,18 +63,18 @@ def judged(
 
 
 def spikes(tau: Float[np.ndarray, "N d"]) -> np.ndarray:
-    """Which torques [N, d] are single samples far from their neighbours (Hampel's identifier, a window of five)."""
+    """Mask of torques [N, d] that are isolated outliers (Hampel's identifier, a window of five)."""
     padded = np.pad(tau, ((2, 2), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0)
     away = np.abs(tau - np.median(windows, axis=-1))
     usual = np.maximum(1.4826 * np.median(away, axis=0), 1e-3 * tau.std(axis=0))
-    # Jumps of the motion, such as those of dry friction, are not alone, and never larger than the torque's range.
+    # Jumps of the motion, such as those of dry friction, are not isolated and never exceed the torque's range.
     size = np.median(np.abs(tau - np.median(tau, axis=0)), axis=0)
     return away > np.maximum(SPIKE * usual, 2 * size)
 
 
 def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, tau: np.ndarray) -> Verdict:
-    """Whether bodies that exist explain the torques as well as least squares, which knows no such bound."""
+    """Whether physically consistent bodies explain the torques as well as unconstrained least squares."""
     if found.consistent is None:
         return Verdict("good", "")
     mine, free = (np.nanmean(normalised_error(torques[name], tau)) for name in (kept, "least_squares"))
@@ -96,7 +96,7 @@ def friction_verdict(
     friction: Float[np.ndarray, "N d"],
     scales: Float[np.ndarray, " d"] | None,
 ) -> Verdict:
-    """Whether friction takes energy away, and whether the joints reach the velocity scales that were fitted to it."""
+    """Whether friction dissipates energy, and whether the joints reach the fitted velocity scales."""
     every, counts = [Verdict("good", "")], np.std(friction, axis=0) > COUNTS * np.std(tau, axis=0)
     power = np.mean(qd * (friction - friction.mean(axis=0)), axis=0)
     for k in np.flatnonzero(counts & (power < 0)):
@@ -110,12 +110,12 @@ def friction_verdict(
 
 
 def without_joints(parameters: RigidTreeParameters) -> RigidTreeParameters:
-    """The bodies alone: no armature, no friction."""
+    """Parameters of the bodies alone, without armature and friction."""
     return RigidTreeParameters(*(each if k == 0 or each is None else 0 * each for k, each in enumerate(parameters)))
 
 
 def weight_verdict(mine: Float[np.ndarray, "N d"], file: Float[np.ndarray, "N d"]) -> Verdict:
-    """Whether the bodies are about as heavy as those of the robot's file, by the torques that they take."""
+    """Whether the torques of the bodies are of the same magnitude as those of the robot's file."""
     sizes = np.sqrt(np.mean(np.square([mine, file]), axis=1))
     there = sizes[1] > 1e-3 * sizes[1].max()
     factor = float(np.median(sizes[0][there] / sizes[1][there])) if there.any() else 1.0

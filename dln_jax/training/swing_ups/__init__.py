@@ -1,1 +1,1 @@
-"""Swinging up a plant: explore, learn, control, film."""
+"""Swing-up of a plant: exploration, learning, control and animation."""

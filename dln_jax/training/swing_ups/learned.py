@@ -1,4 +1,4 @@
-"""A desktop plant explored, learned from its encoders, and swung up by what was learned: step by step."""
+"""Learns a desktop plant from its encoders and evaluates the models for the swing-up."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -20,38 +20,38 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError
 
 MODELS = ("delan", "identified", "analytic", "known")
-"""Learned; linear in its parameters; the maker's sizes without friction; the plant itself."""
+"""Learned; linear in its parameters; the maker's dimensions without friction; the plant itself."""
 TEST_SEED = 500
-"""Added to the seed of what is learned from, for motions that models are judged by."""
+"""Offset of the seed for test motions."""
 
 
 class Obtained(NamedTuple):
-    """A model, and where it is from."""
+    """A model and its origin."""
 
     dynamics: Dynamics
     fitted: Fitted | None
-    """`None` for those that were not learned."""
+    """`None` for models that are not learned."""
     prepared: Prepared | None
     seconds: float
-    """That learning took, compilation included."""
+    """Learning time, compilation included."""
 
 
 class Errors(NamedTuple):
-    """Of a model along true motions that it has not seen, sum of squared errors over that of the truth."""
+    """Errors of a model along unseen true motions: sums of squared errors over sums of squares of the truth."""
 
     torque_nmse: float
     acceleration_nmse: float
 
 
 def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: int, report: Report = silent) -> Obtained:
-    """The model of a name.
+    """The model with this name.
 
     Args:
-        plant: whose maker's model and friction are known to two of the models alone.
+        plant: the plant; only "analytic" and "known" use its maker's model and friction.
         model: one of `MODELS`.
-        recording: that the other two are learned from.
-        seed: of the network's initial parameters.
-        report: of its training.
+        recording: data from which the other two models are learned.
+        seed: seed of the network's initial parameters.
+        report: called with the progress of its training.
 
     Raises:
         InputError: an unknown name.
@@ -71,7 +71,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
 
 
 def errors_along(plant: DesktopPlant, model: Dynamics, runs: Run) -> Errors:
-    """Of a model's inverse and forward dynamics along true runs [E, N]: as the plant's states and forces are."""
+    """Errors of a model's inverse and forward dynamics along true runs [E, N], at the plant's own states and forces."""
     B = np.asarray(plant.scene.needs.actuation)
     x, u = (jnp.asarray(each.reshape(-1, each.shape[-1])) for each in (runs.x[:, :-1], runs.u))
     truth = field_of(model_of_plant(plant), B)
@@ -87,6 +87,6 @@ def errors_along(plant: DesktopPlant, model: Dynamics, runs: Run) -> Errors:
 
 
 def test_motions(plant: DesktopPlant, *, seed: int, seconds: float = 12.0) -> Run:
-    """True motions of another exploration, to judge models by."""
+    """True motions of another exploration, as test data."""
     excitation = Excitation(seconds=seconds, episodes=2, surplus=(0.0, 0.5))
     return explore(plant, plant.numbers.gains, excitation, seed=seed + TEST_SEED)[1]

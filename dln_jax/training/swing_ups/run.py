@@ -1,4 +1,4 @@
-"""From a desktop plant to its swing-up by a model that was learned from its motions: explore, learn, close the loop."""
+"""Swings up a desktop plant with a model learned from its motions: explores, learns, closes the loop."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -27,17 +27,17 @@ from dln_jax.types import InputError, require_positive, require_seed
 from dln_jax.zoo.run import save
 
 EPISODE = 6.0
-"""s, of an episode, about."""
+"""Approximate duration of an episode, s."""
 LEAST_SECONDS = 4.0
-"""Of data: two episodes, of which one is to select by."""
+"""Shortest data, s: two episodes, one of them for validation."""
 UNITS = {"cart-pole": "N", "rotary-pendulum": "N m"}
-"""Of the control."""
+"""Unit of the control."""
 FILMED = 4.0
-"""s, of a run."""
+"""Duration of the animation, s."""
 
 
 class Asked(NamedTuple):
-    """What is to be done, checked."""
+    """The checked arguments of a swing-up."""
 
     plant: DesktopPlant
     name: str
@@ -48,7 +48,7 @@ class Asked(NamedTuple):
 
 
 def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int) -> Asked:
-    """The arguments of a command, refused in one line before anything is written."""
+    """Checks the arguments of a command before anything is written; errors are one line."""
     found = desktop_plant(plant)
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
@@ -65,7 +65,7 @@ def asked(plant: str, model: str, seconds_of_data: float, starts: int, seed: int
 
 
 def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
-    """Explores, learns, swings up, and writes what came of it; gives the metrics."""
+    """Explores, learns, swings up and writes the results; returns the metrics."""
     plant = given.plant
     recording, _ = explore(plant, plant.numbers.gains, given.excitation, seed=given.seed)
     schema.save(folder / "data.npz", recording)
@@ -94,7 +94,7 @@ def swing_up(given: Asked, folder: Path, *, figures: bool) -> dict[str, float]:
 
 
 def metrics_of(tried: Tried) -> dict[str, float]:
-    """Of swing-ups from many starts."""
+    """Metrics of swing-ups from many starts."""
     found = tried.outcomes
     return {
         "success_share": found.share,
@@ -106,13 +106,13 @@ def metrics_of(tried: Tried) -> dict[str, float]:
 
 
 def store(folder: Path, got: Obtained) -> None:
-    """Writes the model, if it was learned."""
+    """Saves the model if it was learned."""
     if got.fitted is not None:
         save(folder, *got.fitted)
 
 
 def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
-    """Prints what came of it."""
+    """Prints the results."""
     if got.prepared is not None:
         late = f"torques {got.prepared.delay} sample(s) late, q filtered at {got.prepared.cutoff:.0f} Hz"
         print(f"{given.model}: learned in {got.seconds:.0f} s; {late}")
@@ -129,7 +129,7 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
 
 
 def draw(given: Asked, model: Dynamics, folder: Path) -> None:
-    """Writes the figure of some runs, and the film of the first."""
+    """Writes a figure of some runs, and an animation of the first."""
     plant, lab = given.plant, given.plant.laboratory
     runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
     unit, limits = UNITS[given.name], (lab.least, lab.most)
@@ -153,7 +153,7 @@ def draw(given: Asked, model: Dynamics, folder: Path) -> None:
 
 
 def some_runs(plant: DesktopPlant, model: Dynamics, count: int, seed: int) -> Run:
-    """The first of the runs that were tried, [count, N]."""
+    """The first `count` of the runs that were tried, [count, N]."""
     run = jax.jit(jax.vmap(motion_of(plant, model, seconds=6.0)))
     found = run(hanging_starts(count, seed, position=plant.position), jax.random.split(jax.random.key(seed), count))
     return jax.tree.map(np.asarray, found)

@@ -28,15 +28,15 @@ def training_of(task: Task, parameters: Parameters, loss: float, seconds: float)
 
 
 def refined_if_asked(task: Task, training: Training) -> Training:
-    """The direct fit, which is to torques; for another objective it is where Gauss-Newton starts."""
+    """Returns the direct fit, which is to torques; for another objective Gauss-Newton starts from it."""
     return training if task.objective.of_torques else refined(task, training)
 
 
 def refined(task: Task, start: Training) -> Training:
-    """The fit of the task's objective from the parameters of another; those are kept if validation prefers them.
+    """Refines the parameters for the task's objective; the start is kept unless the validation error decreases.
 
     Raises:
-        InputError: the model has too many parameters for Gauss-Newton, or a type in which that does not work.
+        InputError: the model has too many parameters for Gauss-Newton, or a precision that it does not support.
     """
     model = build(task.description)
     suited, reason = dynamics.suited_optimiser(model, task.sets, task.objective)

@@ -1,4 +1,4 @@
-"""--target: structured networks of growing size, until one is as accurate as asked; of those, the fastest."""
+"""--target: trains structured networks of growing size until one is accurate enough, and keeps the fastest of those."""
 
 import itertools
 from pathlib import Path
@@ -30,30 +30,30 @@ DEPTHS = (1, 2)
 
 
 class Candidate(NamedTuple):
-    """A network that was tried."""
+    """A network that was trained, with its error and speed."""
 
     width: int
     depth: int
     networks: int
-    """1 where factor and potential share one, else 2."""
+    """1 if factor and potential share a network, else 2."""
     parameters: int
     validation_error: float
     train_seconds: float
-    """Compilation included."""
+    """Includes compilation."""
     one_step_us: float
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Name for tables and messages."""
         return f"{self.depth} x {self.width}, {'one network' if self.networks == 1 else 'two networks'}"
 
 
 def grow_to_target(
     task: Task, optimiser: Optimiser, target: float, folder: Path, *, resume: bool, mesh: Mesh | None
 ) -> tuple[Task, Training]:
-    """Trains all candidates of a width before those of the next, and ends with the first width that meets the target.
+    """Trains all candidates of a width before the next width, and stops at the first width that meets the target.
 
-    Chosen is the fastest that meets it, or, if none does, the most accurate. Writes `candidates.json` and a table.
+    Keeps the fastest candidate that meets it or, if none does, the most accurate. Writes `candidates.json` and a table.
     """
     tried: list[tuple[Candidate, Task, Training]] = []
     enough: list[tuple[Candidate, Task, Training]] = []
@@ -113,7 +113,7 @@ def _try(
         parameters=sum(jnp.size(leaf) for leaf in jax.tree.leaves(training.parameters)),
         validation_error=float(training.validation),
         train_seconds=training.train_seconds + training.compile_seconds,
-        # By it a model is chosen, and in all processes the same.
+        # The selection depends on it, so all processes must use the same value.
         one_step_us=of_first_process(latency_of(system, task, calls=2000).p50_us, mesh),
     )
     return candidate, task, training

@@ -35,7 +35,7 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
 
 
 def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """Two kernels, one for a chain of bodies and one without that assumption, of which validation chooses."""
+    """Fits two kernels, with and without the assumption of a serial chain, and selects one by validation."""
     began = time.perf_counter()
     upper, available = task.description["samples"], len(task.sets.train.tau)
     chosen, trials = choose_kernel(task.needs, task.sets.train, task.sets.validation, samples=upper)

@@ -18,10 +18,10 @@ from dln_jax.zoo.descriptions import describe_for
 
 
 def needs_of_tree(needs: Needs) -> Needs:
-    """The needs as a learned tree states them, whose friction is viscous, dry and an offset of each joint.
+    """Converts the needs to those of a learned tree, whose friction is viscous, dry and an offset per joint.
 
     Raises:
-        InputError: laws of friction that it does not have.
+        InputError: friction laws that a learned tree does not have.
     """
     if others := [law for law in needs.joint_friction if law not in USUAL]:
         raise InputError(f"a learned tree has no {others[0]} friction; leave it out of joint_friction")

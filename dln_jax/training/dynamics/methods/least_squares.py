@@ -29,7 +29,7 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
 
 
 def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """One least-squares problem, after those by which validation chooses the degrees where none is stated."""
+    """Fits the model by least squares; without a stated degree, validation chooses the degrees first."""
     began = time.perf_counter()
     chosen = None
     if given.degree is None:

@@ -49,7 +49,7 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
         optimizer = suited.optimizer
     adam = optimizer == "adam"
     precision = given.precision or ("f32" if adam else "f64")
-    # Structure needs fewer units, and first-order training more.
+    # A structured model needs fewer units; first-order training needs more.
     width = 64 if adam else 8 if CATALOGUE[kind].properties.definite else 16
     keywords = resolved(given, {"width": width, "depth": 2, "activation": "tanh"})
     keywords |= {} if suited is None else suited.keywords
@@ -81,7 +81,7 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
 def posed(
     description: dict[str, Any], sets: Split, objective: Objective, samples: int | None, seeds: int | tuple[int, ...]
 ) -> Problem:
-    """The fit of a model to training samples, `samples` of which are drawn, in units of all of them."""
+    """The fitting problem of a model; `samples` training samples are drawn, scaled by the spread of all of them."""
     scale, some = objective.scale(sets.train), sets
     if samples is not None:
         some = sets._replace(train=drawn(sets.train, samples, seeds if isinstance(seeds, int) else seeds[0]))
@@ -108,7 +108,7 @@ def solver_of(task: Task) -> Solver:
 
 
 def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh | None, fits: int = 1) -> Training:
-    """Trains the task's model, one seed or several, in its share of the time that is left for so many fits."""
+    """Trains the task's model, with one seed or several, in its share of the time left for `fits` fits."""
     total = solver.optimiser.steps
     identity = dynamics.identity_of(solver.optimiser, task.sets, task.objective, seeds=task.seeds)
     with progress(total) as show:
@@ -123,9 +123,9 @@ def train(task: Task, solver: Solver, folder: Path, *, resume: bool, mesh: Mesh 
 
 
 def cross_validated(task: Task, solver: Solver, folder: Path, *, folds: int, resume: bool, mesh: Mesh | None) -> Task:
-    """The task with the seed whose trainings without each fold of the motions predict that fold best.
+    """Selects the seed with the lowest cross-validation error over folds of the motions.
 
-    One or two validation motions often prefer the worse of two seeds; every motion outside the test is in one fold.
+    One or two validation motions often prefer the worse of two seeds. Every motion outside the test is in one fold.
     """
     rest = merged(task.sets._replace(test=select(task.sets.test, [])))
     motions = np.random.default_rng(np.ravel(task.seeds)[0]).permutation(np.unique(rest.trajectory))
