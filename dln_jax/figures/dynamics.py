@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from dln_jax.data.schema import Trajectories
@@ -100,7 +101,7 @@ def tip_paths(
     motions: Sequence[Motion],
     model: str = "model",
 ) -> Figure:
-    """Paths of an arm's tip, one panel each, test paths first with the model's rollouts over them.
+    """Test paths of an arm's tip with the model's rollouts over them, one panel each; training paths behind in grey.
 
     Args:
         data: all trajectories, including those of `test`.
@@ -110,12 +111,10 @@ def tip_paths(
             path ends when the prediction is no longer valid.
         model: name of the model, which sets the colour.
     """
-    tested = list(np.unique(test.trajectory))
-    others = [index for index in np.unique(data.trajectory) if index not in tested]
-    shown = [*tested, *others][:MOST_PATHS]
-    columns = min(len(shown), 8)
+    shown = list(np.unique(test.trajectory))[:MOST_PATHS]
+    columns = min(len(shown), 4)
     rows = -(-len(shown) // columns)
-    figure, axes = style.figure(rows, columns, height=1.0 * rows + 0.55, sharex=True, sharey=True)
+    figure, axes = style.figure(rows, columns, height=2.3 * rows + 0.55, sharex=True, sharey=True)
     places = jax.jit(jax.vmap(tip))
     positions = np.asarray(places(data.q))
     for axis in axes.flat:
@@ -126,21 +125,23 @@ def tip_paths(
     if motions:
         ends = np.cumsum([len(motion.q) for motion in motions])
         paths = np.split(np.asarray(places(np.concatenate([motion.q for motion in motions]))), ends[:-1])
+    training = [positions[data.trajectory == index] for index in np.setdiff1d(data.trajectory, test.trajectory)]
     for number, (axis, index) in enumerate(zip(axes.flat, shown, strict=False)):
-        is_test = number < len(tested)
         chosen = data.trajectory == index
-        axis.plot(*positions[chosen].T, color="black" if is_test else "0.6", linewidth=2.2 if is_test else 1.2)
-        axis.set_title(f"{data.label[index]} (test)" if is_test else str(data.label[index]), fontsize=style.SMALL)
-        if is_test and number < len(times):
+        axis.add_collection(LineCollection(training[:MOST_PATHS], colors="0.88", linewidths=0.7))
+        axis.plot(*positions[chosen].T, color="black", linewidth=2.2)
+        axis.set_title(f"{data.label[index]} (test)", fontsize=style.SMALL)
+        if number < len(times):
             t = data.t[chosen]
             valid = t - t[0] <= times[number] + 1e-9
             path = paths[number][valid]
             axis.plot(*path.T, "--", color=style.colour(model), linewidth=1.3)
             axis.plot(*path[-1], "o", color=style.colour(model), markersize=4)
-            axis.set_title(f"{data.label[index]}: {times[number]:.1f} of {t[-1] - t[0]:.1f} s", fontsize=style.SMALL)
+            said = f"valid for {times[number]:.1f} of {t[-1] - t[0]:.1f} s"
+            axis.set_title(f"{data.label[index]}: {said}", fontsize=style.SMALL)
     if len(times):
         figure.supxlabel(
-            f"black: test, dashed: {model} driven by its torques until the prediction fails; grey: training",
+            f"black: test; dashed: {model} driven by its torques until the prediction fails; grey: training",
             fontsize=style.SMALL,
         )
     return figure

@@ -33,12 +33,14 @@ def torque_bands(
     starts = np.flatnonzero(np.diff(data.trajectory[shown]) != 0) + 0.5
     shade = style.colour(model)
     axes = [figure.add_subplot(grid[joint, 0]) for joint in range(d)]
+    bands = half_width(LEVEL) * std[shown]
+    # One unit for all joints, so that their errors can be compared.
+    factor, prefix = style.prefixed(float(np.quantile(bands[:, :d], 0.9, axis=0).max()), "")
     for joint, axis in enumerate(axes):
         style.prepare(axis)
-        band = half_width(LEVEL) * std[shown, joint]
-        factor, prefix = style.prefixed(float(np.quantile(band, 0.9)), "")
+        band = bands[:, joint]
         axis.fill_between(shown, -band / factor, band / factor, color=shade, alpha=0.25, linewidth=0, label="95 % band")
-        axis.plot(shown, -error[shown, joint] / factor, color="black", linewidth=0.8, label="measured less predicted")
+        axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
         largest = 1.1 * max(np.quantile(band, 0.98), np.quantile(np.abs(error[shown, joint]), 0.995)) / factor
         axis.set_ylim(-largest, largest)
         for first, last in _stretches(outside[shown]):
