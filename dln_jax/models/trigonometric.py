@@ -28,8 +28,7 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 MOST_COEFFICIENTS = 20_000
-"""Largest number of coefficients of the mass matrix; it grows exponentially with the joints, the fit with its
-square."""
+"""Limit on the coefficients of the mass matrix; they grow exponentially with the joints, the fit with their square."""
 SPRING_DEGREE = 2
 """Lower bound on the degree of the potential in a prismatic displacement, so that it holds a linear spring."""
 
