@@ -115,8 +115,7 @@ def _problem(
         return sum((weight * way**2 for weight, way in zip(weights, ways(x), strict=True)), jnp.zeros((), x.dtype))
 
     def with_walls(x: Array) -> Scalar:
-        # The walls begin at 0.4 m of a rail's 0.5 m. Their small value at the goal is subtracted, since costs are zero
-        # there.
+        # The walls begin at 0.4 m of a rail's 0.5 m. Their value at the goal, where costs are zero, is subtracted.
         turned = [
             each - 2 * math.pi * jnp.round(each / (2 * math.pi)) if turns else each
             for each, turns in zip(x, circular, strict=True)
