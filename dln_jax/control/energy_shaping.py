@@ -71,8 +71,7 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
 
 
 def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
-    """(q, qd) -> energy of the passive part with the active joints locked at the goal, J, relative to that at the
-    goal."""
+    """(q, qd) -> energy of the passive part in J, with the active joints locked at the goal, relative to the goal."""
     active, passive = map(np.array, parts)
     goal = jnp.asarray(goal, float)
 
@@ -92,8 +91,7 @@ def energy_shaping(
     *,
     surplus: Any = 0.0,
 ) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces of the active joints that bring the passive ones to the goal's energy, and the active ones to
-    the goal.
+    """(q, qd) -> forces that bring the passive joints to the goal's energy, and the active joints to the goal.
 
     Args:
         plant: a known or learned model with energies; its friction is compensated at the active joints.

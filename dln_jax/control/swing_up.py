@@ -45,7 +45,7 @@ class SwingUpNumbers(NamedTuple):
     compensation: float = GAIN
     """Share of the active joints' friction that is compensated; 0 for none."""
     kick: float = 0.0
-    """N m or N, on a plant at rest far from the goal, towards the active joints' goal."""
+    """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
     still: float = 0.05
     """Largest measured rate that counts as rest, 1/s or m/s."""
 

@@ -51,8 +51,8 @@ FOLDS = 10
 MOST_SAMPLES = 2_000
 """Largest number of validation samples, evenly spaced."""
 HARMLESS = 0.01
-"""Share of a torque's standard deviation: a smaller uncertainty due to parameters puts no state of a linear model out
-of distribution."""
+"""No state of a linear model is out of distribution if its uncertainty due to parameters is below this share of the
+torque's standard deviation."""
 STILL = 1e-3
 """Range in rad, m, 1/s or 1/s² of a coordinate that rests in all data."""
 UPPER = 0.975
@@ -205,8 +205,7 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
 
 
 def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
-    """Number of independent samples that carry as much information on the variance: N / (1 + 2 sum of squared
-    autocorrelations).
+    """Effective number of independent samples for the variance: N / (1 + 2 sum of squared autocorrelations).
 
     The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
     """

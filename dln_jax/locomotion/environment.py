@@ -17,8 +17,7 @@ def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Environment of one creature: an action in [-1, 1] per muscle is an actuation in [0.25, 1]; rewards are the
-    task's.
+    """Environment of one creature, with the task's rewards; actions in [-1, 1] are actuations in [0.25, 1].
 
     An episode is truncated after the task's number of steps. It is terminated by a fall, or by a step of the simulator
     that does not converge; `info["converged"]` distinguishes the two.

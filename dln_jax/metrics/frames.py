@@ -132,8 +132,10 @@ def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
-    """Predicts motions from the first pairs; returns `energy_mse` and `frame_mse` by `phase_space.summary`, and
-    motions."""
+    """Predicts motions from the first pairs; returns their errors and the motions.
+
+    The errors are `energy_mse` and `frame_mse`, both by `phase_space.summary`.
+    """
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
     pictures = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))

@@ -76,8 +76,7 @@ def recorded_motions(
     substeps: int = 20,
     dtype: DTypeLike | None = None,
 ) -> dict[Torque, list[Motion]]:
-    """Returns `follow` along all trajectories of the data, from their first states: float64 arrays of the data's
-    length.
+    """Returns `follow` along all trajectories of the data, from their first states, as float64 arrays of their lengths.
 
     All kinds of torque run in one program, in `dtype` (JAX's default if omitted).
 

@@ -25,8 +25,8 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
-"""A state is out of distribution if directions that the data never showed hold more than this share of its |phi|, in
-scaled parameters."""
+"""Largest share of |phi|, in scaled parameters, in directions that the data never showed; a state above it is out of
+distribution."""
 
 
 class Domain(NamedTuple):

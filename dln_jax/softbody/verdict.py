@@ -44,11 +44,9 @@ class Info(NamedTuple):
     energy_growth: Float[Array, ""] | None = None
     """Energy created by the step, in J; negative for damping. `None` for a static solve."""
     energy_at_hand: Float[Array, ""] | None = None
-    """Energy available to the step, in J, including the effect of rounding and of the tolerance. `None` for a static
-    solve."""
+    """Energy available to the step, in J, with the effect of rounding and tolerance. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
-    """Smallest ratio of an element's volume to its rest volume, over the elements that resist deformation; `None`
-    without any."""
+    """Smallest ratio of an element's volume to its rest volume, over elements that resist deformation, if any."""
     overlaps: Int[Array, ""] | None = None
     """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
     for a mesh of one component. It does not affect `converged`."""

@@ -116,8 +116,7 @@ def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
 def lookahead(
     problem: ControlProblem, found: GridValue, *, most: float, dt: float = 0.05
 ) -> Callable[[Array], Float[Array, " 1"]]:
-    """Returns the policy of a value on a grid: x [2] -> the listed control u [1] with the lowest cost over dt plus V
-    after.
+    """Returns the policy of a value on a grid: x [2] -> the listed control u [1] with the lowest cost over dt plus V.
 
     The cost of following it is at least the true value, so it bounds V from above.
     """

@@ -91,7 +91,7 @@ def desktop_rotary_pendulum() -> ValuePlant:
 PLANTS = {"pendulum": pendulum, "cart-pole": cart_pole_on_rail, "rotary-pendulum": desktop_rotary_pendulum}
 """Plants by name."""
 HORIZON = 5.0
-"""Time in s after which the discount is `share`."""
+"""Time in s after which a cost counts by the factor `share`."""
 
 
 def _problem(

@@ -142,8 +142,9 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
 
 
 def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> ControlProblem:
-    """Returns the problem with another goal: the state cost is shifted, and controls cost their difference from the one
-    that holds it.
+    """Returns the problem with another goal.
+
+    The state cost is shifted, and controls cost their difference from the one that holds the new goal.
 
     Args:
         problem: with zero cost at its goal.

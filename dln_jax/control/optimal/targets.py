@@ -26,8 +26,7 @@ class Targets(NamedTuple):
 def greedy(
     problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
 ) -> Callable[[Array], tuple[Array, Scalar]]:
-    """x -> the state after a step under the value's own policy (against an adversary, if any), and the cost of the
-    step."""
+    """x -> the state after a step under the value's policy, against an adversary if any, and the step's cost."""
     step: Flow = flow(problem, dt, clipped=True)
 
     def closed(x: Array) -> tuple[Array, Scalar]:

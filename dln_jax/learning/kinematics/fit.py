@@ -23,8 +23,8 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
-"""Local minima that are refined and compared by validation: their largest number, and the largest ratio of their loss
-to the lowest."""
+"""Largest number of local minima that are refined and compared by validation, and the largest ratio of their loss to
+the lowest."""
 ROUNDS = 2
 """Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
 LEAST_NOISE = 1e-7
