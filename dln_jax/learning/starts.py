@@ -29,7 +29,7 @@ def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], 
     """
     at = jax.lax.stop_gradient(_descended(frozen, start, STEPS))
     left = residual(at.start)
-    change = left - jax.lax.stop_gradient(left)  # zero, but for its derivative
+    change = left - jax.lax.stop_gradient(left)  # zero, with the derivative of `left`
     return left - at.slope @ solve(at.slope.T @ at.slope, at.slope.T @ change)
 
 

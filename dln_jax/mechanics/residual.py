@@ -37,7 +37,9 @@ class Residual(NamedTuple):
 
 
 def with_residual(system: Any, residual: Residual) -> RecursiveSystem | LagrangianSystem | LoadedSystem:
-    """Adds energies to those of a system; behind the transmission, if load counts.
+    """Adds energies to those of a system.
+
+    In a `LoadedSystem`, potential and inertia are added behind the transmission, and dissipation before it.
 
     Args:
         system: any record of a natural system, a Lagrangian, or one of them behind transmissions.

@@ -17,7 +17,8 @@ LENGTH = 0.3
 LARGEST_STEP = 0.6
 """Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
-"""Damping, relative to the mean of the normal matrix' diagonal; at the largest, no descending step exists."""
+"""Initial, smallest and largest damping, relative to the mean of the normal matrix' diagonal; a descent ends at the
+largest."""
 FEWER, MORE = 0.2, 5.0
 """Factors of the damping after a step that descends, and after one that does not."""
 CHUNK = 10
@@ -53,7 +54,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
         step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.maximum(longest, LARGEST_STEP))
         frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
         at = project(structure, frames, samples, unit, ridge=ridge)
-        lower = at.loss < state.at.loss  # not where it is NaN
+        lower = at.loss < state.at.loss  # false for NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
         before = (state.frames, state.at)
         frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
