@@ -2,9 +2,12 @@
 
     -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   cov = K + Phi S² Phiᵀ + diag(noise²)
 
-The notation is that of `learning.kernel`. L-BFGS minimises -log p. Its gradient is sum(W dK), W = (cov⁻¹ - weights
-weightsᵀ) / 2, so that no factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine
-learning", equation 5.9).
+The notation is that of `learning.kernel`. L-BFGS minimises -log p. Its gradient is
+
+    sum(W dK),   W = (cov⁻¹ - weights weightsᵀ) / 2
+
+so that no factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning",
+equation 5.9).
 """
 
 import functools
