@@ -1,4 +1,4 @@
-"""From an energy to a controller, known or learned: tracking, regulators, swing-up, and the closed loop around them."""
+"""Controllers from known or learned energies: tracking, regulators, swing-up, and the closed loop around them."""
 
 from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
 from dln_jax.control.closed_loop import Controller, Laboratory, Run, following, simulate, stateless, with_differences

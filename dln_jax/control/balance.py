@@ -1,4 +1,4 @@
-"""Regulators on the circle: errors of angles the short way round, the switch from swing-up, and where it is safe."""
+"""Regulators on the circle: wrapped errors of angles, the switch from swing-up, and the region of attraction."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,16 +20,16 @@ Law = Callable[[Array], Array]
 
 
 class Region(NamedTuple):
-    """Around a goal, where a regulator's own value is below a level."""
+    """Region around a goal in which a regulator's own value is below a level."""
 
     level: float
-    """Of (x - x0)ᵀ S (x - x0)."""
+    """Level of (x - x0)ᵀ S (x - x0)."""
     share: float
-    """Of the starts inside that reached the goal."""
+    """Share of the tested starts that reached the goal."""
 
 
 def error(x: Array, goal: Any, joints: tuple[JointKind, ...]) -> Array:
-    """x - goal [2 d], angles the short way round."""
+    """Returns x - goal [2 d], with angles wrapped to the shorter way round."""
     off = x - jnp.asarray(goal)
     round_ = np.concatenate([np.array(joints) == "revolute", np.zeros(len(joints), bool)])
     return jnp.where(round_, jnp.arctan2(jnp.sin(off), jnp.cos(off)), off)
@@ -51,11 +51,11 @@ def value(regulator: Regulator, goal: Any, joints: tuple[JointKind, ...]) -> Cal
 
 
 def switched(far: Law, near: Law, cost: Callable[[Array], Scalar], level: Any) -> Law:
-    """`near` where the cost to go is at most the level, else `far`."""
+    """Switches to `near` where the cost to go is at most the level; `far` elsewhere."""
 
     def law(x: Array) -> Array:
         inside = cost(x) <= level
-        # Both are computed: one of them may be no number where it does not apply.
+        # Both are evaluated, and the one that does not apply may be NaN.
         return where_finite(jnp.where(inside, near(x), far(x)), x)
 
     return law
@@ -76,20 +76,20 @@ def region_of_attraction(
     starts: int = 64,
     key: Array | None = None,
 ) -> Region:
-    """The largest of some levels below which all starts, drawn on the level's surface, come to the goal by simulation.
+    """Returns the largest level below which all random starts on the level's surface reach the goal in simulation.
 
     Args:
         field: of the plant.
         law: near the goal.
-        regulator: whose S shapes the region.
+        regulator: its S shapes the region.
         goal: x0 [2 d].
         joints: kinds.
-        least: limits of the controls.
-        most: likewise.
+        least: lower limits of the controls.
+        most: upper limits of the controls.
         rate: of the samples, Hz.
-        seconds: after which the cost has to be a hundredth of the level.
+        seconds: time within which the cost has to fall to a hundredth of the level.
         levels: ascending; by default powers of ten of 10⁻³ to 10³ times the trace of S, five to a decade.
-        starts: on each surface.
+        starts: number of starts on every surface.
         key: of the starts.
     """
     require_positive(starts=starts, rate=rate, seconds=seconds)

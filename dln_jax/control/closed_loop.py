@@ -1,11 +1,11 @@
-"""The loop of a plant in continuous time and a controller at its samples, with what a laboratory does to both.
+"""Closed loop of a plant in continuous time and a sampled controller, with the effects of a laboratory on both.
 
-At each sample the controller is given the measured coordinates and answers with controls; these are limited, come late
-by whole samples, have noise added, and are held until the next while the plant is integrated by the classical
-Runge-Kutta method. `vmap` over starts and keys gives many runs in one program.
+At every sample the controller receives the measured coordinates and returns controls. They are limited, delayed by
+whole samples and noisy, and held until the next sample while the classical Runge-Kutta method integrates the plant.
+`vmap` over starts and keys simulates many runs in one program.
 
-A control that is not finite becomes NaN, one of a measurement that is not finite too, and so does everything after it:
-a failure is never hidden.
+If a control or a measurement is not finite, the controls are NaN, and so is everything after them: a failure is never
+hidden.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from dln_jax.types import InputError, require_positive
 
 
 class Controller(NamedTuple):
-    """A law with a memory, such as a filter, an observer or a plan; pure."""
+    """A control law with memory, such as a filter, an observer or a plan; pure."""
 
     start: Any
     """Memory before the first sample, any tree of arrays."""
@@ -33,21 +33,21 @@ class Controller(NamedTuple):
 
 
 class Laboratory(NamedTuple):
-    """What stands between a controller and a plant; by default nothing."""
+    """Limits, sensors, noise and delay between a controller and a plant; by default none."""
 
     least: Any = -jnp.inf
-    """Limits of the controls [m], or one for all."""
+    """Lower limits of the controls [m], or one for all."""
     most: Any = jnp.inf
     encoder_step: Any = 0.0
-    """Of the coordinates q, rad or m, which are rounded to it; 0 rounds nothing."""
+    """Resolution to which the coordinates q are rounded, rad or m; 0 for none."""
     encoder_noise: Any = 0.0
-    """Standard deviation that is added to q before, rad or m."""
+    """Standard deviation of the noise added to q before rounding, rad or m."""
     control_noise: Any = 0.0
-    """Standard deviation that is added to the controls after their limits."""
+    """Standard deviation of the noise added to the controls after limiting."""
     delay: int = 0
-    """Samples for which a control is on its way."""
+    """Delay of the controls in samples."""
     sees_rates: bool = True
-    """Whether the controller is given qd too, free of noise; else y = q."""
+    """Whether the controller also receives qd, free of noise; otherwise y = q."""
 
 
 class Run(NamedTuple):
@@ -55,20 +55,20 @@ class Run(NamedTuple):
 
     t: Float[Array, "N+1"]
     x: Float[Array, "N+1 n"]
-    """True states, the first and those at the end of each sample."""
+    """True states: the initial one and those at the ends of the samples."""
     u: Float[Array, "N m"]
-    """What drove the plant."""
+    """Controls that acted on the plant."""
     y: Float[Array, "N p"]
-    """What the controller was given."""
+    """Measurements that the controller received."""
 
 
 def stateless(law: Callable[[Array], Array]) -> Controller:
-    """A controller without a memory: y -> u."""
+    """Returns a controller without memory: y -> u."""
     return Controller((), lambda memory, t, y: (memory, law(y)))
 
 
 def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
-    """A law that follows a recorded reference, of measurements y = (q, qd).
+    """Returns a controller that follows a recorded reference, from measurements y = (q, qd).
 
     The reference is the memory of the controller, so that runs along references of one length share a program.
 
@@ -93,14 +93,15 @@ def following(law: Tracker, reference: Reference, *, rate: float) -> Controller:
 def with_differences(
     law: Callable[[Array], Array] | Controller, d: int, *, rate: float, cutoff: float, order: int = 1
 ) -> Controller:
-    """A law or controller of (q, qd) where q alone is measured: rates by differences and a low-pass of first order.
+    """Estimates the rates for a law of (q, qd) from measurements of q: differences and a first-order low-pass.
 
     Args:
-        law: (q, qd) in one vector [2 d] -> u, or a controller that is given such.
-        d: coordinates.
+        law: (q, qd) in one vector [2 d] -> u, or a controller with such measurements.
+        d: number of coordinates.
         rate: of the samples, Hz.
         cutoff: of the low-pass, Hz.
-        order: of the differences; 1 is late by half a sample, 2 is not, and takes more of the encoders' noise.
+        order: of the differences; order 1 is late by half a sample, order 2 is not but amplifies the encoders' noise
+            more.
 
     Raises:
         InputError: a rate or a cut-off that is not positive, or another order.
@@ -114,7 +115,7 @@ def with_differences(
     def act(memory: tuple, t: Array, y: Array) -> tuple[tuple, Array]:
         (before, slope, qd, seen), inner = memory
         newest = y - before
-        # Of the first sample there is no difference, of the second no other.
+        # The first sample has no difference, and the second no earlier one.
         rates = rate * (1.5 * newest - 0.5 * jnp.where(seen > 1, slope, newest) if order == 2 else newest)
         qd = jnp.where(seen > 0, qd + share * (rates - qd), 0.0)
         inner, u = controller.act(inner, t, jnp.concatenate([y, qd]))
@@ -135,18 +136,18 @@ def simulate(
     key: Array | None = None,
     substeps: int = 1,
 ) -> Run:
-    """A run of the closed loop from a state, traceable and differentiable.
+    """Simulates the closed loop from a state; traceable and differentiable.
 
     Args:
         field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
-        controller: asked once a sample.
-        x: the start [2 d].
-        seconds: of the run.
+        controller: called once per sample.
+        x: initial state [2 d].
+        seconds: duration of the run.
         rate: of the samples, Hz.
         controls: m.
         laboratory: limits, noise, delay.
-        key: of the noise; needed where there is any.
-        substeps: of the integrator in a sample.
+        key: of the noise; required if there is any.
+        substeps: integrator steps per sample.
 
     Raises:
         InputError: settings out of range, or noise without a key.
@@ -173,7 +174,7 @@ def simulate(
 
 
 def noise_of(laboratory: Laboratory, key: Array | None) -> Array:
-    """The key, or any where there is no noise; `InputError` for noise without a key, or a delay that is none."""
+    """Returns the key, or any key without noise; raises `InputError` for noise without a key, or an invalid delay."""
     delay = laboratory.delay
     if delay < 0 or delay != int(delay):
         raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
@@ -183,7 +184,7 @@ def noise_of(laboratory: Laboratory, key: Array | None) -> Array:
 
 
 def measured(laboratory: Laboratory, x: Array, key: Array) -> Array:
-    """What a controller is given of a state (q, qd)."""
+    """Measurement of a state (q, qd) that the controller receives."""
     q, qd = jnp.split(x, 2)
     if _noisy(laboratory):
         q = q + laboratory.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
@@ -192,7 +193,7 @@ def measured(laboratory: Laboratory, x: Array, key: Array) -> Array:
 
 
 def delivered(laboratory: Laboratory, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
-    """What drives the plant when a controller wants this, and the controls [delay, m] that are then on their way."""
+    """Returns the controls that act now, and the queue [delay, m] of delayed controls after adding the wanted ones."""
     queue = jnp.concatenate([waiting, limited(wanted, laboratory.least, laboratory.most)[None]])
     u = queue[0]
     if _noisy(laboratory):
@@ -206,6 +207,6 @@ def _noisy(laboratory: Laboratory) -> bool:
 
 
 def rounded(q: Array, step: Any) -> Array:
-    """The reading of an encoder of this step."""
+    """Reading of an encoder with this resolution."""
     step = jnp.asarray(step)
     return jnp.where(step > 0, step * jnp.round(q / jnp.where(step > 0, step, 1.0)), q)

@@ -1,4 +1,4 @@
-"""Measurements that come late: how late is seen when the system first moves; a model predicts what has come since."""
+"""Compensates delayed measurements: detects the delay from the first motion, and predicts the present state."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,20 +13,20 @@ from dln_jax.types import require_positive
 
 
 class Late(NamedTuple):
-    """Memory of a controller that predicts."""
+    """Memory of a controller with prediction."""
 
     inner: object
-    """Of the controller that is asked."""
+    """Memory of the inner controller."""
     past: Float[Array, "most m"]
-    """Controls, the newest first."""
+    """Past controls, newest first."""
     first: Float[Array, " p"]
-    """Measurement."""
+    """First measurement."""
     acted: Int[Array, ""]
-    """Samples since the first control that was not zero, that one included; 0 before it."""
+    """Samples since the first non-zero control, including its own; 0 before it."""
     delay: Int[Array, ""]
-    """Samples by which measurements are late, as far as is known."""
+    """Current estimate of the measurements' delay in samples."""
     moved: Bool[Array, ""]
-    """Whether the system was seen to move, from when on the delay stays."""
+    """Whether motion was detected; the delay is fixed from then on."""
     seen: Bool[Array, ""]
 
 
@@ -39,20 +39,20 @@ def with_prediction(
     most: int,
     threshold: float = 0.0,
 ) -> Controller:
-    """A controller that is asked about the state of now, where measurements are late by a number of samples.
+    """Wraps a controller for measurements that are late by an unknown number of samples: it acts on predictions.
 
-    The system starts at rest. From the first control that is not zero to the first measurement of motion there is one
-    sample and the delay; until then, what was asked for so far is predicted from rest. A system that moves by itself
-    before, or sooner than its controls say, is taken not to be late.
+    The system starts at rest. From the first non-zero control to the first measured motion there are one sample and the
+    delay; until then the state is predicted from rest with all controls so far. If the system moves before its controls
+    can explain it, the delay counts as zero.
 
     Args:
         controller: of measurements of the whole state [n].
         step: (x, u) -> x a sample later, of a model.
         states: n.
         controls: m.
-        most: samples of delay that may be.
-        threshold: of a measurement's change, in its largest coordinate, above which it is motion, such as some steps of
-            an encoder.
+        most: largest possible delay in samples.
+        threshold: smallest change of a measurement that counts as motion, in its largest coordinate, for example some
+            steps of an encoder.
 
     Raises:
         InputError: a number that is not positive.

@@ -1,4 +1,4 @@
-"""Two plants as they stand on a laboratory's desk: friction, limits, encoders, noise and a delay; in one place.
+"""Two laboratory plants: friction, limits, encoders, noise and delay, defined in one place.
 
 | | cart-pole | rotary pendulum |
 |---|---|---|
@@ -11,7 +11,7 @@
 | encoders | 23 µm; 2048 a turn | 2048 a turn |
 | noise of the force | 0.05 N | 0.25 mN m |
 
-Both at 500 Hz, with forces that come a sample late. Stiction is dry friction below 5 mm/s or 10 mrad/s.
+Both run at 500 Hz, with forces delayed by one sample. Stiction is dry friction below 5 mm/s or 10 mrad/s.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,31 +30,31 @@ from dln_jax.scenes.scene import Scene
 from dln_jax.types import InputError
 
 TURN = 2 * np.pi / 2048
-"""rad, of an encoder."""
+"""Resolution of an encoder, rad."""
 
 
 class DesktopPlant(NamedTuple):
-    """A plant with one motor and one free pole that is to stand up, and what is between it and a controller."""
+    """A plant with one motor and one free pole to swing up, and its laboratory."""
 
     scene: Scene
-    """With the friction that the plant has."""
+    """Scene with the plant's friction."""
     makers: Callable[..., Scene]
-    """The maker's model, without friction, by its sizes."""
+    """Builds the manufacturer's model, without friction, from its sizes."""
     sizes: Mapping[str, float]
-    """Masses in kg and lengths in m as they are."""
+    """True masses in kg and lengths in m."""
     laboratory: Laboratory
     rate: float
-    """Of the controller's samples, Hz."""
+    """Sampling rate of the controller, Hz."""
     substeps: int
-    """Of the integrator in a sample, so many that stiction is resolved."""
+    """Integrator steps per sample, enough to resolve stiction."""
     numbers: SwingUpNumbers
-    """Of its swing-up, chosen by the analytic model (`scripts.reports.control.swing_up_gains`)."""
+    """Numbers of its swing-up, tuned on the analytic model (`scripts.reports.control.swing_up_gains`)."""
     position: float
-    """Standard deviation of the driven coordinate where runs start, m or rad."""
+    """Standard deviation of the driven coordinate's initial value, m or rad."""
 
 
 def desktop_cart_pole() -> DesktopPlant:
-    """Cart on a rail."""
+    """Returns a cart on a rail."""
     sizes = {"cart_mass": 0.57, "pole_mass": 0.127, "length": 0.16825}
     friction = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
     shape = FrictionShape(velocity_scale=(0.005, 0.01), stribeck_velocity=(0.05, 0.1))
@@ -72,7 +72,7 @@ def desktop_cart_pole() -> DesktopPlant:
 
 
 def desktop_rotary_pendulum() -> DesktopPlant:
-    """Arm on a motor's shaft."""
+    """Returns a pendulum on the arm of a motor's shaft."""
     sizes = {"arm_mass": 0.095, "arm_length": 0.085, "pole_mass": 0.024, "pole_length": 0.129}
     friction = FrictionCoefficients(viscous=(1e-4, 1e-5), coulomb=(1.5e-3, 5e-5), stribeck=(5e-4, 2e-5))
     shape = FrictionShape(velocity_scale=(0.01, 0.01), stribeck_velocity=(0.1, 0.1))
@@ -94,11 +94,11 @@ PLANTS: Mapping[str, Callable[[], DesktopPlant]] = {
     "rotary-pendulum": desktop_rotary_pendulum,
 }
 NAMES = {**{name: name for name in PLANTS}, "furuta": "rotary-pendulum"}
-"""Also those by which a plant is known otherwise."""
+"""Names of the plants, with their aliases."""
 
 
 def desktop_plant(name: str) -> DesktopPlant:
-    """The plant of a name; `InputError` lists the names."""
+    """Returns the plant of this name; `InputError` lists the names."""
     if name not in NAMES:
         raise InputError(f"plant is {name!r:.40}; choose from {', '.join(NAMES)}")
     return PLANTS[NAMES[name]]()

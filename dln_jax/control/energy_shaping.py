@@ -1,12 +1,12 @@
 """Swing-up by energy, for systems with passive joints (Spong 1995, "The swing up control problem for the acrobot").
 
-Collocated partial feedback linearisation gives the active joints any acceleration a; the passive rows of the equations
-of motion, which no motor touches, give the other accelerations. With h = c + g + friction,
+Collocated partial feedback linearisation gives the active joints any acceleration a. The passive rows of the equations
+of motion, without motors, determine the other accelerations. With h = c + g + friction,
 
     qdd_p = -M_pp⁻¹ (M_pa a + h_p),   tau_a = M_aa a + M_ap qdd_p + h_a
 
-The passive part, with the active joints held, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active joints
-does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
+The passive part, with the active joints locked, has the energy E = ½ qd_pᵀ M_pp qd_p + V. Accelerating the active
+joints does work on it at the rate -qd_pᵀ M_pa a, so that a = k (E - E*) M_ap qd_p drives E to that of the goal.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +23,10 @@ from dln_jax.types import InputError, Scalar, Vector
 
 
 class EnergyGains(NamedTuple):
-    """Of the accelerations of the active joints."""
+    """Gains of the accelerations of the active joints."""
 
     energy: float
-    """1/(kg m² J s) for revolute joints: from M_ap qd_p and the energy's error to an acceleration."""
+    """1/(kg m² J s) for revolute joints; maps M_ap qd_p times the energy's error to an acceleration."""
     proportional: float
     """1/s²."""
     derivative: float
@@ -34,14 +34,14 @@ class EnergyGains(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Which coordinates are driven and which are not."""
+    """Indices of the driven and of the passive coordinates."""
 
     active: tuple[int, ...]
     passive: tuple[int, ...]
 
 
 def parts_of(actuation: Any) -> Parts:
-    """From the matrix [d, u] in tau = B u, each of whose motors drives one coordinate.
+    """Derives the parts from the matrix [d, u] in tau = B u, if every motor drives one coordinate.
 
     Raises:
         InputError: motors that drive several coordinates, or no passive one.
@@ -71,7 +71,7 @@ def partial_linearisation(plant: Dynamics, parts: Parts) -> Callable[[Vector, Ve
 
 
 def passive_energy(plant: Dynamics, parts: Parts, goal: Any) -> Callable[[Vector, Vector], Scalar]:
-    """(q, qd) -> energy of the passive part with the active joints held at the goal, J, less that at the goal."""
+    """(q, qd) -> energy of the passive part in J, with the active joints locked at the goal, relative to the goal."""
     active, passive = map(np.array, parts)
     goal = jnp.asarray(goal, float)
 
@@ -91,14 +91,14 @@ def energy_shaping(
     *,
     surplus: Any = 0.0,
 ) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces of the active joints that bring the passive ones to the energy of the goal, and theirs home.
+    """(q, qd) -> forces that bring the passive joints to the goal's energy, and the active joints to the goal.
 
     Args:
-        plant: a model with energies, known or learned; friction that it has is compensated at the active joints.
-        parts: which joints are driven.
+        plant: a known or learned model with energies; its friction is compensated at the active joints.
+        parts: driven and passive joints.
         goal: posture [d].
         gains: of the accelerations.
-        surplus: J above the goal's energy that the passive joints are driven to, which makes up for what they lose.
+        surplus: target energy of the passive joints above that of the goal, J, which compensates their losses.
 
     Raises:
         InputError: a model without energies.

@@ -1,6 +1,6 @@
-"""A plant in its laboratory as a `gymnasium.Env`, for those who train controllers by other means (extra `[rl]`).
+"""A plant in its laboratory as a `gymnasium.Env`, for training controllers with other libraries (extra `[rl]`).
 
-NumPy in float32, actions in [-1, 1], which are the limits of the controls; the loop is that of `simulate`.
+NumPy in float32; actions in [-1, 1] are scaled to the limits of the controls. The loop is that of `simulate`.
 """
 
 from collections.abc import Callable
@@ -21,32 +21,32 @@ from dln_jax.types import InputError, JointKind, Scalar, require_positive
 class _Place(NamedTuple):
     x: Array
     waiting: Array
-    """[delay, m], controls on their way."""
+    """[delay, m], delayed controls."""
     number: Array
 
 
 class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One plant: an action in [-1, 1] per control spans its limits, the reward is minus the cost of the sample.
+    """Environment of one plant: actions in [-1, 1] span the controls' limits, the reward is minus the sample's cost.
 
-    What is observed is what the laboratory measures, of revolute joints the cosine and sine. An episode is truncated
-    after its seconds. It is terminated where the state is no longer finite: `info["failed"]` is then true, the
+    Observations are the measurements of the laboratory, with cosine and sine for revolute joints. An episode is
+    truncated after `seconds`. It is terminated if the state is not finite: `info["failed"]` is then true, the
     observation is the last finite one, and the reward is minus the cost of a failure. `info["x"]` is the true state,
-    `info["u"]` what drove it.
+    `info["u"]` the acting control.
 
     Args:
         field: of the plant, (x, u) -> dx/dt, on x = (q, qd).
         cost: (x, u) -> cost per second at the start of a sample.
-        start: key of jax.random -> x [2 d], drawn anew at each reset.
+        start: key of jax.random -> x [2 d], drawn anew at every reset.
         joints: their kinds [d].
-        seconds: of an episode.
+        seconds: duration of an episode.
         rate: of the samples, Hz.
-        laboratory: whose limits are finite, one for each control or one for all.
+        laboratory: with finite limits, one per control or one for all.
         controls: m.
-        substeps: of the integrator in a sample.
-        failure_cost: of a state that is not finite; expected to be above what is left to pay elsewhere.
+        substeps: integrator steps per sample.
+        failure_cost: cost of a state that is not finite; it should exceed the remaining cost of any other episode.
 
     Raises:
-        InputError: settings that are not positive, limits that are not finite, or a delay that is none.
+        InputError: settings that are not positive, limits that are not finite, or an invalid delay.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
-        """The observation of a start that is drawn; the seed determines it, and all noise after it."""
+        """Draws an initial state and returns its observation; the seed determines it and all later noise."""
         super().reset(seed=seed, options=options)
         self._key = jax.random.key(int(self.np_random.integers(2**32)))
         self._place, seen = self._begin(self._key)
@@ -112,7 +112,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(
         self, action: Float[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
-        """Observation, reward, terminated, truncated and `info`; `InputError` before the first reset."""
+        """Returns observation, reward, terminated, truncated and `info`; raises `InputError` before the first reset."""
         if self._place is None:
             raise InputError("the environment has no state; call reset before step")
         after, seen, cost, u = self._advance(self._key, self._place, np.asarray(action, float))
@@ -125,11 +125,11 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def register(name: str, make: Callable[[], PlantEnvironment]) -> None:
-    """Lets `gymnasium.make(name)` call `make`; nothing is registered before it is asked for.
+    """Registers `make` with Gymnasium, so that `gymnasium.make(name)` calls it; nothing is registered by default.
 
     Args:
-        name: as Gymnasium has them, such as "dln_jax/CartPole-v0".
-        make: the environment.
+        name: in Gymnasium's form, such as "dln_jax/CartPole-v0".
+        make: builds the environment.
     """
     if name not in gymnasium.registry:
         gymnasium.register(id=name, entry_point=lambda **options: make(**options))

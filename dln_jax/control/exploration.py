@@ -1,7 +1,7 @@
-"""Motions to learn a plant from, in its laboratory: an energy law by a rough model, and smooth noise beside it.
+"""Exploratory motions of a plant in its laboratory: an energy law from a rough model, plus smooth noise.
 
-What is recorded is what a laboratory has: the encoders' readings and the torques that were asked for, which came late
-and with noise. Rates and accelerations are for `data.encoders` to find.
+A recording holds what a laboratory measures: the encoders' readings and the commanded torques, before delay and noise.
+`data.encoders` estimates rates and accelerations.
 """
 
 from typing import Any, NamedTuple
@@ -25,24 +25,24 @@ from dln_jax.types import require_positive, require_seed
 
 
 class Excitation(NamedTuple):
-    """How a plant is explored."""
+    """Settings of an exploration."""
 
     seconds: float = 30.0
-    """Of all episodes together."""
+    """Total duration of all episodes."""
     episodes: int = 5
     wrong: float = 0.25
-    """Relative deviation of the rough model's sizes from the true ones, up or down at random."""
+    """Relative error of the rough model's sizes, up or down at random."""
     surplus: tuple[float, float] = (-0.5, 1.0)
-    """Energies that the first and the last episode drive the pole to, above that of the goal, as shares of what lifts
-    it from hanging by the rough model; those between are in between."""
+    """Energies to which the first and the last episode drive the pole, above that of the goal, as shares of the energy
+    that lifts it from hanging in the rough model; those of the other episodes are interpolated."""
     noise: float = 0.3
     """Standard deviation of the smooth noise, as a share of the limits."""
     bandwidth: float = 3.0
-    """Of it, Hz."""
+    """Bandwidth of the noise, Hz."""
     share: float = 0.8
-    """Of the limits, that is used at most."""
+    """Largest share of the limits that is used."""
     cutoff: float = 50.0
-    """Of the rates that the law is given, Hz."""
+    """Cut-off frequency of the law's rates, Hz."""
 
 
 def smooth_noise(
@@ -54,8 +54,8 @@ def smooth_noise(
 
 
 def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controller:
-    """A law of (q, qd), whose rates are differences of q, with noise [N, m] added sample by sample."""
-    # The noise is a part of the memory, so that a batch of controllers is a batch of memories.
+    """Wraps a law of (q, qd), with rates from differences of q, and adds noise [N, m] sample by sample."""
+    # The noise is part of the memory, so that a batch of controllers is a batch of memories.
     inner = with_differences(law, 2, rate=rate, cutoff=cutoff)
 
     def act(memory: Any, t: Array, y: Array) -> tuple[Any, Array]:
@@ -67,7 +67,7 @@ def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controlle
 
 
 def commands(controller: Controller, run: Run, laboratory: Laboratory) -> Float[Array, "N m"]:
-    """What the controller asked for in a run, within the limits: it is asked again, by what it was given."""
+    """Commands of the controller in a run, within the limits, recomputed from its measurements."""
 
     def ask(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
         memory, wanted = controller.act(memory, *now)
@@ -83,12 +83,12 @@ def explore(
     *,
     seed: int = 0,
 ) -> tuple[Trajectories, Run]:
-    """A recording of q and of the torques asked for, t and no rates; and the true runs, for who wants to judge by them.
+    """Returns a recording of t, q and the commanded torques, without rates, and the true runs for evaluation.
 
     Args:
-        plant: in its laboratory; also the true one, whose friction the rough model knows nothing of.
+        plant: in its laboratory; the true plant, with friction that the rough model lacks.
         gains: of the energy law, whose goal is the upright pole.
-        excitation: how long and how.
+        excitation: settings.
         seed: of the rough model, the noise, the starts and the laboratory.
 
     Raises:
@@ -132,7 +132,7 @@ def explore(
 
 
 def recording(runs: Run, tau: Float[np.ndarray, "E N d"], plant: DesktopPlant) -> Trajectories:
-    """Episodes as one log of q and torques, with the needs of the plant's makers: no friction is promised."""
+    """Joins episodes into one log of q and torques, with the needs of the manufacturer's model: without friction."""
     episodes, samples, d = runs.y.shape
     q = np.asarray(runs.y).reshape(-1, d)
     absent = np.full_like(q, np.nan)

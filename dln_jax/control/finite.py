@@ -1,4 +1,4 @@
-"""What a controller answers where its state is no number: none."""
+"""Controls of states that are not finite: NaN."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ from jax import Array
 
 
 def where_finite(u: Array, *state: Any) -> Array:
-    """The controls [m] of a finite state; of any other, NaN in every motor, for whoever holds the brake.
+    """Returns the controls [m] for a finite state, and NaN in every motor otherwise, for whoever handles the failure.
 
-    A law of some coordinates alone would answer with numbers where others are none, and limits make a number of what is
-    infinite.
+    Without it, a law of some coordinates only would return numbers while others are NaN, and limits would turn
+    infinities into numbers.
     """
     finite = jnp.asarray(True)
     for each in state:

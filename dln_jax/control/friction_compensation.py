@@ -1,13 +1,13 @@
-"""Friction apart from a model's other forces, and its compensation at the joints that have motors.
+"""Separates friction from a model's other forces, and compensates it at the joints that have motors.
 
-Dry friction jumps where a joint turns round, where a measured rate is noise alone. With r = √(u² + s²) > |u|, the
+Dry friction jumps when a joint reverses, where a measured rate is mostly noise. With r = √(u² + s²) > |u|, the
 compensation of a joint at rate u is
 
     gain (w F(r) + (1 - w) F(-r)),   w = (1 + u / r) / 2
 
-F(u) at rates well above the smoothing rate s, and a straight line through rest below, with as much as friction has at
-s: no jump, and no work at rest. With a gain below 1 friction is never made up for entirely, so that no joint is driven
-by it.
+This equals F(u) at rates well above the smoothing rate s. Below, it is a straight line through rest with the magnitude
+of friction at s: no jump, and no work at rest. A gain below 1 never compensates all friction, so that it cannot drive a
+joint.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,13 +21,13 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError, Vector, require_positive
 
 GAIN = 0.9
-"""Share of the friction that is made up for."""
+"""Share of the friction that is compensated."""
 
 
 def without_friction(plant: Dynamics) -> Dynamics:
-    """The same energies without the friction, whose slope at rest no linearisation should have.
+    """Removes the friction, whose slope at rest a linearisation should not contain; the energies stay.
 
-    Of a system whose friction adds to its other forces, as all have but those with load in their transmissions.
+    It requires friction that adds to the other forces, which holds for all systems without load in their transmissions.
     """
     return plant._replace(
         inverse_dynamics=lambda q, qd, qdd: plant.inverse_dynamics(q, qd, qdd) - plant.friction(q, qd),
@@ -39,12 +39,12 @@ def without_friction(plant: Dynamics) -> Dynamics:
 def friction_compensation(
     plant: Dynamics, active: Sequence[int], *, smoothing: Any, gain: float = GAIN
 ) -> Callable[[Vector, Vector], Array]:
-    """(q, qd) -> forces of the active joints that make up for a share of their friction; qd measured or wanted.
+    """(q, qd) -> forces of the active joints that compensate a share of their friction; qd measured or wanted.
 
     Args:
         plant: with friction, known or learned.
         active: joints with a motor.
-        smoothing: s, rad/s or m/s, one for each active joint or one for all: some times the noise of a measured rate.
+        smoothing: s, rad/s or m/s, one per active joint or one for all: some times the noise of a measured rate.
         gain: share of the friction, above 0 and at most 1.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Whether a loop may be closed through a model, judged by motions that it was not fitted to.
+"""Decides whether a loop may be closed through a model, from motions that it was not fitted to.
 
-A box about the training data does not tell: within it, a network that was trained on too little is as wrong as outside.
+A box around the training data is no such test: inside it, a network trained on too little data is as wrong as outside.
 """
 
 from typing import NamedTuple
@@ -16,29 +16,28 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import require_positive
 
 MOST = 0.1
-"""Of a joint's torques, in their square, that a model may leave unexplained."""
+"""Largest nMSE of a joint's torques: the share of their variance that the model may leave unexplained."""
 
 
 class Judgement(NamedTuple):
-    """Of a model."""
+    """Verdict on a model."""
 
     usable: bool
     line: str
-    """Which says why."""
+    """The reason, in a sentence."""
     nmse: Float[np.ndarray, " d"]
-    """Of each joint's torques: mean squared error over their variance."""
+    """Mean squared errors of the joints' torques over their variances."""
     definite: float
     """Share of the states in which the mass matrix is positive definite."""
 
 
 def judged(plant: Dynamics, held_out: Trajectories, *, most: float = MOST) -> Judgement:
-    """Whether a model explains held-out torques, with a mass matrix that is definite all along.
+    """Decides whether a model explains held-out torques, with a positive definite mass matrix in all states.
 
     Args:
         plant: the model.
-        held_out: motions that it was not fitted to, of the kind that is to be followed; joints whose torques do not
-            vary count for nothing.
-        most: nMSE of the worst joint, at most.
+        held_out: motions like those to follow, not used in the fit; joints with constant torques do not count.
+        most: largest nMSE of the worst joint.
     """
     require_positive(most=most)
     q, qd, qdd = (jnp.asarray(each) for each in (held_out.q, held_out.qd, held_out.qdd))
@@ -47,7 +46,7 @@ def judged(plant: Dynamics, held_out: Trajectories, *, most: float = MOST) -> Ju
     variance = np.var(held_out.tau, axis=0)
     moved = variance > 0
     nmse = np.mean((tau - held_out.tau) ** 2, axis=0) / np.where(moved, variance, np.nan)
-    # What is no number is worse than any.
+    # An error that is not finite is the worst.
     worst = int(np.argmax(np.where(moved, np.where(np.isfinite(nmse), nmse, np.inf), -1.0)))
     usable = bool(nmse[worst] <= most) and share == 1.0
     if share < 1:

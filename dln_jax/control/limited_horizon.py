@@ -3,8 +3,8 @@
     min  sum_k gᵀ (dx_k, du_k) + ½ (dx_k, du_k)ᵀ H (dx_k, du_k) + end,   dx_0 = 0
          dx_{k+1} = F (dx_k, du_k) + d_k,   low <= du_k <= high
 
-A primal-dual method whose linear systems are Riccati recursions (Rao, Wright and Rawlings 1998): limits add
-z / s to the controls' Hessian, s being the distance from a limit and z its multiplier, and s z goes to zero.
+A primal-dual method whose linear systems are Riccati recursions (Rao, Wright and Rawlings 1998). A limit adds z / s to
+the controls' Hessian, with s the distance from the limit and z its multiplier; s z tends to zero.
 """
 
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from dln_jax.solvers.elimination import solve
 from dln_jax.solvers.lapack import cholesky
 
 CENTRING = 0.1
-"""Of s z, what a step aims at."""
+"""Target of a step for s z, relative to its present value."""
 SHORT_OF_LIMITS = 0.995
-"""Of the step that would come to a limit."""
+"""Length of a step, relative to the longest one within the limits."""
 SMALL = 1e-11
-"""Of the first s z, at which it ends."""
+"""The method ends when s z is below this share of its first value."""
 MOST_STEPS = 60
 
 
@@ -36,19 +36,19 @@ class Horizon(NamedTuple):
     end_gradient: Float[Array, " n"]
     end_curvature: Float[Array, "n n"]
     low: Float[Array, "N m"]
-    """Infinite where there is no limit; negative, and `high` positive, or zero."""
+    """Infinite without a limit; negative or zero, and `high` positive or zero."""
     high: Float[Array, "N m"]
 
 
 class Solution(NamedTuple):
-    """Where it is least; not finite where it has no minimum."""
+    """Minimiser; not finite if there is no minimum."""
 
     dx: Float[Array, "N+1 n"]
     du: Float[Array, "N m"]
     K: Float[Array, "N m n"]
-    """Of the controls with the state, nothing where a limit holds one."""
+    """Feedback of the controls from the state, zero where a limit is active."""
     multipliers: Float[Array, "N n"]
-    """Slope of the cost to go with dx_{k+1}."""
+    """Derivative of the cost to go by dx_{k+1}."""
 
 
 class _Point(NamedTuple):
@@ -60,7 +60,7 @@ class _Point(NamedTuple):
 
 
 def least_cost(horizon: Horizon) -> Solution:
-    """The solution, traceable."""
+    """Returns the solution; traceable."""
     low, high = horizon.low, horizon.high
     finite = jnp.isfinite(low), jnp.isfinite(high)
     limits = jnp.maximum(jnp.sum(finite[0]) + jnp.sum(finite[1]), 1)
@@ -76,7 +76,7 @@ def least_cost(horizon: Horizon) -> Solution:
     def step(point: _Point) -> _Point:
         dx, du, below, above = *point.solution[:2], point.below, point.above
         under, over, aim = du - low, high - du, CENTRING * point.product
-        # About the point, since the weights of controls at their limits exceed all else by ten orders.
+        # About the present point, because the weights of controls at their limits exceed all else by ten orders.
         found = _recursion(_about(horizon, dx, du), aim / over - aim / under, below / under + above / over)
         change = found.du
         of_below, of_above = (aim - below * change) / under - below, (aim + above * change) / over - above
@@ -98,7 +98,7 @@ def least_cost(horizon: Horizon) -> Solution:
 
 
 def _about(horizon: Horizon, dx: Array, du: Array) -> Horizon:
-    """The program of further changes."""
+    """Returns the program of changes about a point."""
     both = jnp.concatenate([dx[:-1], du], axis=1)
     return horizon._replace(
         missed=jnp.zeros_like(horizon.missed),
@@ -108,7 +108,7 @@ def _about(horizon: Horizon, dx: Array, du: Array) -> Horizon:
 
 
 def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
-    """The minimum without limits, of the program with ½ weight du² + gradient du beside it."""
+    """Returns the minimum without limits of the program plus ½ weight du² + gradient du."""
     n = horizon.missed.shape[1]
 
     def back(value: tuple[Array, Array], now: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
@@ -119,7 +119,7 @@ def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
         both = -solve(Quu, jnp.concatenate([qu[:, None], Qux], axis=1))
         k, K = both[:, 0], both[:, 1:]
         before = Q[:n, :n] + Qux.T @ K
-        # Where there is no minimum, there is no solution.
+        # NaN unless the problem is convex.
         convex = jnp.isfinite(cholesky(Quu)).all()
         return (q[:n] + Qux.T @ k, jnp.where(convex, (before + before.T) / 2, jnp.nan)), (k, K, g, S)
 
@@ -139,7 +139,7 @@ def _recursion(horizon: Horizon, gradient: Array, weight: Array) -> Solution:
 
 
 def _followed(horizon: Horizon, du: Array) -> Array:
-    """States of some controls."""
+    """States that follow from the controls."""
 
     def forth(dx: Array, now: tuple[Array, ...]) -> tuple[Array, Array]:
         F, missed, du = now

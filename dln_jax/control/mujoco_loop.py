@@ -1,4 +1,4 @@
-"""The closed loop around a plant that MuJoCo simulates, which shares no equation with ours (extra `[robot]`)."""
+"""Closed loop with a plant simulated by MuJoCo, which shares no equation with this library (extra `[robot]`)."""
 
 import importlib
 from typing import Any
@@ -27,23 +27,23 @@ def simulate_in_mujoco(
     laboratory: Laboratory = Laboratory(),  # noqa: B008
     key: Array | None = None,
 ) -> Run:
-    """As `simulate`, in MuJoCo: one run, sample by sample, by the model's own integrator and time step.
+    """Simulates one run as `simulate` does, sample by sample, with MuJoCo's integrator and time step.
 
-    After a control that is not finite, and where MuJoCo warns that it diverges, all is NaN.
+    After a control that is not finite, or MuJoCo's warning of divergence, all is NaN.
 
     Args:
-        model: the text of an MJCF file, such as `data.mjcf` writes of a tree, or a `mujoco.MjModel`.
-        controller: asked once a sample.
-        x: the start (q, qd) [2 d], in MuJoCo's order of joints.
-        seconds: of the run.
-        rate: of the samples, Hz; a sample has a whole number of MuJoCo's steps.
+        model: the text of an MJCF file, for example of a tree from `data.mjcf`, or a `mujoco.MjModel`.
+        controller: called once per sample.
+        x: initial (q, qd) [2 d], in MuJoCo's order of joints.
+        seconds: duration of the run.
+        rate: of the samples, Hz; a sample is a whole number of MuJoCo's steps.
         actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
-        laboratory: limits, noise, delay; the model's own limits hold too.
-        key: of the noise; needed where there is any.
+        laboratory: limits, noise, delay; the model's own limits also apply.
+        key: of the noise; required if there is any.
 
     Raises:
-        InputError: MuJoCo is missing or refuses the model, whose joints are not all hinges and slides; a start of
-            another size; samples that are no whole number of steps; settings as for `simulate`.
+        InputError: MuJoCo is missing or refuses the model; joints that are not hinges or slides; an initial state of
+            another size; a sample that is not a whole number of steps; settings as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
     key = noise_of(laboratory, key)
@@ -77,8 +77,8 @@ def simulate_in_mujoco(
 
 
 def _advanced(mujoco: Any, model: Any, data: Any, control: np.ndarray, steps: int) -> np.ndarray:
-    """The state after a sample, NaN where there is none."""
-    # MuJoCo replaces what is not finite, and begins anew where it diverges: both would hide a failure.
+    """Returns the state after a sample, or NaN after a failure."""
+    # MuJoCo replaces values that are not finite, and resets when it diverges: both would hide a failure.
     if np.isfinite(control).all() and np.isfinite(data.qpos).all():
         data.ctrl[:] = control
         with quiet(mujoco):

@@ -1,4 +1,4 @@
-"""What came of many runs: when the pole was up for good, and which ended in no number."""
+"""Outcomes of many runs: the time at which the pole stays upright, and runs that failed."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,30 +7,30 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 UP = 0.1
-"""rad, within which a pole is up."""
+"""Angle in rad below which a pole counts as upright."""
 
 
 class Outcomes(NamedTuple):
-    """Of n runs."""
+    """Outcomes of n runs."""
 
     seconds: Float[np.ndarray, " n"]
-    """From when on the pole is up until the end, s; infinite where it is not."""
+    """Time in s after which the pole stays upright until the end; infinite if it does not."""
     failed: Bool[np.ndarray, " n"]
-    """Whether a run ended in no number, which is counted as not up too."""
+    """Whether a run contains values that are not finite; such values do not count as upright."""
 
     @property
     def share(self) -> float:
-        """Of runs that are up."""
+        """Share of the runs that end upright."""
         return float(np.mean(np.isfinite(self.seconds)))
 
     @property
     def median(self) -> float:
-        """Of the times of those that are up, s; infinite where none is."""
+        """Median time of the runs that end upright, s; infinite if none does."""
         return self._of_reached(np.median)
 
     @property
     def worst(self) -> float:
-        """Likewise, the longest."""
+        """Longest time of the runs that end upright, s; infinite if none does."""
         return self._of_reached(np.max)
 
     def _of_reached(self, statistic: Callable[..., Any]) -> float:
@@ -39,9 +39,9 @@ class Outcomes(NamedTuple):
 
 
 def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
-    """Of a pole's angles from upright [n, N+1], rad, at the samples of each run.
+    """Evaluates a pole's angles from upright [n, N+1], rad, at the samples of the runs.
 
-    An angle that is no number is not up, and neither is whatever follows it.
+    An angle that is not finite does not count as upright.
     """
     angle = np.asarray(angle)
     near = np.cos(angle) > np.cos(up)  # NaN is not
@@ -51,13 +51,13 @@ def outcomes(angle: Any, *, rate: float, up: float = UP) -> Outcomes:
 
 
 def hanging_starts(count: int, seed: int, *, position: float, angle: float = 0.1) -> Float[np.ndarray, "n 4"]:
-    """States (position, angle from upright, rates) of a pole that hangs at rest, all but: normal deviations from it.
+    """Random states (position, angle from upright, rates) near a pole hanging at rest, with normal deviations.
 
     Args:
         count: n.
         seed: of the draw.
         position: standard deviation of the driven coordinate, m or rad.
-        angle: that of the pole from hanging, rad.
+        angle: standard deviation of the pole from hanging, rad.
     """
     random = np.random.default_rng(seed)
     x = np.zeros((count, 4))

@@ -2,8 +2,8 @@
 
     J = integral (x - x0)ᵀ Q (x - x0) + (u - u0)ᵀ R (u - u0) dt,   u = u0 - K (x - x0),   J(x) = (x - x0)ᵀ S (x - x0)
 
-Riccati equations of constant matrices are solved by SciPy (`scipy.linalg.solve_continuous_are`), which is imported
-when they are; the backward recursion of a trajectory is ours, and differentiable.
+SciPy solves the Riccati equations of constant matrices (`scipy.linalg.solve_continuous_are`, imported on use); the
+backward recursion along a trajectory is our own, and differentiable.
 """
 
 from typing import Any, NamedTuple
@@ -26,14 +26,14 @@ class Regulator(NamedTuple):
 
 
 class SampledRegulators(NamedTuple):
-    """One for each step of a trajectory, and the cost to go at each and at its end."""
+    """Regulators of the steps of a trajectory, and the costs to go at the steps and at the end."""
 
     K: Float[Array, "N m n"]
     S: Float[Array, "N+1 n n"]
 
 
 def lqr(A: Any, B: Any, Q: Any, R: Any) -> Regulator:
-    """The regulator of continuous time.
+    """Returns the regulator in continuous time.
 
     Args:
         A: [n, n].
@@ -58,13 +58,13 @@ def lqr(A: Any, B: Any, Q: Any, R: Any) -> Regulator:
 
 
 def sampled_lqr(A: Any, B: Any, Q: Any, R: Any, dt: float) -> Regulator:
-    """The regulator of controls that are held for dt, of the cost sum dt (xᵀ Q x + uᵀ R u) at the samples.
+    """Returns the regulator for controls held for dt, with the cost sum dt (xᵀ Q x + uᵀ R u) at the samples.
 
     Args:
         A: of continuous time [n, n].
         B: [n, m].
         Q: as for `lqr`.
-        R: likewise.
+        R: as for `lqr`.
         dt: s.
 
     Raises:
@@ -86,7 +86,7 @@ def sampled_lqr(A: Any, B: Any, Q: Any, R: Any, dt: float) -> Regulator:
 
 
 def held(A: Any, B: Any, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """F and G in x(t + dt) = F x + G u of controls that are held, by one exponential of [[A, B], [0, 0]]."""
+    """F and G in x(t + dt) = F x + G u with held controls, by one exponential of [[A, B], [0, 0]]."""
     from scipy.linalg import expm
 
     n, m = np.shape(B)
@@ -97,14 +97,14 @@ def held(A: Any, B: Any, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def time_varying_lqr(F: Any, G: Any, Q: Any, R: Any, S_end: Any) -> SampledRegulators:
-    """Regulators along a trajectory of N steps, by the backward Riccati recursion; pure and differentiable.
+    """Returns regulators along a trajectory of N steps, by the backward Riccati recursion; pure and differentiable.
 
     Args:
-        F: of each step x' = F x + G u [N, n, n].
+        F: of the steps x' = F x + G u [N, n, n].
         G: [N, n, m].
-        Q: cost of the state in each step [n, n], or [N, n, n].
-        R: of the controls [m, m], or [N, m, m].
-        S_end: of the last state [n, n].
+        Q: cost of the state [n, n], or [N, n, n].
+        R: cost of the controls [m, m], or [N, m, m].
+        S_end: cost of the last state [n, n].
     """
     steps = len(F)
     Q, R = (jnp.broadcast_to(jnp.asarray(each), (steps, *np.shape(each)[-2:])) for each in (Q, R))
@@ -140,7 +140,7 @@ def _checked(A: Any, B: Any, Q: Any, R: Any) -> tuple[np.ndarray, ...]:
 
 
 def _require_stabilisable(A: np.ndarray, B: np.ndarray, unstable: Any) -> None:
-    """By Hautus: [A - s I, B] has full rank at every eigenvalue s that does not decay by itself."""
+    """Hautus test: [A - s I, B] has full rank at every eigenvalue s that does not decay by itself."""
     values = np.linalg.eigvals(A)
     size = max(np.linalg.norm(A), np.linalg.norm(B), 1e-300)
     for value in values[unstable(values)]:

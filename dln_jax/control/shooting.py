@@ -1,14 +1,15 @@
-"""Trajectories of least cost by multiple shooting: the states of all knots are unknowns, and steps may be implicit.
+"""Optimal trajectories by multiple shooting: the states at all knots are unknowns, and steps may be implicit.
 
     min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
 
-What a step misses of the next knot, its defect d_k = f(x_k, u_k) - x_{k+1}, is nothing at the solution alone: a guess
-need not be a motion, and an unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
-Sequential quadratic programming: all steps are expanded at once, `limited_horizon` finds the changes of states and
-controls, and they are shortened until cost + nu |defects|_1 falls enough, nu being above the multipliers (Nocedal and
-Wright 2006, section 18.3); whole, they may also lower the augmented Lagrangian, since near a solution the other merit
-can refuse steps that lead there (Maratos). Of the costs' curvature what is negative is left out. Through steps that
-are `integrated` by implicit methods, derivatives are those of the implicit function theorem.
+The defect of a step, d_k = f(x_k, u_k) - x_{k+1}, vanishes only at the solution. A guess need not be a motion, and an
+unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
+
+Sequential quadratic programming: all steps are expanded at once, and `limited_horizon` solves for the changes of states
+and controls. They are shortened until cost + nu |defects|_1 falls enough, with nu above the multipliers (Nocedal and
+Wright 2006, section 18.3). A full step may instead lower the augmented Lagrangian, because near a solution the first
+merit function can refuse steps that lead there (Maratos). Negative curvature of the costs is dropped. Through steps
+that are `integrated` by implicit methods, derivatives are those of the implicit function theorem.
 """
 
 from typing import Any, NamedTuple
@@ -25,33 +26,33 @@ from dln_jax.solvers.lapack import symmetric_eigen
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 2.0**-12
-"""Of the steps that are tried."""
+"""Shortest step length that is tried."""
 ENOUGH = 1e-4
-"""Of the decrease that the slope promises (Armijo)."""
+"""Required share of the decrease that the slope predicts (Armijo)."""
 ABOVE = 2.0
-"""nu over the largest multiplier."""
+"""Ratio of nu to the largest multiplier."""
 CLOSE = 1e-2
-"""Of the cost: where a change promises less and is taken whole, the curvature of the steps is of use."""
+"""Relative predicted decrease below which a full step counts as close, so that the steps' curvature is used."""
 
 
 class Shooting(NamedTuple):
-    """What multiple shooting found."""
+    """Result of multiple shooting."""
 
     plan: Plan
-    """For `receding` and for feedback along it; its states are the knots, a motion to within the defect."""
+    """Plan for `receding` and for feedback along it; its states are the knots, a motion to within the defect."""
     multipliers: Float[Array, "N n"]
-    """Slope of the cost to go with the state at the end of each step."""
+    """Derivatives of the cost to go by the states at the ends of the steps."""
     defect: Float[Array, ""]
     """Largest |f(x_k, u_k) - x_{k+1}|, in the states' units."""
     promised: Float[Array, ""]
-    """By how much the last change was to lower the cost, relative to it."""
+    """Predicted decrease of the cost by the last change, relative to the cost."""
     iterations: Int[Array, ""]
     ending: Int[Array, ""]
     """An `Ending`."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether defects and promised decrease came within the tolerance; `solvers.ending.reason` says why not."""
+        """Whether defects and predicted decrease are within the tolerance; `solvers.ending.reason` says why not."""
         return self.ending == Ending.CONVERGED
 
 
@@ -65,7 +66,7 @@ class _Knots(NamedTuple):
     multipliers: Array
     promised: Array
     close: Array
-    """Whether the last change was taken whole, and promised little."""
+    """Whether the last change was a full step with a small predicted decrease."""
     better: Array
     iterations: Array
     done: Array
@@ -81,17 +82,17 @@ def shoot(
     tolerance: float = 1e-9,
     exact: bool = False,
 ) -> Shooting:
-    """The trajectory of least cost near a guess, traceable.
+    """Returns the optimal trajectory near a guess; traceable.
 
     Args:
         problem: to solve.
-        x: the start [n].
-        states: guess [N+1, n], of which the first is replaced by the start; it need not be a motion.
-        u: guess [N, m]; put within the limits.
-        iterations: at most.
+        x: initial state [n].
+        states: guess [N+1, n], whose first is replaced by the initial state; it need not be a motion.
+        u: guess [N, m]; clipped to the limits.
+        iterations: largest number of iterations.
         tolerance: of the defects, relative to 1 + |x|, and of the cost.
-        exact: whether close to the optimum all curvature is used, that of the steps too: quadratic convergence, by
-            more derivatives. Otherwise it is Gauss-Newton's method.
+        exact: whether to use all curvature close to the optimum, including that of the steps: quadratic convergence,
+            for more derivatives. Otherwise the method is Gauss-Newton.
 
     Raises:
         InputError: shapes that do not agree, or settings that are not positive.
@@ -128,7 +129,7 @@ def shoot(
 
 
 def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> _Knots:
-    """Judges the knots, and improves them."""
+    """Evaluates the knots and improves them."""
     n = knots.x.shape[1]
     horizon = _expand(problem, knots, exact)
     change = least_cost(horizon)
@@ -152,7 +153,7 @@ def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> 
     def judged(length: Array) -> tuple[Array, Array, Array, Array]:
         cost, missed = _judge(problem, knots.x + length * change.dx, knots.u + length * change.du)
         fell = merits(cost, missed) <= now + ENOUGH * length * slopes
-        # At the solution, what is left to gain is below the rounding of the cost.
+        # At the solution, the remaining gain is below the rounding of the cost.
         return length, cost, missed, done | fell[0] | (fell[1] & (length == 1))
 
     def too_long(trial: tuple[Array, Array, Array, Array]) -> Array:
@@ -163,7 +164,7 @@ def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> 
     new = knots._replace(x=knots.x + length * change.dx, u=knots.u + length * change.du, cost=cost, missed=missed)
     kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), new, knots)
     close = better & (length == 1) & (jnp.abs(linear) <= CLOSE * jnp.abs(knots.cost))
-    # What fails with all curvature is tried without.
+    # A step that fails with all curvature is retried without.
     return kept._replace(
         K=change.K, multipliers=change.multipliers, promised=-linear / jnp.abs(knots.cost), close=close,
         better=better | knots.close, iterations=knots.iterations + 1, done=done,
@@ -171,13 +172,13 @@ def _iterate(problem: Problem, knots: _Knots, tolerance: float, exact: bool) -> 
 
 
 def _judge(problem: Problem, x: Array, u: Array) -> tuple[Array, Array]:
-    """Cost, and defects [N, n]."""
+    """Returns the cost, and the defects [N, n]."""
     missed = jax.vmap(problem.step)(x[:-1], u) - x[1:]
     return jnp.sum(jax.vmap(problem.cost)(x[:-1], u)) + problem.final_cost(x[-1]), missed
 
 
 def _expand(problem: Problem, knots: _Knots, exact: bool) -> Horizon:
-    """The quadratic program at the knots."""
+    """Returns the quadratic program at the knots."""
     n = knots.x.shape[1]
     both = jnp.concatenate([knots.x[:-1], knots.u], axis=1)
 
@@ -204,7 +205,7 @@ def _expand(problem: Problem, knots: _Knots, exact: bool) -> Horizon:
 
 
 def _adjoint(slopes: Array, gradients: Array, end: Array) -> Array:
-    """Multipliers [N, n] by the slopes of the steps and of the costs with the states."""
+    """Multipliers [N, n] from the derivatives of the steps and of the costs by the states."""
 
     def back(after: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
         slope, gradient = now
@@ -214,7 +215,7 @@ def _adjoint(slopes: Array, gradients: Array, end: Array) -> Array:
 
 
 def _not_negative(curvatures: Array, end: Array) -> tuple[Array, Array]:
-    """Hessians without their negative eigenvalues."""
+    """Sets negative eigenvalues of the Hessians to zero."""
     n = len(end)
     every = jnp.concatenate([curvatures, jnp.zeros_like(curvatures[:1]).at[0, :n, :n].set(end)])
     sizes, axes = jax.vmap(symmetric_eigen)(every)

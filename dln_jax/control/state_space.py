@@ -26,11 +26,11 @@ class Linearisation(NamedTuple):
 
 
 def field_of(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Field:
-    """The field of a mechanical system, on x = (q, qd) [2 d] and the controls u [m].
+    """Returns the field of a mechanical system, on x = (q, qd) [2 d] and the controls u [m].
 
     Args:
-        plant: such as `mechanics.equations.dynamics` gives.
-        actuation: matrix [d, m] in tau = actuation u; by default each coordinate has its own motor.
+        plant: for example from `mechanics.equations.dynamics`.
+        actuation: matrix [d, m] in tau = actuation u; by default every coordinate has its own motor.
     """
 
     def field(x: Array, u: Array) -> Array:
@@ -46,13 +46,13 @@ def integrated(
 ) -> Callable[[Array, Array], Array]:
     """(x, u) -> x after dt with u held: the step of a sampled controller and of a `Problem`, differentiable.
 
-    A step of an implicit method is NaN where its equations are not solved, and its derivatives are those of the
-    implicit function theorem.
+    A step of an implicit method is NaN if its equations are not solved. Its derivatives are those of the implicit
+    function theorem.
 
     Args:
         field: (x, u) -> dx/dt.
         dt: s.
-        method: of Runge and Kutta, such as `integrators.MIDPOINT` or `RADAU_3` for a stiff plant.
+        method: Runge-Kutta tableau, such as `integrators.MIDPOINT` or `RADAU_3` for a stiff plant.
         substeps: of the method.
 
     Raises:
@@ -67,7 +67,7 @@ def integrated(
 
 
 def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linearisation:
-    """The linearisation at an equilibrium, by forward-mode derivatives.
+    """Returns the linearisation at an equilibrium, by forward-mode derivatives.
 
     Args:
         field: (x, u) -> dx/dt.
@@ -76,7 +76,7 @@ def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linea
         tolerance: of |dx/dt| at (x, u), in the units of the field.
 
     Raises:
-        InputError: (x, u) is no equilibrium.
+        InputError: (x, u) is not an equilibrium.
     """
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
     rest = field(x, u)
@@ -90,13 +90,13 @@ def linearise(field: Field, x: Any, u: Any, *, tolerance: float = 1e-6) -> Linea
 
 
 def holding_controls(plant: Dynamics, q: Any, actuation: Any = None, *, tolerance: float = 1e-6) -> Array:
-    """Controls [m] at which the plant stays in the posture q.
+    """Returns the controls [m] that hold the plant in the posture q.
 
     Args:
-        plant: whose gravity is held.
+        plant: with gravity.
         q: posture [d].
         actuation: as for `field_of`.
-        tolerance: N m or N, of what the motors leave.
+        tolerance: of the remaining torque, N m or N.
 
     Raises:
         InputError: no controls hold it.

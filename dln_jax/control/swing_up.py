@@ -1,10 +1,10 @@
-"""Swing-up of a plant with passive joints by one model, known or learned: the same functions for all of them.
+"""Swing-up of a plant with passive joints by a known or learned model: the same functions for all models.
 
-1. The model's friction is taken off (`friction_compensation`): what is left has energies, and a smooth linearisation.
-2. Its own equilibrium near the goal is found, for a learned potential is not level at exactly the goal.
+1. The model's friction is removed (`friction_compensation`): the rest has energies, and a smooth linearisation.
+2. The model's own equilibrium near the goal is computed, because a learned potential is not level exactly at the goal.
 3. Far from it the energy law acts, near it the regulator of the model's linearisation; the regulator's value decides.
-4. A share of the friction of the active joints is added, at the measured rates.
-5. At rest the energy law asks for nothing, and dry friction holds on to that: a kick starts what is still.
+4. A share of the friction of the active joints is compensated, at the measured rates.
+5. At rest the energy law returns zero, and dry friction would hold the plant: a kick starts it.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from dln_jax.types import InputError, JointKind, Vector
 
 NEWTON_STEPS = 20
 FARTHEST = 0.1
-"""rad or m, by which a model's equilibrium may be off the goal."""
+"""Largest distance of a model's equilibrium from the goal, rad or m."""
 
 
 class SwingUpNumbers(NamedTuple):
-    """What is chosen for a plant; the same for every model of it."""
+    """Settings of a plant's swing-up, the same for all models."""
 
     gains: EnergyGains
     state_cost: Any
@@ -39,35 +39,35 @@ class SwingUpNumbers(NamedTuple):
     control_cost: Any
     """R [m, m]."""
     level: float
-    """Of the regulator's value, below which it acts."""
+    """Level of the regulator's value below which the regulator acts."""
     smoothing: Any
-    """Of friction's compensation, rad/s or m/s."""
+    """Smoothing of the friction compensation, rad/s or m/s."""
     compensation: float = GAIN
-    """Share of the active joints' friction that is made up for; 0 for none."""
+    """Share of the active joints' friction that is compensated; 0 for none."""
     kick: float = 0.0
-    """N m or N, for a plant that is still, far from the goal; towards where the active joints are to be."""
+    """Kick in N m or N on a plant at rest far from the goal, towards the active joints' goal."""
     still: float = 0.05
-    """1/s or m/s, at and below which all measured rates are those of rest."""
+    """Largest measured rate that counts as rest, 1/s or m/s."""
 
 
 class SwingUp(NamedTuple):
-    """A law, and what it stands on."""
+    """A swing-up law with its equilibrium and regulator."""
 
     law: Law
     equilibrium: Float[Array, " two_d"]
-    """The model's own, near the goal."""
+    """The model's own equilibrium near the goal."""
     controls: Float[Array, " m"]
-    """That hold it."""
+    """Controls that hold it."""
     regulator: Regulator
 
     @property
     def offset(self) -> float:
-        """How far from zero, where the goal is, the farthest coordinate of the equilibrium is, rad or m."""
+        """Largest coordinate of the equilibrium, rad or m, where the goal is zero."""
         return float(jnp.max(jnp.abs(self.equilibrium)))
 
 
 def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> Vector:
-    """The posture [d] nearest to a goal at which nothing pulls at the passive joints, by Newton's method over these.
+    """Posture [d] nearest to a goal with zero force at the passive joints, by Newton's method over these.
 
     Raises:
         InputError: there is none within `FARTHEST`.
@@ -92,10 +92,10 @@ def nearest_equilibrium(plant: Dynamics, goal: Any, passive: Sequence[int]) -> V
 
 
 def usable(plant: Dynamics | PlainDynamics, postures: Any) -> Dynamics:
-    """The model itself.
+    """Returns the model if it is usable.
 
     Raises:
-        InputError: one without energies, or whose mass matrix is not definite in some posture [n, d].
+        InputError: a model without energies, or with a mass matrix that is not definite in some posture [n, d].
     """
     if not isinstance(plant, Dynamics):
         raise InputError("the model has no energy, which an energy law shapes; train one that has, such as a DeLaN")
@@ -120,29 +120,29 @@ def swing_up(
     most: Any = jnp.inf,
     tolerance: float = 1e-6,
 ) -> SwingUp:
-    """The law x -> u of a swing-up by a model.
+    """Returns the law x -> u of a swing-up by a model.
 
     Args:
         model: known or learned, with friction or without.
-        actuation: matrix [d, m], each of whose motors drives one coordinate.
+        actuation: matrix [d, m]; every motor drives one coordinate.
         joints: kinds.
         goal: posture [d].
         numbers: gains and costs.
-        postures: [n, d], that a swing-up goes through, where the model has to be usable.
-        least: limits of the controls.
-        most: likewise.
+        postures: [n, d], postures of a swing-up, in which the model has to be usable.
+        least: lower limits of the controls.
+        most: upper limits of the controls.
         tolerance: of the equilibrium, in N m or N.
 
     Raises:
         InputError: a model without energies, with a mass matrix that is not definite, without an equilibrium near the
-            goal, one that the limits cannot hold, or that no feedback stabilises.
+            goal, or with one that the limits cannot hold or no feedback stabilises.
     """
     parts, B = parts_of(actuation), np.asarray(actuation, float)
-    # What hangs on the model alone is computed now, also where gains or the level are being traced.
+    # Values that depend on the model only are computed now, even if gains or the level are being traced.
     with jax.ensure_compile_time_eval():
         model = usable(model, postures)
         conservative = without_friction(model)
-        # Operation by operation, these take longer than compiled.
+        # Compiled, because operation by operation they take longer.
         inverse, forward = jax.jit(conservative.inverse_dynamics), jax.jit(conservative.forward_dynamics)
         whole = conservative._replace(inverse_dynamics=inverse, forward_dynamics=forward)
         home = nearest_equilibrium(whole, goal, parts.passive)
@@ -155,7 +155,7 @@ def swing_up(
         x = jnp.concatenate([home, jnp.zeros_like(home)])
         at = linearise(field_of(whole, B), x, controls, tolerance=np.inf)
         regulator = lqr(at.A, at.B, numbers.state_cost, numbers.control_cost)
-    # Motors are numbered by columns of the matrix, active joints by coordinates.
+    # Motors are ordered by columns of the matrix, active joints by coordinates.
     to_controls = jnp.linalg.pinv(B[np.array(parts.active)])
     shaped = energy_shaping(conservative, parts, home, numbers.gains)
     near = regulated(regulator, x, controls, joints)

@@ -1,4 +1,4 @@
-"""A desktop plant's swing-ups in its laboratory, by any model of it: one run, or what came of many."""
+"""Swing-ups of a desktop plant in its laboratory, by any model of it: one run, or the outcomes of many."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,31 +19,31 @@ from dln_jax.mechanics.equations import dynamics
 
 SECONDS = 10.0
 CUTOFF = 50.0
-"""Of the low-pass of rates, which are differences of encoders, Hz."""
+"""Cut-off frequency of the rates, which are differences of encoder readings, Hz."""
 POSTURES = 65
-"""Angles of the pole, around the circle, in which a model has to be usable."""
+"""Number of pole angles around the circle at which a model has to be usable."""
 
 
 class Tried(NamedTuple):
-    """Swing-ups from n starts."""
+    """Swing-ups from n initial states."""
 
     outcomes: Outcomes
     farthest: Float[np.ndarray, " n"]
-    """m or rad, of the driven coordinate."""
+    """Largest displacement of the driven coordinate, m or rad."""
 
 
 def model_of_plant(plant: DesktopPlant) -> Dynamics:
-    """What nobody has: the plant itself, with its friction."""
+    """The true plant with its friction, which is unknown in practice."""
     return dynamics(plant.scene.closed_form)
 
 
 def model_of_maker(plant: DesktopPlant) -> Dynamics:
-    """The maker's sizes, without friction."""
+    """Model with the manufacturer's sizes, without friction."""
     return dynamics(plant.makers(**plant.sizes).closed_form)
 
 
 def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:
-    """The plant's swing-up by a model of it; by the plant's own numbers, where none are given. Errors as `swing_up`."""
+    """Returns the plant's swing-up by a model, with the plant's own numbers by default. Raises as `swing_up`."""
     angle = np.linspace(-np.pi, np.pi, POSTURES)
     needs, lab = plant.scene.needs, plant.laboratory
     return swing_up(
@@ -59,7 +59,7 @@ def motion_of(
     *,
     seconds: float = SECONDS,
 ) -> Callable[[Array, Array], Run]:
-    """(start [4], key of the noise) -> the closed loop of the true plant with the model's law."""
+    """(initial state [4], key of the noise) -> a run of the true plant with the model's law."""
     law = law_of(plant, model, numbers).law
     controller = with_differences(law, 2, rate=plant.rate, cutoff=CUTOFF)
     field, B = field_of(model_of_plant(plant), plant.scene.needs.actuation), np.asarray(plant.scene.needs.actuation)
@@ -82,7 +82,7 @@ def try_starts(
     seed: int = 0,
     seconds: float = SECONDS,
 ) -> Tried:
-    """What comes of starts near hanging, drawn by the seed, each with noise of its own."""
+    """Runs swing-ups from random states near hanging, with independent noise."""
     run = motion_of(plant, model, numbers, seconds=seconds)
 
     def watched(x: Array, key: Array) -> tuple[Array, Array]:

@@ -1,12 +1,12 @@
-"""Laws that make a mechanical system follow references, of one state; gains and torques may be learned through.
+"""Tracking laws for mechanical systems, of one state; gains and torques are differentiable.
 
     gravity compensation    tau = g(q) + feedback
     feed-forward            tau = f(q*, qd*, qdd*) + feedback
     computed torque         tau = f(q, qd, qdd* + feedback)
 
-with f the inverse dynamics of a model, known or learned, and feedback = P (q* - q) + D (qd* - qd). Computed torque
-trusts the model at the measured state, whatever that is: with a bad model it is worse than feedback alone
-(`trusted`). Of a state that is not finite every torque is NaN.
+with f the inverse dynamics of a known or learned model, and feedback = P (q* - q) + D (qd* - qd). Computed torque
+evaluates the model at any measured state: with a bad model it is worse than feedback alone (`trusted`). If a state is
+not finite, all torques are NaN.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from dln_jax.types import Vector
 
 
 class Reference(NamedTuple):
-    """Where the system is to be, each [d]."""
+    """Desired position, velocity and acceleration, all [d]."""
 
     q: Any
     qd: Any
@@ -31,7 +31,7 @@ class Reference(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Of feedback: numbers, one for each joint [d], or matrices [d, d]."""
+    """Feedback gains: numbers, one per joint [d], or matrices [d, d]."""
 
     proportional: Any
     """N m/rad or N/m; 1/s² for computed torque."""
@@ -49,7 +49,7 @@ def feedback(gains: Gains, q: Any, qd: Any, wanted: Reference) -> Array:
 
 
 def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """Holds the weight where the system is, beside feedback: exact at rest."""
+    """Gravity of the present posture plus feedback: exact at rest."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         rest = jnp.zeros_like(qd)
@@ -59,7 +59,7 @@ def gravity_compensation(plant: Dynamics | PlainDynamics, gains: Gains) -> Track
 
 
 def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """The model's torque on the reference, beside feedback; what the state does cannot upset the model."""
+    """The model's torque on the reference plus feedback; the model is never evaluated at the measured state."""
 
     def law(q: Vector, qd: Vector, wanted: Reference) -> Array:
         planned = plant.inverse_dynamics(wanted.q, wanted.qd, wanted.qdd)
@@ -69,7 +69,7 @@ def feed_forward(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
 
 
 def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
-    """The model's torque for an acceleration that takes errors back; with an exact model they decay linearly.
+    """The model's torque for the reference acceleration plus feedback; with an exact model, errors decay linearly.
 
     With gains [d] or matrices in 1/s² and 1/s, the error obeys e'' + D e' + P e = 0.
     """
@@ -82,7 +82,7 @@ def computed_torque(plant: Dynamics | PlainDynamics, gains: Gains) -> Tracker:
 
 
 def limited(tau: Any, least: Any, most: Any) -> Array:
-    """A torque within the motors' limits; one that is not finite is NaN, for whoever holds the brake."""
+    """Clips a torque to the motors' limits; one that is not finite becomes NaN, for whoever handles the failure."""
     tau = jnp.asarray(tau)
     return jnp.where(jnp.isfinite(tau), jnp.clip(tau, least, most), jnp.nan)
 
@@ -95,17 +95,17 @@ def trusted(
     outside: Callable[[Vector, Vector, Vector], Any] | None = None,
     usable: bool = True,
 ) -> Callable[[Vector, Vector, Reference], tuple[Array, Array]]:
-    """One law where the model can be used at the state, and another where it cannot, with whether it was the first.
+    """Returns a law that takes `first` where the model is usable and `otherwise` elsewhere, with a flag for the first.
 
-    A model can be used where its mass matrix is positive definite (by a Cholesky factor) and the state is within its
-    data, if it can tell. The other law is one that does not ask the model at the state, such as `feed_forward`.
+    A model is usable if its mass matrix is positive definite (by a Cholesky factor) and the state is in distribution,
+    as far as the model can test this. The other law should not evaluate the model at the state, such as `feed_forward`.
 
     Args:
         plant: the model.
         first: a law such as `computed_torque`.
         otherwise: a law such as `feed_forward`.
-        outside: (q, qd, qdd) -> whether the state is outside the data, such as that of a run with uncertainty.
-        usable: whether the model may be used at all, such as `judgement.judged` says of held-out motions.
+        outside: (q, qd, qdd) -> whether the state is out of distribution, for example from a run with uncertainty.
+        usable: whether the model may be used at all, for example by `judgement.judged` on held-out motions.
     """
     credible = usable
 

@@ -1,11 +1,11 @@
-"""Trajectories of least cost with limited controls, by iterative linear-quadratic regulators, and their use as MPC.
+"""Optimal trajectories with limited controls, by iterative linear-quadratic regulators, and their use as MPC.
 
     min  sum_k l(x_k, u_k) + l_N(x_N),   x_{k+1} = f(x_k, u_k),   least <= u_k <= most
 
-An iteration expands f to first and the costs to second order about the plan (Gauss-Newton: Li and Todorov 2004), solves
-for u_k = ū_k + k_k + K_k (x_k - x̄_k) backwards, with the limits as a small quadratic program in each step (Tassa,
-Mansard and Todorov 2014), and takes the best of several step lengths at once. A damping of the controls' Hessian grows
-where no step is better, and shrinks where one is. Everything is traced: a plan is a tree of arrays.
+An iteration expands f to first and the costs to second order about the plan (Gauss-Newton: Li and Todorov 2004). It
+solves for u_k = ū_k + k_k + K_k (x_k - x̄_k) backwards, with a small quadratic program for the limits in every step
+(Tassa, Mansard and Todorov 2014), and takes the best of several step lengths at once. The damping of the controls'
+Hessian is raised if no step is better, and lowered otherwise. Everything is traceable: a plan is a tree of arrays.
 """
 
 from collections.abc import Callable
@@ -24,38 +24,38 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 STEP_LENGTHS = 0.5 ** np.arange(10)
 LEAST_DAMPING, MOST_DAMPING, FIRST_DAMPING = 1e-9, 1e9, 1e-3
-"""Of the controls' Hessian, relative to the mean of its diagonal."""
+"""Damping of the controls' Hessian, relative to the mean of its diagonal."""
 PROJECTED_STEPS = 8
-"""Of Newton's method in the quadratic program of a step."""
+"""Newton iterations of the quadratic program of a step."""
 
 
 class Problem(NamedTuple):
-    """What is to be minimised."""
+    """Dynamics, costs and limits of a trajectory."""
 
     step: Callable[[Array, Array], Array]
-    """(x [n], u [m]) -> x' [n], such as an integrator's."""
+    """(x [n], u [m]) -> x' [n], for example of an integrator."""
     cost: Callable[[Array, Array], Scalar]
-    """(x, u) -> of one step."""
+    """(x, u) -> cost of one step."""
     final_cost: Callable[[Array], Scalar]
-    """x -> of the last state."""
+    """x -> cost of the last state."""
     least: Any = -jnp.inf
-    """Limits of the controls, [m] or one for all."""
+    """Lower limits of the controls, [m] or one for all."""
     most: Any = jnp.inf
 
 
 class Plan(NamedTuple):
-    """N steps from a state."""
+    """Controls, states and gains of N steps from a state."""
 
     u: Float[Array, "N m"]
     x: Float[Array, "N+1 n"]
     K: Float[Array, "N m n"]
-    """u_k + K_k (x - x_k) is the plan's control at a state beside it."""
+    """Gains; at a state x near the plan the control is u_k + K_k (x - x_k)."""
     cost: Float[Array, ""]
     damping: Float[Array, ""]
     better: Bool[Array, ""]
     """Whether the last iteration found a lower cost."""
     ending: Int[Array, ""]
-    """An `Ending`: why the optimisation ended, undecided after a single iteration."""
+    """An `Ending`: the reason why the optimisation ended, undecided after a single iteration."""
 
     @property
     def converged(self) -> Bool[Array, ""]:
@@ -64,11 +64,11 @@ class Plan(NamedTuple):
 
 
 def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
-    """The plan of given controls [N, m] from a state [n]; `InputError` for other shapes."""
+    """Returns the plan of controls [N, m] from a state [n]; raises `InputError` for other shapes."""
     x, u = jnp.asarray(x, float), jnp.asarray(u, float)
     if x.ndim != 1 or u.ndim != 2 or not len(u):
         raise InputError(f"x has shape {x.shape}, u {u.shape}; expected a state [n] and controls [N, m]")
-    # Without gains it does not matter which states the controls are planned about.
+    # Without gains, the states about which the controls are planned do not matter.
     about, K = jnp.tile(x, (len(u) + 1, 1)), jnp.zeros((*u.shape, x.shape[0]), x.dtype)
     damping = jnp.asarray(FIRST_DAMPING, x.dtype)
     plan = Plan(u, about, K, jnp.zeros((), x.dtype), damping, jnp.asarray(True), jnp.asarray(Ending.UNDECIDED))
@@ -77,18 +77,18 @@ def first_plan(problem: Problem, x: Any, u: Any) -> Plan:
 
 
 def improve(problem: Problem, plan: Plan, *, step_lengths: Any = STEP_LENGTHS) -> Plan:
-    """One iteration, the best of some step lengths [L]; the cost never rises."""
+    """Runs one iteration and takes the best of some step lengths [L]; the cost never rises."""
     return _improved(problem, plan, step_lengths)[0]
 
 
 def _improved(problem: Problem, plan: Plan, step_lengths: Any) -> tuple[Plan, Array]:
-    """The plan after an iteration, and by how much the first step length lowers the cost."""
+    """Returns the plan after an iteration, and the decrease of the cost at the first step length."""
     k, K = _backward(problem, plan)
     lengths = jnp.asarray(step_lengths, plan.u.dtype)
     x, u, costs = jax.vmap(lambda length: _follow(problem, plan.x[0], plan._replace(u=plan.u + length * k, K=K)))(
         lengths
     )
-    # A cost that is no number is none that is lower.
+    # A cost that is not finite never counts as lower.
     best = jnp.argmin(jnp.where(jnp.isfinite(costs), costs, jnp.inf))
     better = costs[best] < plan.cost
     undecided = jnp.asarray(Ending.UNDECIDED)
@@ -99,15 +99,15 @@ def _improved(problem: Problem, plan: Plan, step_lengths: Any) -> tuple[Plan, Ar
 
 
 def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, tolerance: float = 1e-9) -> Plan:
-    """Iterates from given controls until the cost falls by less than a share of it, or no step is better at all.
+    """Iterates from initial controls until the relative decrease of the cost is small, or no step is better.
 
-    The plan's `ending` says which; without a lower cost it has converged only if a whole step changes nothing either.
+    The plan's `ending` states which. Without a lower cost it has converged only if a full step changes nothing either.
 
     Args:
         problem: to solve.
-        x: the start [n].
-        u: first controls [N, m].
-        iterations: at most.
+        x: initial state [n].
+        u: initial controls [N, m].
+        iterations: largest number of iterations.
         tolerance: relative change of the cost.
     """
     require_positive(iterations=iterations, tolerance=tolerance)
@@ -138,19 +138,19 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
 def receding(
     problem: Problem, *, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[[Array, Plan], tuple[Array, Plan]]:
-    """Model-predictive control: (state, plan) -> (control, plan), the plan moved on by one step and improved.
+    """Model predictive control: (state, plan) -> (control, plan), with the plan shifted by one step and improved.
 
     Start with `first_plan` or `optimise`, whose first control is for its first state.
 
     Args:
         problem: over the horizon.
-        iterations: a call, always as many.
-        step_lengths: that an iteration tries [L]; a call from a good plan needs few, and takes less time and memory.
+        iterations: number of iterations per call.
+        step_lengths: tried in an iteration [L]; from a good plan few suffice, for less time and memory.
     """
     require_positive(iterations=iterations)
 
     def act(x: Array, plan: Plan) -> tuple[Array, Plan]:
-        # Feedback about the old plan makes good what the state is off, which alone may be unstable.
+        # Feedback about the old plan corrects the deviation of the state; controls alone may be unstable.
         states, u, cost = _follow(problem, x, plan)
         now = plan._replace(x=states, u=u, cost=cost)
         for _ in range(iterations):
@@ -164,7 +164,7 @@ def receding(
 
 
 def _follow(problem: Problem, x: Array, plan: Plan) -> tuple[Array, Array, Array]:
-    """States, controls and cost from a state by the plan and its gains."""
+    """Returns states, controls and cost from a state under the plan and its gains."""
 
     def step(x: Array, now: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array, Array]]:
         planned, u, K = now
@@ -176,7 +176,7 @@ def _follow(problem: Problem, x: Array, plan: Plan) -> tuple[Array, Array, Array
 
 
 def _backward(problem: Problem, plan: Plan) -> tuple[Array, Array]:
-    """k [N, m] and K [N, m, n]."""
+    """Returns k [N, m] and K [N, m, n]."""
     n = plan.x.shape[1]
 
     def of_both(function: Callable[..., Any]) -> Callable[[Array], Any]:
@@ -205,7 +205,7 @@ def _backward(problem: Problem, plan: Plan) -> tuple[Array, Array]:
 
 
 def _limited_quadratic(Q: Array, q: Array, cross: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """k that minimises ½ kᵀ Q k + qᵀ k within limits, by projected Newton steps, and the gains of what is free."""
+    """Minimises ½ kᵀ Q k + qᵀ k within limits by projected Newton steps; returns k, and gains of the free controls."""
 
     def pinned(k: Array) -> Array:
         slope = Q @ k + q

@@ -1,9 +1,9 @@
-"""Learning: problems, what is made small, and the one loop that solves them.
+"""Learning: problems, objectives, and the one loop that solves them.
 
     training = fit(dynamics.problem(model, split(data)), GaussNewton())
 
-`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems; what is
-linear in its parameters needs no loop. `uncertainty` says what a fitted model does not know.
+`dynamics`, `rates`, `motions`, `accelerations`, `measured_motions`, `frames` and `functions` build problems. Models
+that are linear in their parameters are solved directly. `uncertainty` estimates the uncertainty of a fitted model.
 """
 
 from dln_jax.learning import (

@@ -1,9 +1,9 @@
-"""Accelerations of a model fitted to those of data, in coordinates and velocities, with or without torques.
+"""Fits a model's accelerations to those of the data, in coordinates and velocities, with or without torques.
 
     residual = (qdd_hat(q, qd, tau) - qdd) / spread of qdd
 
-A first fit for `learning.measured_motions`, whose result does not rest on estimated accelerations; and all that is
-needed where accelerations are exact.
+Use it as the first fit for `learning.measured_motions`, whose result does not depend on estimated accelerations. Where
+accelerations are exact, this fit alone is enough.
 """
 
 import jax.numpy as jnp
@@ -31,19 +31,19 @@ def problem(
     most_samples: int = 4_000,
     seed: int = 0,
 ) -> Problem:
-    """The fit of a model to accelerations, in float64.
+    """Builds the problem of fitting a model to accelerations, in float64.
 
     Args:
-        model: of any energies, or of accelerations, with float64 parameters.
-        parameters: to start from.
-        data: to fit; of more than `most_samples` a subset is drawn by the seed.
-        validation: to select by.
-        gauge: what motions without torques need, and others do not.
-        most_samples: fitted at most.
-        seed: of the draw, and of the order of the samples.
+        model: built from any energies, or from accelerations, with float64 parameters.
+        parameters: initial parameters.
+        data: training samples; if there are more than `most_samples`, a random subset is drawn.
+        validation: samples that select the parameters.
+        gauge: fixes the scale of the energies; needed only for motions without torques.
+        most_samples: largest number of samples to fit.
+        seed: seed of the draw and of the order of the samples.
 
     Raises:
-        InputError: no gauge where there are no torques, or numbers that are too large.
+        InputError: motions without torques and without a gauge, or numbers that are too large.
     """
     require_positive(most_samples=most_samples)
     if gauge is None and not np.any(data.tau):
@@ -71,7 +71,7 @@ def problem(
 
 
 def drawn(samples: int, most: int, seed: int) -> np.ndarray:
-    """Indices of `most` samples, or of all in order where there are no more."""
+    """Indices of `most` random samples in ascending order, or of all samples if there are no more than that."""
     if samples <= most:
         return np.arange(samples)
     return np.sort(np.random.default_rng(seed).choice(samples, size=most, replace=False))

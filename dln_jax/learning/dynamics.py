@@ -1,4 +1,4 @@
-"""Models of dynamics fitted to trajectories: the problem that `engine.fit` solves.
+"""Fits models of dynamics to trajectories: builds the problem that `engine.fit` solves.
 
 training = fit(problem(model, sets, objective), GaussNewton())
 """
@@ -24,17 +24,18 @@ from dln_jax.types import require_seed
 
 
 def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0) -> Problem:
-    """The fit of a model to an objective, in the precision of the model.
+    """Builds the problem of fitting a model to an objective, in the precision of the model.
 
     Args:
         model: from `dln_jax.models`.
-        sets: what to fit, to select by, and to monitor.
-        objective: what to make small, from `learning.objectives`.
-        seeds: of the initial parameters and the order of the samples. Several train in one program, and the result has
-            them on the leading axis.
+        sets: samples for training, for selecting the parameters, and for monitoring.
+        objective: residual to minimise, from `learning.objectives`.
+        seeds: seeds of the initial parameters and of the order of the samples. Several seeds train in one program, and
+            the results have a leading axis of seeds.
 
     Raises:
-        InputError: the data cannot determine the model, lack what it is fitted to, or overflow in its precision.
+        InputError: the data cannot determine the model, lack a key of the objective, or overflow in the model's
+            precision.
     """
     for seed in (seeds,) if isinstance(seeds, int) else seeds:
         require_seed(seed)
@@ -56,26 +57,26 @@ def problem(model: Model, sets: Split, objective: Objective = TORQUE, *, seeds: 
 
 
 def samples(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[Array, ...]:
-    """All that is read, for fitting, selecting and monitoring, in the model's precision."""
+    """All arrays that are read for fitting, selecting and monitoring, in the model's precision."""
     return tuple(map(lambda *parts: jnp.concatenate(parts), *_read(model, sets, objective)[1]))
 
 
 def identity_of(
     optimiser: Optimiser, sets: Split, objective: Objective = TORQUE, *, seeds: int | Sequence[int] = 0
 ) -> dict[str, Any]:
-    """By what a `Checkpoint` of a training recognises it."""
+    """Returns the identity by which a `Checkpoint` recognises a training."""
     return identity(optimiser, (getattr(data, key) for data in sets for key in objective.keys), seeds=seeds)
 
 
 def suited_optimiser(model: Model, sets: Split, objective: Objective = TORQUE) -> tuple[type[Optimiser], str]:
-    """The optimiser for a model of this size and data, and why."""
+    """Returns the optimiser that suits the sizes of the model and the data, and the reason."""
     return optimisers.suited(_shapes(model), len(sets.train.t), len(objective.scale(sets.train)))
 
 
 def validation_errors(
     model: Model, sets: Split, parameters: Parameters, objective: Objective = TORQUE
 ) -> Float[np.ndarray, " N"]:
-    """Squared error of each validation sample, whose mean is what selects."""
+    """Squared error of every validation sample; their mean selects the parameters."""
     scale, (_, batch, _) = _read(model, sets, objective)
     return np.asarray(jax.jit(lambda given: _squares(objective, model, given, batch, scale))(parameters))
 
@@ -85,12 +86,12 @@ def _shapes(model: Model) -> Parameters:
 
 
 def _read(model: Model, sets: Split, objective: Objective) -> tuple[Array, list[tuple[Array, ...]]]:
-    """The unit of each residual, and the arrays of each set."""
+    """Returns the scale of the residuals, and the arrays of every set."""
     dtype = jnp.result_type(*jax.tree.leaves(_shapes(model)))
     return objective.scale(sets.train).astype(dtype), [objectives.arrays(objective, data, dtype) for data in sets]
 
 
 def _squares(objective: Objective, model: Model, parameters: Any, batch: tuple[Array, ...], scale: Array) -> Array:
-    """Squared error of each sample of a batch, in the units that the objective selects by."""
+    """Squared error of every sample of a batch, in the units in which the objective selects parameters."""
     errors = objectives.residuals(objective, model.energies(parameters), batch)
     return jnp.sum((errors if objective.selects_by == "torque" else errors / scale) ** 2, axis=1)

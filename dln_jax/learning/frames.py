@@ -1,19 +1,20 @@
-"""Fits an autoencoder and the field in its latent plane to pictures of motions (Greydanus, Dzamba and Yosinski 2019).
+"""Fits an autoencoder and the field in its latent plane to images of motions (Greydanus, Dzamba and Yosinski 2019).
 
     loss = AE + CC + 0.1 HNN                              published weights; means over samples and components
-    AE   = |decoder(encoder(x_k)) - x_k|²                 pictures come back
+    AE   = |decoder(encoder(x_k)) - x_k|²                 reconstruction of the images
     CC   = |z_p,k - (z_q,k+1 - z_q,k)|²                   the momentum is the change of the coordinate per frame
-    HNN  = |flow_j(z_0) - z_j|²                           the field moves the latent states as the pictures do
+    HNN  = |flow_j(z_0) - z_j|²                           the field moves the latent states as the images do
 
-Samples are windows of frames after each other, k = 0 .. W - 1, and x_k are the frames k and k + 1. In place of the
-published forward difference, z_1 - z_0 = rates(z_0), which is off by the square of the time of a frame, the field is
-integrated by RK4 from a window's first state to each of the next: with a window of two that is the published term made
-exact, and longer ones weigh what grows in a motion. Our rate falls by a cosine; the published one is constant.
+Samples are windows of consecutive frames, k = 0 .. W - 1; x_k holds the frames k and k + 1. The published term is a
+forward difference, z_1 - z_0 = rates(z_0), whose error is quadratic in the frame time. Here RK4 integrates the field
+from a window's first state to all later ones. With a window of two this is the published term without that error;
+longer windows also penalise errors that grow during a motion. The learning rate decays by a cosine; the published one
+is constant.
 
-Latent states have no scale of their own: CC and HNN fall when the plane shrinks, and AE does not notice. So that
-nothing is gained by shrinking, every error is taken relative to the variance in the batch of what it is an error of
-(of z_p for CC), unless `relative` is off. The published weights then weigh other sizes: on the pendulum HNN needs 10
-in place of 0.1 before the motions, and not the decoder, are as good as they can be.
+Latent states have no scale of their own: CC and HNN fall when the latent plane shrinks, and AE does not change. To
+remove that incentive, every error is divided by the variance of its target in the batch (z_p for CC), unless `relative`
+is off. The published weights then act on other magnitudes: on the pendulum HNN needs 10 in place of 0.1 until the
+decoder, and no longer the motion, limits the accuracy.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,7 @@ from dln_jax.types import InputError, Scalar
 
 
 class Weights(NamedTuple):
-    """Of the terms of the loss."""
+    """Weights of the terms of the loss."""
 
     autoencoder: float = 1.0
     coordinate: float = 1.0
@@ -40,17 +41,17 @@ class Weights(NamedTuple):
 
 
 class Matching(NamedTuple):
-    """What is made small."""
+    """Windows and loss of the fit."""
 
     window: int = 2
-    """Pictures (of two frames) of a window."""
+    """Images (of two frames) per window."""
     weights: Weights = Weights()
     relative: bool = True
-    """Whether errors of latent states are relative to their variances; published ones are not."""
+    """Whether errors of latent states are relative to their variances; the published ones are not."""
 
 
 class Terms(NamedTuple):
-    """The loss, before it is weighted."""
+    """Terms of the loss, before weighting."""
 
     autoencoder: Scalar
     coordinate: Scalar
@@ -60,7 +61,7 @@ class Terms(NamedTuple):
 def terms(
     model: LatentModel, parameters: Parameters, windows: Float[Array, "N frames pixels"], relative: bool
 ) -> Terms:
-    """AE, CC and HNN of windows of W + 1 frames each."""
+    """Returns AE, CC and HNN of windows of W + 1 frames."""
     system = model.apply(parameters)
     step = rk4(lambda t, state: system.field.rates(*state))
     pairs = jnp.concatenate([windows[:, :-1], windows[:, 1:]], axis=2)
@@ -88,10 +89,10 @@ def loss(model: LatentModel, matching: Matching, parameters: Parameters, windows
 
 
 def windows(frames: Float[np.ndarray, "K T pixels"], length: int) -> Float[np.ndarray, "N length pixels"]:
-    """Frames of trajectories cut to windows of a length, one after the other; what is left over ends a trajectory.
+    """Cuts the frames of trajectories into consecutive windows; the remainder at the end of a trajectory is dropped.
 
     Raises:
-        InputError: trajectories shorter than a window.
+        InputError: trajectories are shorter than a window.
     """
     K, T, pixels = frames.shape
     count = T // length
@@ -108,12 +109,13 @@ def problem(
     *,
     seed: int = 0,
 ) -> Problem:
-    """The fit of a model to the frames of trajectories, for Adam; others select the parameters, by the same loss.
+    """Builds the problem of fitting a model to the frames of trajectories, for Adam.
 
-    The seed is that of the initial parameters and the order of the windows.
+    The validation trajectories select the parameters, by the same loss. The seed decides the initial parameters and the
+    order of the windows.
 
     Raises:
-        InputError: settings out of range, or trajectories shorter than a window.
+        InputError: settings are out of range, or trajectories are shorter than a window.
     """
     if matching.window < 2:
         raise InputError(f"window is {matching.window}; expected at least 2 pictures, one to predict the other from")
@@ -129,5 +131,5 @@ def problem(
         score=score,
         seed=seed,
         loss=lambda parameters, batch: loss(model, matching, parameters, *batch),
-        loss_is_mean=not matching.relative,  # variances of a batch are not the means of its parts'
+        loss_is_mean=not matching.relative,  # the variance of a batch is not the mean of its parts' variances
     )

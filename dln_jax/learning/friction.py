@@ -1,9 +1,10 @@
-"""Friction of a rigid tree identified with its inertias: coefficients linearly, the shapes of curves by Gauss-Newton.
+"""Identifies the friction and the inertias of a rigid tree: linear coefficients directly, curve shapes by Gauss-Newton.
 
     tau = Phi(q, qd, qdd) theta + F(qd; shape) c,   over theta, c and shape: `solvers.separable`
 
-Velocities, slopes and shares of load are unknown by their logarithms (a share by that of μ / (1 - μ)). With load, rows
-of Phi have the factor 1 ± μ tanh(u / v) with the sign of tau_link, which comes from the fit before, until it stays.
+Velocities, slopes and load shares are fitted by their logarithms (a share by that of μ / (1 - μ)). With load, rows of
+Phi are multiplied by 1 ± μ tanh(u / v) with the sign of tau_link. The sign comes from the previous fit, and the fit is
+repeated until the signs no longer change.
 """
 
 import functools
@@ -35,34 +36,34 @@ from dln_jax.solvers.separable import SeparableSolution, solve_separable
 from dln_jax.types import FrictionLaw, InputError
 
 FIRST_LOAD = 0.05
-"""Share of load that a fit starts from."""
+"""Initial share of load."""
 LONGEST_STEP = 1.0
-"""Of an unknown in an iteration: a factor e of what is known by its logarithm."""
+"""Largest change of an unknown per iteration: a factor e for quantities fitted by their logarithm."""
 MOST_ROUNDS = 5
-"""Fits after which the signs of the link torques are taken as they are."""
+"""Largest number of fits; the signs of the link torques before the last one are then final."""
 
 
 class FrictionFit(NamedTuple):
-    """An identified tree with friction, and how well the data determine it."""
+    """Identified tree with friction, and its uncertainty."""
 
     model: Model
-    """With the shapes found: `dynamics(fit.model.energies(fit.parameters))`."""
+    """Model with the fitted shapes: `dynamics(fit.model.energies(fit.parameters))`."""
     parameters: RigidTreeParameters
     standard_errors: RigidTreeParameters
-    """Of each parameter, on what the data determine, in its unit."""
+    """Standard error of every parameter, in its unit, within the space that the data determine."""
     shape: dict[str, Float[np.ndarray, " d"]]
-    """What was found of `FrictionShape`, and "load"."""
+    """Fitted entries of `FrictionShape`, and "load"."""
     shape_errors: dict[str, Float[np.ndarray, " d"]]
-    """Standard error of each, in its unit."""
+    """Standard errors of the entries of `shape`, in their units."""
     rank: int
-    """Combinations of linear parameters that the data determine."""
+    """Number of combinations of linear parameters that the data determine."""
     condition: float
-    """Of their scaled columns."""
+    """Condition number of their scaled columns."""
     torque_mse: float
     """Mean over samples of the sum of squared errors over joints; (N m)² or N²."""
     converged: bool
     seconds: float
-    """Of the whole call, compilation included."""
+    """Duration of the whole call, compilation included."""
 
 
 def fit_friction(
@@ -76,23 +77,24 @@ def fit_friction(
     negligible: float = 1e-12,
     iterations: int = 50,
 ) -> FrictionFit:
-    """The inertias, armature and friction of a tree that explain measured torques best.
+    """Fits the inertias, armature and friction of a tree to measured torques.
 
-    All samples are held in memory, N d (11 d + coefficients) numbers: thin long logs.
+    All samples are held in memory, N d (11 d + coefficients) numbers: decimate long logs.
 
     Args:
-        tree: whose frames are known.
-        data: to fit; hold out the trajectories that the result is judged by.
-        laws: of friction, as in `mechanics.friction.laws`.
-        shape: where shapes start; by default that of `FrictionShape`.
-        held: numbers of shape that stay there.
-        noise: of each joint's torque [d], by which its samples are weighted; by default the torque's own deviation.
+        tree: tree with known frames.
+        data: samples to fit; hold out the trajectories that will judge the result.
+        laws: friction laws, as in `mechanics.friction.laws`.
+        shape: initial shapes; the defaults of `FrictionShape` if omitted.
+        held: names of shapes that stay at their initial value.
+        noise: standard deviations of the joints' torques [d], which weight the samples; the torque's own deviation by
+            default.
         negligible: as for `learning.linear.fit_linear`.
-        iterations: of Gauss-Newton, at most.
+        iterations: largest number of Gauss-Newton iterations.
 
     Raises:
-        InputError: unknown laws, nothing to find but linear coefficients (`fit_linear` finds them), torques that do not
-            vary, or a noise that is not positive.
+        InputError: unknown laws, only linear coefficients to fit (use `fit_linear`), torques that do not vary, or a
+            noise that is not positive.
     """
     began = time.perf_counter()
     require_laws(laws, "laws")
@@ -137,16 +139,16 @@ def fit_friction(
 
 
 class _Log(NamedTuple):
-    """What is known, an array with a row for each sample."""
+    """Known quantities, as arrays with one row per sample."""
 
     links: Any
     """Phi [N, d, 11 d]."""
     qd: Any
     tau: Any
     weights: Any
-    """[d], unit of each joint's residual."""
+    """[d], scale of the joints' residuals."""
     signs: Any = None
-    """[N, d], of the link torques."""
+    """[N, d], signs of the link torques."""
 
 
 def _equations(laws: tuple[FrictionLaw, ...], learned: tuple[str, ...], start: FrictionShape, unknowns: Any, log: _Log):
@@ -188,7 +190,7 @@ def _unknown(name: str, start: FrictionShape) -> Any:
 
 
 def _shapes(learned: tuple[str, ...], unknowns: Any, d: int) -> dict[str, Any]:
-    """The numbers that unknowns stand for, [d] each."""
+    """Shapes [d] that the unknowns stand for, by name."""
     inverse = {"sigmoid_shift": lambda x: x, "load": jax.nn.sigmoid}
     return {
         name: inverse.get(name, jnp.exp)(unknowns[place * d : (place + 1) * d]) for place, name in enumerate(learned)
@@ -196,7 +198,7 @@ def _shapes(learned: tuple[str, ...], unknowns: Any, d: int) -> dict[str, Any]:
 
 
 def _slope(name: str, value: np.ndarray) -> np.ndarray:
-    """Of a number by its unknown."""
+    """Derivative of a shape by its unknown."""
     return {"sigmoid_shift": np.ones_like(value), "load": value * (1 - value)}.get(name, value)
 
 

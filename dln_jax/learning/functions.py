@@ -1,12 +1,12 @@
-"""Fitting a differential network, or an ensemble of them, to samples of a function and of its derivatives.
+"""Fits a differential network, or an ensemble of them, to samples of a function and of its derivatives.
 
-Losses: type 1 reads values and Jacobians, type 2 values only (the published names); derivative 2 adds the Hessian to
-either. All are means over samples of sums of squares over components, without weights between the terms:
+Type 1 losses read values and Jacobians, type 2 losses only values (the published names); derivative 2 adds the Hessian
+to either. All are means over samples of sums of squares over components, without weights between the terms:
 
     r = [y_hat - y, dy_hat/dx - dy/dx, d²y_hat/dx² - d²y/dx²],   loss = mean over samples of |r|².
 
-The published recipe (Adam with decoupled weight decay, minibatches, constant rate) is for wide networks;
-Levenberg-Marquardt on all samples at once is for small ones, whose errors go down to what the noise leaves.
+The published recipe (Adam with decoupled weight decay, minibatches, constant rate) is for wide networks.
+Levenberg-Marquardt on all samples at once is for small networks, and reduces their errors to the level of the noise.
 """
 
 import functools
@@ -36,13 +36,13 @@ from dln_jax.types import InputError, Scalar, require_positive, require_seed
 
 LOSSES = ("type1", "type2")
 WIDTHS = (2, 4, 8, 16)
-"""Of hidden layers, for `grow_width`."""
+"""Widths of the hidden layers, for `grow_width`."""
 GAUSS_NEWTON = GaussNewton(steps=40, coarse_steps=200, improvement=1e-7)
 """For networks of `WIDTHS`."""
 
 
 class Network(NamedTuple):
-    """What is fitted to what; the defaults are the published ones."""
+    """Network and loss; the defaults are the published ones."""
 
     loss: str = "type1"
     """type1 or type2."""
@@ -53,21 +53,21 @@ class Network(NamedTuple):
     depth: int = 1
     """Hidden layers."""
     members: int = 1
-    """Networks of the ensemble, which differ in their initial parameters."""
+    """Networks in the ensemble, which differ in their initial parameters."""
     precision: str = "f32"
     """f32 or f64; Gauss-Newton needs f64."""
     seed: int = 0
-    """Of the initial parameters and the order of the samples."""
+    """Seed of the initial parameters and of the order of the samples."""
 
 
 Targets = tuple[Array, Array | None, Array | None, Array | None]
-"""x, y, dy and d2y of `FunctionSamples`; `None` is what a loss does not read, and is never computed."""
+"""x, y, dy and d2y of `FunctionSamples`; arrays that the loss does not read are `None` and never computed."""
 
 
 def published_adam(
     samples: int, *, epochs: int = 500, batch: int = 512, learning_rate: float = 1e-3, weight_decay: float = 1e-6
 ) -> Adam:
-    """The published recipe for so many samples: a constant rate, and no early stop."""
+    """Returns the published recipe for this number of samples: a constant rate and no early stopping."""
     require_positive(epochs=epochs, batch=batch)
     steps = epochs * (samples // min(batch, samples))
     return Adam(
@@ -84,10 +84,10 @@ def published_adam(
 
 
 def targets(data: FunctionSamples, network: Network) -> Targets:
-    """The arrays that the loss reads, on the device.
+    """Returns the arrays that the loss reads, on the device.
 
     Raises:
-        InputError: settings out of range, a derivative that the data lack, or numbers whose squares overflow.
+        InputError: settings are out of range, the data lack a derivative, or the squares of numbers overflow.
     """
     require_positive(members=network.members)
     require_seed(network.seed)
@@ -111,7 +111,7 @@ def targets(data: FunctionSamples, network: Network) -> Targets:
 def residual(
     layers: Layers, x: Array, y: Array | None, dy: Array | None, d2y: Array | None, *, activation: Activation
 ) -> Float[Array, "r"]:
-    """r of one sample, as far as there are targets: value, Jacobian and Hessian, flat, one after the other."""
+    """Returns r of one sample: errors of the value, Jacobian and Hessian that have targets, concatenated."""
     if d2y is not None:
         predicted = differential_mlp.value_jacobian_and_hessian(layers, x, activation=activation)
     elif dy is not None:
@@ -138,13 +138,12 @@ def train(
 ) -> Training:
     """Fits the training samples and keeps the parameters with the lowest loss on the validation samples.
 
-    The result's parameters are layers with the ensemble's members on the leading axis, also when there is one. Adam
-    shows all members the same batches and keeps one step for all; Gauss-Newton keeps the best of each. Reports and
-    history are means over the members. Devices of a mesh share the members where Gauss-Newton trains several, else the
-    samples.
+    The resulting layers have a leading axis of ensemble members, even if there is only one. With Adam, all members see
+    the same batches and share one best step; Gauss-Newton keeps the best step of every member. Reports and history are
+    means over the members. Devices of a mesh share the members if Gauss-Newton trains several, otherwise the samples.
 
     Raises:
-        InputError: what `targets` and `fit` refuse.
+        InputError: raised by `targets` or `fit`.
     """
     members = network.members if isinstance(optimiser, Adam) else 1
 
@@ -159,10 +158,10 @@ def train(
 
 
 def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool) -> Problem:
-    """The fit of an ensemble: its members as seeds of one program, for Gauss-Newton, or the sum of their losses.
+    """Builds the problem of fitting an ensemble: members as seeds (for Gauss-Newton), or the sum of their losses.
 
     Raises:
-        InputError: what `targets` refuses.
+        InputError: raised by `targets`.
     """
     ours, theirs = (targets(data, network) for data in sets)
     sizes = (sets.train.inputs, *(network.width,) * network.depth, sets.train.outputs)
@@ -173,9 +172,9 @@ def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool)
     of_member = functools.partial(mean_loss, activation=function)
 
     def together(layers: Layers, batch: Targets) -> Scalar:
-        """A sum, so that each member's gradient, and with it its training, is the same as alone."""
+        """The sum of losses leaves every member's gradient, and so its training, the same as alone."""
         if network.members == 1:
-            # An axis of one member would make every product a batch of products, at two or three times the cost.
+            # An axis of one member would turn all products into batched ones, at two or three times the cost.
             return of_member(jax.tree.map(lambda leaf: leaf[0], layers), batch)
         return jax.vmap(lambda member: of_member(member, batch))(layers).sum()
 
@@ -193,9 +192,9 @@ def problem(sets: SampleSplit, network: Network, *, each_member_by_itself: bool)
 def grow_width(
     sets: SampleSplit, network: Network, fit: Callable[[Network], Training], *, widths: Sequence[int] = WIDTHS
 ) -> tuple[Trial, list[Trial]]:
-    """Trains networks of growing width by `fit` and chooses the smallest that the validation calls enough.
+    """Trains networks of growing width with `fit` and chooses the smallest that no other betters significantly.
 
-    The outcome of each trial is its `Training`.
+    The outcome of a trial is its `Training`.
     """
 
     def fit_and_judge(candidate: Network) -> tuple[Training, Float[np.ndarray, " N"]]:
@@ -206,7 +205,7 @@ def grow_width(
 
 
 def validation_errors(sets: SampleSplit, network: Network, layers: Layers) -> Float[np.ndarray, " N"]:
-    """|r|² of each validation sample, the mean over the ensemble's members."""
+    """|r|² of every validation sample, averaged over the ensemble's members."""
     of_sample = functools.partial(residual, activation=activation(network.activation))
 
     @jax.jit

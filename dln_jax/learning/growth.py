@@ -1,7 +1,7 @@
-"""Only as much model as the data needs: candidates of growing size, and the smallest that the validation calls enough.
+"""Model selection by size: trains candidates of growing size, and takes the smallest that none betters significantly.
 
 A larger network always fits its training samples better, and soon fits their noise. Candidates are trained in order of
-size. One is better than another when its validation error is lower by more than the standard error of their paired
+size. One is better than another if its validation error is lower by more than the standard error of their paired
 difference over the validation samples (the one-standard-error rule of Breiman et al. 1984, paired).
 """
 
@@ -14,21 +14,21 @@ from jaxtyping import Float, Int
 from dln_jax.data.schema import Trajectories
 
 STRETCH = 0.5
-"""s of motion whose mean error counts as one measurement: neighbouring samples are not independent."""
+"""Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
 
 
 class Trial(NamedTuple):
-    """A candidate, and what came of it."""
+    """Candidate, outcome of its training, and validation errors."""
 
     candidate: Any
     outcome: Any
-    """What `fit` gave beside the errors, for example a `Training`."""
+    """First result of `fit`, for example a `Training`."""
     errors: Float[np.ndarray, " N"]
-    """Squared error of each validation sample."""
+    """Squared error of every validation sample."""
 
     @property
     def validation(self) -> float:
-        """Mean squared error; inf where it is not finite."""
+        """Mean squared error; inf if it is not finite."""
         mean = float(np.mean(self.errors))
         return mean if np.isfinite(mean) else float("inf")
 
@@ -49,15 +49,15 @@ def grow(
     patience: int = 2,
     target: float | None = None,
 ) -> tuple[Trial, list[Trial]]:
-    """Trains candidates in the order given, smallest first; returns the chosen one and all that were trained.
+    """Trains candidates in order, smallest first; returns the chosen trial and all trials.
 
-    Chosen is the first whose error no other candidate betters significantly.
+    The choice is the first candidate whose error no other betters significantly.
 
     Args:
         candidates: in order of size.
-        fit: candidate -> outcome, and the squared error of each validation sample.
-        patience: how many candidates in a row may bring no significant improvement before growing ends.
-        target: mean squared error at which growing ends at once.
+        fit: candidate -> outcome, and the squared error of every validation sample.
+        patience: stop after this many candidates in a row without significant improvement.
+        target: mean squared error at which to stop at once.
     """
     trials: list[Trial] = []
     best, waited = None, 0
@@ -74,13 +74,13 @@ def grow(
 
 
 def smallest_enough(trials: Sequence[Trial]) -> Trial:
-    """The first whose error no other betters significantly."""
+    """Returns the first trial whose error no other betters significantly."""
     lowest = min(trials, key=lambda trial: trial.validation)
     return next(trial for trial in trials if not significantly_better(lowest.errors, trial.errors))
 
 
 def stretches(data: Trajectories, seconds: float = STRETCH) -> Int[np.ndarray, " N"]:
-    """The number of the stretch of time that each sample is in; stretches do not reach across trajectories."""
+    """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
     within = np.floor(data.t / seconds).astype(int)
     within -= within.min()
     _, numbers = np.unique(data.trajectory * (within.max() + 1) + within, return_inverse=True)

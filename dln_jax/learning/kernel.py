@@ -1,11 +1,11 @@
-"""Fitting `models.trigonometric_kernel`: the scales by their likelihood, all else by one linear problem.
+"""Fits `models.trigonometric_kernel`: scales by maximum likelihood, weights by one linear solve.
 
     tau = O L + Phi c + noise,   cov = K + Phi S² Phiᵀ + diag(noise²),   weights = cov⁻¹ tau,   c = S² Phiᵀ weights
 
-with O the Euler-Lagrange operator, K the `own_covariance` of the samples, Phi the friction of coefficients c, whose
-prior is normal with deviations S, and a noise for each joint: the regulariser, of which nothing is hidden. Scales and
-noises maximise the marginal likelihood of the torques of some samples (L-BFGS; its gradient is exact), weights are the
-solution of N d equations (Cholesky).
+O is the Euler-Lagrange operator and K the `own_covariance` of the samples. Phi is the friction with coefficients c,
+whose prior is normal with deviations S. The noise of the joints is the only regulariser. Scales and noises maximise the
+marginal likelihood of the torques on a subset of the samples (L-BFGS with the exact gradient); the weights solve N d
+equations (Cholesky).
 """
 
 import time
@@ -28,27 +28,28 @@ from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 NOISIER = 3.0
-"""Factor by which the noise grows where the covariance is not positive definite to rounding."""
+"""Factor by which the noise is raised if the covariance is not positive definite to rounding."""
 
 
 class KernelFit(NamedTuple):
-    """A model of torques, and what the data say of it."""
+    """Model of torques, its likelihood and its errors."""
 
     parameters: Any
-    """Of `trigonometric-kernel` of the catalogue, in float64, with as many samples as `parameter_count` counts."""
+    """Parameters of the catalogue's `trigonometric-kernel`, in float64, for `samples` samples."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation that the equations have, N m or N: of the torques, and of what no such energy explains; more
-    than is most likely where the covariance would not be positive definite to rounding."""
+    """Standard deviation of the torque noise in the equations, N m or N; it includes torque that no such energy
+    explains. It exceeds the most likely value if the covariance would otherwise not be positive definite to
+    rounding."""
     likelihood: float
-    """Logarithm of the marginal likelihood by the torque, of all fitted samples; the higher the better."""
+    """Logarithm of the marginal likelihood per torque, over all fitted samples; higher is better."""
     torque_mse: float
     """Mean over fitted samples of the sum of squared errors over joints; (N m)² or N²."""
     samples: int
-    """That the energies are made of."""
+    """Number of samples that the energies are built from."""
     parameter_count: int
-    """Weights, and coefficients of friction."""
+    """Number of weights and friction coefficients."""
     seconds: float
-    """Of the whole call, compilation included."""
+    """Duration of the whole call, compilation included."""
 
 
 def fit_kernel(
@@ -62,23 +63,24 @@ def fit_kernel(
     least_noise: float = 1e-4,
     friction_scale: float = 1.0,
 ) -> KernelFit:
-    """The energies and friction that are most likely, given torques; in float64.
+    """Fits the most likely energies and friction to measured torques, in float64.
 
     Args:
-        needs: kinds of joints, gravity, and friction: viscous of each coordinate, and laws of joints but for load.
-        train: to fit; hold out what the result is judged by.
-        samples: at most, evenly spaced; memory is 16 samples² d² bytes, time grows with the third power.
+        needs: kinds of joints, gravity, and friction: viscous friction of the coordinates and joint laws except load.
+        train: samples to fit; hold out those that will judge the result.
+        samples: largest number of samples, evenly spaced; memory is 16 samples² d² bytes, time grows as the cube.
         serial: as for `make_trigonometric_kernel`.
-        likelihood_samples: of those, by which scales and noise are found.
-        iterations: of L-BFGS, at most.
-        least_noise: of a joint, relative to its torque's deviation, where data have none. What is too little for the
-            rounding of the equations is raised, by `NOISIER` at a time; the result's noise says what it came to.
-        friction_scale: S of a coefficient is this, over the torque of one unit of it in root mean square, each joint's
-            torque in units of its deviation.
+        likelihood_samples: number of these samples used to fit the scales and the noise.
+        iterations: largest number of L-BFGS iterations.
+        least_noise: lower bound on a joint's noise, relative to its torque's deviation, for data without noise. If it
+            is too low for the rounding of the equations, it is multiplied by `NOISIER` until it suffices; the result's
+            noise holds the final value.
+        friction_scale: S of a coefficient is this value over the root mean square torque of one unit of the
+            coefficient, with the joints' torques in units of their deviations.
 
     Raises:
-        InputError: torques that do not vary, joints that are not the data's, friction by load, or a setting that is not
-            positive.
+        InputError: torques that do not vary, a number of joints that differs from the data's, friction by load, or a
+            setting that is not positive.
     """
     from scipy.linalg import cho_solve
 
@@ -109,7 +111,7 @@ def fit_kernel(
         parameters=_parameters(needs, scales, every.states, weights, found),
         noise=noise,
         likelihood=float(-(0.5 * np.vdot(every.tau, weights) + diagonal) / weights.size),
-        # What the equations leave over is noise² weights.
+        # The residual of the equations is noise² weights.
         torque_mse=float(np.mean(np.sum((noise**2 * weights) ** 2, axis=1))),
         samples=len(weights),
         parameter_count=weights.size + found.size,
@@ -120,13 +122,13 @@ def fit_kernel(
 def choose_kernel(
     needs: Needs, train: Trajectories, validation: Trajectories, *, samples: int = 600
 ) -> tuple[Trial, list[Trial]]:
-    """A chain of bodies, or none assumed: the lower error at the validation samples, and both.
+    """Fits a serial chain and a model without that assumption; returns the better in validation, and both trials.
 
-    Of a `Trial` the candidate is `serial`, the outcome the `KernelFit`, and the errors are squares of torques, each
-    joint's in units of its deviation.
+    The candidate of a `Trial` is `serial` and its outcome the `KernelFit`. Its errors are squared torques in units of
+    the joints' deviations.
 
     Raises:
-        InputError: as `fit_kernel`.
+        InputError: as for `fit_kernel`.
     """
     trials = []
     for serial in (True, False):
@@ -142,7 +144,7 @@ def choose_kernel(
 def _factor(
     covariance: Float[np.ndarray, "Nd Nd"], noise: Float[np.ndarray, " d"], unit: Float[np.ndarray, " d"]
 ) -> tuple[Any, Float[np.ndarray, " d"]]:
-    """Cholesky's, of the covariance with noise, and the noise: more than was given where rounding asks for it."""
+    """Returns the Cholesky factor of the covariance with noise, and the noise, raised as far as rounding requires."""
     from scipy.linalg import cho_factor
 
     while (noise < unit).any():
@@ -159,7 +161,7 @@ def _factor(
 
 
 def _friction(needs: Needs, qd: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N d P"]:
-    """Torques of one unit of each coefficient of friction."""
+    """Torques of one unit of every friction coefficient."""
     d = needs.degrees_of_freedom
     if "load" in needs.joint_friction:
         raise InputError("friction by load multiplies what the energies give; leave load out, or train a network")
@@ -180,7 +182,7 @@ def _equations(data: Trajectories, friction: Float[np.ndarray, "N d P"], most: i
 
 
 def _parameters(needs: Needs, scales: KernelScales, states: States, weights: np.ndarray, friction: np.ndarray) -> Any:
-    """Of the catalogue's model."""
+    """Parameters of the catalogue's model."""
     d = needs.degrees_of_freedom
     own, of_laws = np.split(friction, [d if needs.friction else 0])
     found = jax.tree.map(jnp.asarray, KernelParameters(*states, weights, scales, own if needs.friction else None))

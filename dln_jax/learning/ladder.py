@@ -1,9 +1,9 @@
-"""A ladder of models for one recording, those that state most and cost least first, and which of them it asks for.
+"""Model selection for one recording: fits candidates, most structured and cheapest first, and chooses one.
 
-Each rung is fitted to the training motions and judged by the validation motions: squared errors of each joint's torque
-in units of its variance, so that a wrist counts as much as a shoulder. Chosen is the first rung whose mean error no
-other betters by more than the standard error of their difference over stretches of time (`learning.growth`). The climb
-ends early at errors that are the noise of the torques, or rounding, and when time is out.
+Candidates are fitted to the training motions and compared on the validation motions by squared torque errors in units
+of the joints' variances, so that a wrist counts as much as a shoulder. The choice is the first candidate whose mean
+error no other betters by more than the standard error of their difference over time segments (`learning.growth`). The
+selection ends early if the errors equal the noise of the torques, or rounding, and when time is up.
 """
 
 import time
@@ -22,55 +22,55 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
 
 EXACT = 1e-12
-"""Normalised error of every joint below which no rung is looked at any more."""
+"""No further candidate is tried once the normalised error of every joint is below this."""
 LEAST_NOISE, MOST_NOISE = 0.5, 1.2
-"""Times the noise's share of a torque's variance, within which the error of a joint is that noise. Where an error is
-lower, the estimated noise is none."""
+"""Range of a joint's error, relative to the noise's share of the torque's variance, that counts as that noise. A lower
+error shows that the estimate of the noise is wrong."""
 
 
 class Fitted(NamedTuple):
-    """What a rung came to."""
+    """A fitted candidate."""
 
     model: Model
     parameters: Parameters
     outcome: Any = None
-    """What else there is to keep."""
+    """Further results of the fit."""
 
 
 class Rung(NamedTuple):
-    """A kind of model."""
+    """A candidate of the model selection."""
 
     name: str
     fit: Callable[[float], Fitted | str]
-    """Seconds that are left -> the fitted model, or why there is none. May raise InputError, which is such a reason."""
+    """Remaining seconds -> the fitted model, or the reason why there is none. An InputError counts as a reason."""
 
 
 class Step(NamedTuple):
-    """A rung, and how it did."""
+    """A candidate and its validation errors."""
 
     name: str
     fitted: Fitted | None
     errors: Float[np.ndarray, "S d"] | None
-    """Normalised squared error of each stretch of validation motion, by joint; `None` where there is no model."""
+    """Normalised squared error of every segment of the validation motions, by joint; `None` without a model."""
     nmse: Float[np.ndarray, " d"] | None
-    """Mean over validation samples, likewise."""
+    """Normalised mean squared error over the validation samples, by joint; `None` without a model."""
     seconds: float
-    """Of the fit, compilation included."""
+    """Duration of the fit, compilation included."""
     reason: str = ""
-    """Why there is no model."""
+    """Reason why there is no model."""
     tried: bool = True
-    """Whether it was its turn."""
+    """Whether a fit was attempted."""
 
 
 class Climb(NamedTuple):
-    """The rungs that were tried or passed over, in order."""
+    """Result of a model selection: all candidates in order, tried or not."""
 
     chosen: Step
     fitted: Fitted
-    """The chosen model."""
+    """The chosen candidate's model."""
     steps: tuple[Step, ...]
     ended: str
-    """Why no further rung was tried; empty where all were."""
+    """Reason why no further candidate was tried; empty if all were."""
 
 
 def climb(
@@ -82,19 +82,19 @@ def climb(
     seconds: float = float("inf"),
     report: Callable[[Step], None] = lambda step: None,
 ) -> Climb:
-    """Fits rungs in the order given, and chooses the first that no other is better than.
+    """Fits candidates in order and chooses the first that no other betters significantly.
 
     Args:
-        rungs: those that state most first; of two that do equally well the first is chosen.
-        train: what they are fitted to, whose torques' variances are the units of errors.
+        rungs: candidates, most structured first; of two equally good ones the first is chosen.
+        train: samples to fit; the variances of their torques are the units of the errors.
         validation: other motions.
-        noise: standard deviation of each measured torque, N m or N, where it is known: no rung is tried once that is
-            all the error there is.
-        seconds: after which no further rung is tried; the first that can be fitted is.
-        report: told of every rung once it is done with.
+        noise: standard deviation of the joints' measured torques, N m or N, if known: the selection ends once the
+            errors equal it.
+        seconds: time limit; at least the first candidate that can be fitted is.
+        report: called with the result of every candidate.
 
     Raises:
-        InputError: seconds that are not positive, torques that do not vary, or no rung that could be fitted.
+        InputError: seconds that are not positive, torques that do not vary, or no candidate that could be fitted.
     """
     require_positive(seconds=seconds)
     began, steps, ended = time.perf_counter(), [], ""
@@ -124,7 +124,7 @@ def climb(
 def torque_errors(
     model: Model, parameters: Parameters, data: Trajectories, scale: Float[np.ndarray, " d"]
 ) -> Float[np.ndarray, "N d"]:
-    """Squared error of each joint's torque at each sample, in float64, in units of the scale's square."""
+    """Squared torque error of every sample and joint, computed in float64, in units of the squared scale."""
     with jax.enable_x64(True):
         judge = jax.jit(lambda given, batch: residuals(TORQUE, model.energies(given), batch))
         errors = np.asarray(judge(parameters, arrays(TORQUE, data, jnp.float64)))
@@ -152,7 +152,7 @@ def _tried(
 
 
 def _ended(step: Step, share: Float[np.ndarray, " d"] | None) -> str:
-    """Why no other rung can be better, if so."""
+    """Returns the reason why no other candidate can be better, or an empty string."""
     if step.nmse is None:
         return ""
     if (step.nmse <= EXACT).all():

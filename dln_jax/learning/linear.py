@@ -1,14 +1,14 @@
-"""Fitting models whose forces are linear in their parameters: one least-squares problem, no iteration.
+"""Fits models whose forces are linear in their parameters: one least-squares problem, no iteration.
 
     tau = Phi(q, qd, qdd) theta,   theta minimises sum over samples of |(Phi theta - tau) / torque_scale|²
 
-Any `Model` of that kind will do, such as `models.trigonometric`. Phi is the derivative of the inverse model with
-respect to the parameters, exact because it is linear.
+This works for any `Model` of that kind, such as `models.trigonometric`. Phi is the derivative of the inverse model with
+respect to the parameters, exact because the model is linear in them.
 
-`choose_degrees` finds how much of a trigonometric basis data ask for. One degree for all joints grows until it no
-longer helps (`learning.growth`); where that is more than 1, each joint in turn is given the smallest degree that is not
-significantly worse. A joint that neither turns the mass matrix nor lifts a weight, such as an arm's first vertical
-axis, ends at degree 0, which divides the basis by 2 n + 1.
+`choose_degrees` selects the size of a trigonometric basis. One degree for all joints grows until it no longer helps
+(`learning.growth`). If that degree exceeds 1, every joint in turn takes the smallest degree that is not significantly
+worse. A joint that neither changes the mass matrix nor lifts a weight, such as an arm's first vertical axis, ends at
+degree 0, which divides the size of the basis by 2 n + 1.
 """
 
 import functools
@@ -33,12 +33,12 @@ from dln_jax.types import InputError, Needs, require_positive
 from dln_jax.zoo.catalogue import CATALOGUE
 
 LARGEST_DEGREE = 4
-"""That is tried."""
+"""Largest degree that is tried."""
 MOST_PARAMETERS = 1_500
-"""Of a basis that is tried; a fit takes some N d P² operations."""
+"""Largest basis that is tried; a fit takes about N d P² operations."""
 ROUNDING = 1e-10
-"""Error, relative to the torque, below which no basis is better than another."""
-# Phi theta may differ from the model's force by the rounding of its sum, relative to the sum of absolute terms.
+"""Error, relative to the torque, below which bases count as equally good."""
+# The model's force may differ from Phi theta by the rounding of its sum, relative to the sum of absolute terms.
 _LINEARITY_TOLERANCE = 1e-9
 _NOT_LINEAR = (
     "the model's torque is not linear in its parameters, as a linear fit expects: "
@@ -50,17 +50,17 @@ class LinearFit(NamedTuple):
     """Identified parameters, and how well the data determine them."""
 
     parameters: Any
-    """Of the model, in its dtype."""
+    """Parameters of the model, in its dtype."""
     parameter_count: int
     """P, the number of parameters."""
     rank: int
-    """Combinations of parameters that the data determine; the other P - rank have no part in the solution."""
+    """Number of combinations of parameters that the data determine; the solution has no part in the other P - rank."""
     condition: float
-    """Of the scaled columns that count: the most by which relative errors of the data can grow."""
+    """Condition number of the scaled columns that count: the largest amplification of relative errors of the data."""
     torque_mse: float
     """Mean over the fitted samples of the sum of squared errors over joints, in float64; (N m)² or N²."""
     seconds: float
-    """Of the whole call, compilation included."""
+    """Duration of the whole call, compilation included."""
 
 
 def fit_linear(
@@ -72,17 +72,19 @@ def fit_linear(
     negligible: float = 0.0,
     chunk_size: int = 4096,
 ) -> LinearFit:
-    """The parameters that minimise the torque error on the data, computed in float64 whatever the model's dtype.
+    """Fits the parameters that minimise the torque error on the data, in float64 whatever the model's dtype.
 
-    Takes some N d P² operations. Where the data leave combinations of parameters undetermined, the solution is the
-    shortest one (see `solvers.least_squares`), which predicts the same forces along motions like those of the data.
+    It takes about N d P² operations. If the data leave combinations of parameters undetermined, the result is the
+    shortest solution (see `solvers.least_squares`), which predicts the same forces along motions like those of the
+    data.
 
     Args:
         model: linear in its parameters.
-        data: trajectories to fit; hold out those that the result is judged by.
+        data: trajectories to fit; hold out those that will judge the result.
         ridge: dimensionless, as in `solvers.least_squares.solve`.
         rank_tolerance: as in `solvers.least_squares.solve`; by default rounding alone.
-        negligible: as there; about 1e-12 for rigid trees, some of whose parameters have no effect but rounding's.
+        negligible: as in `solvers.least_squares.solve`; use about 1e-12 for rigid trees, because some of their columns
+            hold only rounding errors.
         chunk_size: samples whose design matrix is in memory at a time.
 
     Raises:
@@ -111,7 +113,7 @@ def fit_linear(
             squares += float(np.sum((predicted - tau) ** 2))
             weighted += float(np.sum(((predicted - tau) / scale) ** 2))
             bound += float(np.sum((rounding / scale) ** 2))
-        # A force that is homogeneous in its parameters passes sample by sample; its residual is another.
+        # A force that is homogeneous in its parameters passes the test per sample; only its total residual differs.
         if not abs(weighted**0.5 - solution.residual) <= bound**0.5:
             raise InputError(_NOT_LINEAR)
     return LinearFit(
@@ -126,13 +128,13 @@ def fit_linear(
 
 @functools.lru_cache(maxsize=4)
 def design(model: Model) -> Callable:
-    """(parameters, q, qd, qdd [N, d] each) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
+    """(parameters, q, qd, qdd as [N, d]) -> Phi [N, d, P] and tau [N, d]: `linearised`, compiled."""
     one = functools.partial(linearised, model)
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0)), compiler_options=quick_compilation())
 
 
 def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """By how much rounding may part Phi theta from the model's force; `InputError` where more does."""
+    """Returns the bound on the rounding between Phi theta and the force; raises `InputError` if they differ by more."""
     rounding = _LINEARITY_TOLERANCE * (abs(columns) @ abs(theta))
     if not (abs(columns @ theta - predicted) <= rounding).all():
         raise InputError(_NOT_LINEAR)
@@ -140,7 +142,7 @@ def require_linear(columns: np.ndarray, theta: np.ndarray, predicted: np.ndarray
 
 
 def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
-    """A tree like another, of the elements of a vector in the order of its leaves; NumPy, so that nothing compiles."""
+    """Returns a tree like another from a vector, in the order of its leaves; nothing is compiled."""
     leaves, structure = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = (vector[end - leaf.size : end].reshape(leaf.shape) for leaf, end in zip(leaves, ends, strict=True))
@@ -150,7 +152,7 @@ def unravelled(vector: np.ndarray, like: Parameters) -> Parameters:
 def design_chunks(
     linearise: Callable, parameters: Parameters, data: Trajectories, chunk_size: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Phi, the model's tau and the measured tau of equally many samples at a time; the last chunk may be shorter."""
+    """Phi, the model's tau and the measured tau, in chunks of equal length; the last one may be shorter."""
     samples = len(data.tau)
     return _chunks(linearise, parameters, data, -(-samples // -(-samples // chunk_size)))
 
@@ -160,7 +162,7 @@ def linearised_chunks(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Phi [n, d, P], the model's tau and the measured tau [n, d] of n <= length samples at a time.
 
-    Of any number of samples by one program, in the dtype of the parameters.
+    One program serves any number of samples, in the dtype of the parameters.
     """
     return _chunks(design(model), parameters, data, length)
 
@@ -170,7 +172,7 @@ def _chunks(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     samples = len(data.tau)
     for first in range(0, samples, length):
-        # The last chunk is filled up with its first sample, so that all are one program.
+        # The last chunk is padded with its first sample, so that one program serves all chunks.
         rows = np.arange(first, first + length)
         rows[rows >= samples] = first
         last = min(first + length, samples)
@@ -179,15 +181,14 @@ def _chunks(
 
 
 def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) -> tuple[Trial, list[Trial]]:
-    """The chosen degrees, one for each joint, and all that were tried.
+    """Chooses the degree of every joint; returns the chosen trial and all trials.
 
-    Of a `Trial`, the candidate is the degrees, the outcome the `LinearFit` in float64, and the errors are those of the
-    torques at the validation samples, squared, in units of each joint's `torque_scale` and summed over joints. Degrees
-    above 1 are tried while they have no more parameters than the training data have equations, and than
-    `MOST_PARAMETERS`.
+    The candidate of a `Trial` is the degrees, and the outcome is the `LinearFit` in float64. Its errors are squared
+    torque errors of the validation samples in units of the joints' `torque_scale`, summed over joints. Degrees above 1
+    are tried while they have at most `MOST_PARAMETERS` parameters, and no more than the training data have equations.
 
     Raises:
-        InputError: the basis of degree 1 is too large, or what `fit_linear` refuses.
+        InputError: the basis of degree 1 is too large, or `fit_linear` refuses the data.
     """
     d = needs.degrees_of_freedom
     make = CATALOGUE["trigonometric"].factory
@@ -219,7 +220,7 @@ def choose_degrees(needs: Needs, train: Trajectories, validation: Trajectories) 
 
 
 def parameters_of_degree(needs: Needs, degree: int) -> int | None:
-    """Of the trigonometric model with this degree in every joint; `None` where it is too large to be made."""
+    """Number of parameters of the trigonometric model with this degree in every joint; `None` if it is too large."""
     try:
         model = CATALOGUE["trigonometric"].factory(needs, degree=degree)
     except InputError:

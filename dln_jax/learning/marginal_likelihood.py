@@ -1,9 +1,13 @@
-"""Scales and noise of the energies of `models.trigonometric_kernel`, by the marginal likelihood of torques.
+"""Fits the scales and noise of the energies of `models.trigonometric_kernel` by the marginal likelihood of torques.
 
     -log p = ½ tauᵀ cov⁻¹ tau + ½ log det cov + const,   cov = K + Phi S² Phiᵀ + diag(noise²)
 
-as `learning.kernel` has it. L-BFGS descends it. The slope is sum(W dK), W = (cov⁻¹ - weights weightsᵀ) / 2, so that no
-factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning", equation 5.9).
+The notation is that of `learning.kernel`. L-BFGS minimises -log p. Its gradient is
+
+    sum(W dK),   W = (cov⁻¹ - weights weightsᵀ) / 2
+
+so that no factorisation is differentiated (Rasmussen and Williams 2006, "Gaussian processes for machine learning",
+equation 5.9).
 """
 
 import functools
@@ -20,15 +24,15 @@ from dln_jax.models.trigonometric_kernel import KernelScales
 from dln_jax.types import JointKind, Needs
 
 FIRST_NOISE = 0.05
-"""Of the torques' deviation, from which the search starts."""
+"""Initial noise, relative to the torques' deviation."""
 FEW = 16
-"""States whose torques' variance sets the scales to start from."""
+"""Number of states whose torque variance sets the initial scales."""
 _REFUSED = 1e10
-"""Likelihood of scales whose covariance rounding leaves indefinite."""
+"""Objective of scales whose covariance is indefinite due to rounding."""
 
 
 class Equations(NamedTuple):
-    """Torques of samples, and what friction has in them."""
+    """Torques of samples, and the regressor of their friction."""
 
     states: States
     friction: Any
@@ -38,7 +42,7 @@ class Equations(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """Logarithms."""
+    """Logarithms of the scales and of the noise."""
 
     scales: KernelScales
     noise: Any
@@ -48,7 +52,7 @@ class Unknowns(NamedTuple):
 def likeliest(
     needs: Needs, serial: bool, equations: Equations, unit: np.ndarray, *, iterations: int, least_noise: float
 ) -> Unknowns:
-    """Scales and noise that maximise the marginal likelihood."""
+    """Returns the scales and noise that maximise the marginal likelihood."""
     from scipy.optimize import minimize
 
     start = Unknowns(start_of(needs, serial, equations, unit), np.log(FIRST_NOISE * unit))
@@ -75,7 +79,7 @@ def likeliest(
 
 
 def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknowns, Equations], Any]:
-    """(unknowns, equations) -> minus its logarithm by the torque, without the constant, and the slope."""
+    """(unknowns, equations) -> minus the log likelihood per torque, without the constant, and its gradient."""
 
     def evaluate(unknowns: Unknowns, equations: Equations) -> Any:
         states, friction, tau = equations
@@ -99,9 +103,9 @@ def likelihood(joints: tuple[JointKind, ...], serial: bool) -> Callable[[Unknown
 
 
 def start_of(needs: Needs, serial: bool, equations: Equations, unit: np.ndarray) -> KernelScales:
-    """Logarithms of scales at which each energy explains torques of the size that they have, with random frames.
+    """Returns logarithms of scales at which the energies explain torques of the measured size, with random frames.
 
-    A vector in a randomly turned frame keeps a third of its square where it is parallel to the joint's axis.
+    A randomly rotated vector keeps on average a third of its squared length along the joint's axis.
     """
     d = needs.degrees_of_freedom
     bodies = d if serial else 1
@@ -116,7 +120,7 @@ def start_of(needs: Needs, serial: bool, equations: Equations, unit: np.ndarray)
     few = States(*(each[:: max(1, len(each) // FEW)] for each in equations.states))
 
     def size(scales: KernelScales) -> float:
-        """Mean variance of torques in units of those that were measured; 1 where nothing moves."""
+        """Mean variance of torques in units of the measured ones; 1 if nothing moves."""
         variance = np.diagonal(compiled_covariance(needs.joints, serial)(scales, few)).reshape(-1, d)
         return float(np.mean(variance / unit**2)) or 1.0
 

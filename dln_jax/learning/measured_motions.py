@@ -1,18 +1,19 @@
-"""Motions of which coordinates were measured, matched in coordinates and velocities, with or without torques.
+"""Fits trajectories with measured coordinates in q and qd, with or without torques (multiple shooting).
 
-The state is (q, qd), so that momenta p = dL/dqd are the model's own, and coupled joints are no harder than one: any
-energies of `mechanics.equations.dynamics` will do. A window of T samples is matched by
+The state is (q, qd). Momenta p = dL/dqd are the model's own, so coupled joints are no harder than a single one, and any
+energies of `mechanics.equations.dynamics` work. The residual of a window of T samples is
 
     r_w(theta, z) = [(q(t; z, theta) - q_measured) / noise_q,  (qd(t; z, theta) - qd_measured) / noise_qd]
 
-where qd has been measured too, and minimise over theta and all starts z_w: sum over windows of |r_w|². Starts are
-eliminated window by window: z_w(theta) is found by Gauss-Newton, and the derivative of what is left of r_w is that of
-Kaufman (`learning.starts`). The problem's parameters are those of the model alone, however many windows there are.
+with the second part only if qd was measured. The fit minimises the sum over windows of |r_w|² over theta and all starts
+z_w. Starts are eliminated window by window: Gauss-Newton solves for z_w(theta), and the derivative of the remaining r_w
+is that of Kaufman (`learning.starts`). The problem's parameters are those of the model alone, for any number of
+windows.
 
-Torques that are off push motions off course. With `Noise.tau` each window has a torque e_w more, constant and unknown,
-and a residual e_w / noise_tau: between matching motions under exact torques, and matching torques of exact motions.
+Torque errors drive simulated motions off course. With `Noise.tau` every window has an unknown constant torque e_w and a
+residual e_w / noise_tau: a compromise between matching motions under exact torques and torques of exact motions.
 
-Motion without torques fits any multiple of an energy: a `Gauge` says which one is meant.
+Motion without torques fits any multiple of an energy: a `Gauge` fixes the multiple.
 """
 
 from typing import NamedTuple
@@ -35,18 +36,18 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Scalar, require_positive
 
 GAUGE_TOLERANCE = 0.01
-"""Relative distance from a gauge that counts as one standard deviation; it can be met exactly, and is."""
+"""Relative distance from a gauge that counts as one standard deviation; the fit meets the gauge exactly."""
 
 
 class MeasuredWindows(NamedTuple):
-    """W equally long windows; the shorter ones repeat their last sample, with weight zero."""
+    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
 
     t: np.ndarray
     """Time since the window's first sample [W, T], in s."""
     q: np.ndarray
     """[W, T, d]."""
     qd: np.ndarray
-    """[W, T, d], measured, or an estimate that only the first start is taken from."""
+    """[W, T, d], measured, or an estimate that only provides the initial start."""
     tau: np.ndarray
     """[W, T, d]."""
     weight: np.ndarray
@@ -54,27 +55,27 @@ class MeasuredWindows(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard deviations of what was measured, one for each coordinate or one for all."""
+    """Standard deviations of the measurements, one per coordinate or one for all."""
 
     q: tuple[float, ...] | float
     qd: tuple[float, ...] | float | None = None
-    """`None` where velocities were not measured."""
+    """`None` if velocities were not measured."""
     tau: tuple[float, ...] | float | None = None
-    """Of the mean torque over a window; `None` where torques are exact. What pushes a motion off course is then an
-    unknown of each window, as its start is."""
+    """Standard deviation of the mean torque over a window; `None` if torques are exact. The torque error is then
+    an unknown of every window, like its start."""
 
 
 class Gauge(NamedTuple):
-    """Which of the multiples of an energy is meant, that are all the same to motions without torques."""
+    """Fixes the multiple of an energy, which motions without torques leave free."""
 
     q: tuple[float, ...]
-    """Where the mass matrix is looked at."""
+    """Position at which the mass matrix is evaluated."""
     mass: float = 1.0
-    """The mean of its diagonal there, kg m² or kg."""
+    """Mean of its diagonal there, kg m² or kg."""
 
 
 def cut_measured_windows(data: Trajectories, length: int, *, gap: float = GAP) -> MeasuredWindows:
-    """Consecutive windows of `length` samples within stretches without a gap.
+    """Cuts consecutive windows of `length` samples within segments without a gap.
 
     Raises:
         InputError: a length below 2, or no two samples without a gap between them.
@@ -93,7 +94,7 @@ def motion(
     torque: Torque = "interpolated",
     substeps: int = 1,
 ) -> Float[Array, "T two_d"]:
-    """States (q, qd) at the times t from `start`, by RK4, under torques or none."""
+    """States (q, qd) at the times t from `start`, by RK4, with or without torques."""
     d = start.shape[0] // 2
     driving = jnp.zeros((t.shape[0], d), start.dtype) if tau is None else tau
 
@@ -119,24 +120,25 @@ def problem(
     substeps: int = 1,
     seed: int = 0,
 ) -> Problem:
-    """The fit of a model's parameters to windows, in float64; starts are eliminated.
+    """Builds the problem of fitting a model's parameters to windows, in float64, with the starts eliminated.
 
-    Selected are the parameters whose motions come closest to the validation windows, whose starts are fitted too.
+    The validation windows select the parameters, by the distance of simulated motions after fitting their starts too.
 
     Args:
-        model: of any energies, or of accelerations, with float64 parameters.
-        parameters: to start from, such as those of `learning.accelerations`.
-        windows: to fit.
-        validation: to select by.
-        noise: of the measurements; a loss of d (or 2 d where velocities were measured) is then noise alone, less what
-            the starts take up.
-        gauge: what motions without torques need, and others do not.
-        torque: between samples.
-        substeps: of RK4 between two samples.
-        seed: of the order of the windows.
+        model: built from any energies, or from accelerations, with float64 parameters.
+        parameters: initial parameters, for example from `learning.accelerations`.
+        windows: windows to fit.
+        validation: windows that select the parameters.
+        noise: standard deviations of the measurements; a loss of d (or 2 d if velocities were measured) is then noise
+            alone, less what the starts take up.
+        gauge: fixes the scale of the energies; needed only for motions without torques.
+        torque: torque between samples.
+        substeps: RK4 steps between two samples.
+        seed: seed of the order of the windows.
 
     Raises:
-        InputError: no windows, noise that is not positive, no gauge where there are no torques, or one of another size.
+        InputError: no windows, noise that is not positive, motions without torques and without a gauge, or a gauge of
+            another size.
     """
     require_positive(substeps=substeps)
     d = windows.q.shape[2]
@@ -172,7 +174,7 @@ def problem(
 
 
 def check_gauge(gauge: Gauge | None, d: int) -> None:
-    """Raises `InputError` for a gauge of another number of coordinates, or a mass that is not positive."""
+    """Raises `InputError` for a gauge with another number of coordinates, or a mass that is not positive."""
     if gauge is None:
         return
     require_positive(gauge_mass=gauge.mass)
@@ -181,7 +183,7 @@ def check_gauge(gauge: Gauge | None, d: int) -> None:
 
 
 def gauge_error(system: Dynamics | PlainDynamics, gauge: Gauge | None) -> Float[Array, " n"]:
-    """How far the mass matrix is from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without one or energies."""
+    """Distance of the mass matrix from the gauge, in units of `GAUGE_TOLERANCE` [1]; empty without them."""
     if gauge is None or not isinstance(system, Dynamics):
         return jnp.zeros(0)
     M = system.mass_matrix(jnp.asarray(gauge.q))

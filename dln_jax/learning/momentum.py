@@ -1,9 +1,9 @@
-"""Any energies fitted to q, qd and tau in weak form: `learning.weak_forms` for models not linear in their parameters.
+"""Fits any energies to q, qd and tau in weak form: `learning.weak_forms` for models not linear in their parameters.
 
     r_w = [integral w (s - tau) dt - integral w' p dt] / unit_w,   p = M(q) qd,   s = tau(q, qd, 0) - dM/dt qd
 
-for each window w, which is zero at both its ends: the change of momentum under the forces that were measured. There
-are no accelerations in it, and torques that jump, held between samples, are no harder than smooth ones.
+The window w is zero at both ends; r_w compares the change of momentum with the measured forces. It contains no
+accelerations, and torques that are held between samples are no harder to fit than smooth ones.
 """
 
 from collections.abc import Sequence
@@ -30,20 +30,20 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 class MomentumWindows(NamedTuple):
-    """W windows of S steps each."""
+    """W windows of S steps."""
 
     q: Float[np.ndarray, "W S+1 d"]
     qd: Float[np.ndarray, "W S+1 d"]
     impulse: Float[np.ndarray, "W d"]
-    """Integral of w tau dt, N m or N: of a window whose integral is 1, a mean torque."""
+    """Integral of w tau dt, N m or N: a mean torque if the integral of w is 1."""
     dt: float
 
 
 def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> MomentumWindows:
-    """Overlapping windows of a length in s, within stretches without a gap.
+    """Cuts overlapping windows of a length in s, within segments without a gap.
 
     Raises:
-        InputError: no stretch is as long as a window.
+        InputError: no segment is as long as a window.
     """
     require_positive(window=window)
     pieces = stretches(data.t, data.trajectory)
@@ -62,14 +62,14 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
 
 
 def momentum_errors(plant: Dynamics, q: Array, qd: Array, impulse: Array, *, dt: float) -> Array:
-    """What is left of one window's equations [d], in N m or N."""
+    """Residual of one window's equations [d], in N m or N."""
     w, slope = (jnp.asarray(each) for each in window_weights(q.shape[0] - 1, dt))
     p, rest = jax.vmap(lambda q, qd: momentum_and_rest(plant, q, qd))(q, qd)
     return w @ rest - slope @ p - impulse
 
 
 def deviations(plant: Dynamics, windows: MomentumWindows) -> Float[np.ndarray, " d"]:
-    """Root mean square over windows of what a model leaves of each joint's equation, N m or N."""
+    """Root mean square over windows of the residuals of the joints' equations, N m or N."""
     left = jax.jit(jax.vmap(lambda *window: momentum_errors(plant, *window, dt=windows.dt)))(*windows[:3])
     return np.sqrt(np.mean(np.asarray(left) ** 2, axis=0))
 
@@ -83,18 +83,18 @@ def momentum_problem(
     unit: Sequence[float] | Float[np.ndarray, " d"],
     seed: int = 0,
 ) -> Problem:
-    """The fit of a model's parameters to windows, selected by validation windows, in float64.
+    """Builds the problem of fitting a model's parameters to windows, selected by validation windows, in float64.
 
     Args:
         model: of energies in coordinates and velocities.
-        parameters: to start from.
-        windows: to fit.
-        validation: to select by.
-        unit: of each joint's residual [d], N m or N, such as what another model leaves (`deviations`).
-        seed: of the order of the windows.
+        parameters: initial parameters.
+        windows: windows to fit.
+        validation: windows that select the parameters.
+        unit: scale of the joints' residuals [d], N m or N, for example the residuals of another model (`deviations`).
+        seed: seed of the order of the windows.
 
     Raises:
-        InputError: a unit that is not positive, or windows of another length for validation.
+        InputError: a unit that is not positive, or validation windows of another length.
     """
     for size in unit:
         require_positive(unit=float(size))
@@ -118,17 +118,17 @@ def momentum_problem(
 
 
 def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
-    """Torques as they act at the samples, of those that were asked for: late by whole samples, and held in between.
+    """Returns the torques that act at the samples, from commanded torques that are delayed and held between samples.
 
-    A torque that is held over a step has at a sample the mean of what was held before it and after it. The first
-    torques of a trajectory, before anything was asked for, are zero.
+    A torque held over a step contributes to both its ends: the torque at a sample is the mean of those held before and
+    after it. The first torques of a trajectory, before the first command, are zero.
 
     Args:
-        data: torques asked for at each sample.
-        delay: samples for which they were on their way.
+        data: with the commanded torques.
+        delay: delay of the commands in samples.
 
     Raises:
-        InputError: a delay that is no whole number, or negative.
+        InputError: a delay that is not a whole number, or negative.
     """
     if delay < 0 or delay != int(delay):
         raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
@@ -141,16 +141,16 @@ def driven_torques(data: Trajectories, *, delay: Any) -> Trajectories:
 
 
 def delay_of_torques(model: Model, recording: Trajectories, *, most: int, window: float = WINDOW) -> int:
-    """Samples by which torques are late, with which a model that is linear in its parameters leaves least.
+    """Estimates the delay of torques in samples: the smallest residual of a model linear in its parameters decides.
 
     Args:
-        model: such as `models.make_trigonometric`.
-        recording: q and the torques that were asked for.
-        most: delays that are tried, from 0.
-        window: s.
+        model: for example `models.make_trigonometric`.
+        recording: q and the commanded torques.
+        most: largest delay that is tried; the smallest is 0.
+        window: length of a window in s.
 
     Raises:
-        InputError: as `smooth` and `cut_momentum_windows`.
+        InputError: as for `smooth` and `cut_momentum_windows`.
     """
     smoothed = smooth(recording)
     windows = cut_momentum_windows(smoothed.data, window=window)

@@ -1,15 +1,16 @@
-"""Trajectory matching: a phase field is fitted so that its motions pass through what was measured (multiple shooting).
+"""Trajectory matching: fits a phase field so that its motions pass through the measurements (multiple shooting).
 
 Trajectories are cut into short windows. A window's motion starts at a state z_w that is itself unknown:
 
     minimise over theta and all z_w:   sum over windows and samples of |(x(t; z_w, theta) - x_measured) / state_noise|²
                                        [ + |(rates(x(t)) - rates_measured) / rate_noise|² where rates were measured ]
 
-(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) No derivative is estimated and no noise is differentiated,
-and a free start lets noise average out where derivative matching, which evaluates the field at noisy states, is biased.
+(Bock 1981; Hairer, Norsett and Wanner 1993, section II.6.) No derivative is estimated and no noise is differentiated.
+Free starts average out noise, whereas derivative matching evaluates the field at noisy states and is biased.
+
 Windows never reach across a gap, that is, a time step of more than 1.5 times the median. Gauss-Newton solves for
-theta and all starts at once; its matrix has a row for each. Adam, for networks that are too large for that, takes
-batches of windows, and its steps cost the same whatever their number.
+theta and all starts at once; its matrix has a row for every unknown. Adam, for networks that are too large for that,
+takes batches of windows, and the cost of its steps does not depend on the number of windows.
 """
 
 import functools
@@ -34,11 +35,11 @@ from dln_jax.solvers.elimination import solve
 from dln_jax.types import InputError, Scalar, require_positive
 
 START_STEPS = 3
-"""Of Gauss-Newton, to the start of a validation window."""
+"""Gauss-Newton steps that fit the start of a validation window."""
 
 
 class Windows(NamedTuple):
-    """Stretches of W equally long windows; the shorter ones repeat their last sample, with weight zero."""
+    """W windows of equal length; shorter ones repeat their last sample with weight zero."""
 
     t: np.ndarray
     """Time since the window's first sample [W, T], in s."""
@@ -51,18 +52,18 @@ class Windows(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Standard deviations that residuals are divided by; a larger one counts for less."""
+    """Standard deviations that divide the residuals; a larger one gives less weight."""
 
     state: tuple[float, ...] | float
-    """Of q and p, one number or 2 d; infinite for what was not measured."""
+    """Of q and p, one number or 2 d; infinite for quantities that were not measured."""
     rate: tuple[float, ...] | float | None = None
     """Of qd and pd, one number or 2 d; `None` leaves measured rates out."""
 
 
 def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows:
-    """Consecutive windows of `length` samples; each begins with the sample that the one before it ends with.
+    """Cuts consecutive windows of `length` samples; a window begins with the last sample of the one before.
 
-    Windows lie within stretches without a gap. What remains of a stretch is a shorter window.
+    Windows lie within segments without a gap. The remainder of a segment is a shorter window.
 
     Raises:
         InputError: a length below 2, no momenta, or no two samples without a gap between them.
@@ -77,7 +78,7 @@ def cut_windows(data: Trajectories, length: int, *, gap: float = GAP) -> Windows
 
 
 def take(windows: Windows, chosen: Sequence[int] | np.ndarray) -> Windows:
-    """Some of the windows."""
+    """Selects windows by index."""
     return jax.tree.map(lambda array: array[np.asarray(chosen, int)], windows)
 
 
@@ -116,20 +117,20 @@ def problem(
     substeps: int = 4,
     seed: int = 0,
 ) -> Problem:
-    """The fit of a model to windows, in float64; the training's parameters are {"model": ..., "starts": ...}.
+    """Builds the problem of fitting a model to windows, in float64, with parameters {"model": ..., "starts": ...}.
 
-    Selected are the parameters whose motions come closest to the validation windows, whose starts are fitted too where
-    starts are free.
+    The validation windows select the parameters, by the distance of simulated motions; free starts are fitted there
+    too.
 
     Args:
         model: a phase model with float64 parameters.
-        parameters: to start from, such as those of a fit of rates.
-        windows: to fit.
-        validation: to select by.
+        parameters: initial parameters, for example from a fit of rates.
+        windows: windows to fit.
+        validation: windows that select the parameters.
         weights: of the residuals.
-        free_starts: whether starts are unknowns; otherwise windows start where they were measured to.
-        substeps: of RK4 between two samples.
-        seed: of the order of the windows.
+        free_starts: whether starts are unknowns; otherwise windows start at their measured states.
+        substeps: RK4 steps between two samples.
+        seed: seed of the order of the windows.
 
     Raises:
         InputError: no windows, weights that are not positive, or rates that the windows lack.
@@ -157,10 +158,10 @@ def problem(
 
 
 def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tuple[Array, ...]]:
-    """What a fit reads of each, on the device.
+    """Returns the arrays that a fit reads of both sets, on the device.
 
     Raises:
-        InputError: as `problem`.
+        InputError: as for `problem`.
     """
     for deviation in np.ravel(weights.state):
         require_positive(state_weight=float(deviation))
@@ -179,7 +180,7 @@ def arrays(windows: Windows, validation: Windows, weights: Weights) -> list[tupl
 
 
 def _nearest(residual: Callable[[Array], Array], start: Array) -> Array:
-    """A start of lower residual, by a few steps of Gauss-Newton."""
+    """Returns a start of lower residual, by a few steps of Gauss-Newton."""
 
     def step(start: Array, _) -> tuple[Array, None]:
         slope, value = jax.jacfwd(residual)(start), residual(start)

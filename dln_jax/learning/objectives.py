@@ -1,4 +1,4 @@
-"""What training makes small: an objective names the arrays that it reads, their units, and the residuals per sample."""
+"""Objectives of training: the arrays that they read, the scales of their residuals, and the residuals of a sample."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,17 +17,17 @@ from dln_jax.zoo.catalogue import CATALOGUE
 
 
 class Objective(NamedTuple):
-    """What a model of dynamics is fitted to."""
+    """Objective of a fit of dynamics."""
 
     keys: tuple[str, ...]
-    """The arrays of `Trajectories` that the residual reads, [N, d] each."""
+    """Arrays [N, d] of `Trajectories` that the residual reads."""
     scale: Callable[[Trajectories], Float[Array, " r"]]
-    """Training data -> the unit of each residual. Raises InputError where the data cannot determine the model."""
+    """Training data -> the scales of the residuals. Raises InputError if the data cannot determine the model."""
     residual: Callable[..., Float[Array, " r"]]
     """(system, *sample) -> residuals of one sample, in SI units."""
     selects_by: str
     """"torque": validation is the mean square of the residual in (N m)², as published, to which large joints contribute
-    most; "scaled": in its own units, so that every joint counts alike."""
+    most; "scaled": in units of the scales, so that all joints count alike."""
 
     @property
     def of_torques(self) -> bool:
@@ -36,13 +36,13 @@ class Objective(NamedTuple):
 
 
 def torque_scale(data: Trajectories) -> Float[Array, " d"]:
-    """Standard deviation of each torque [d], in N m or N: the unit in which residuals are measured.
+    """Standard deviations of the torques [d], in N m or N: the scales of the residuals.
 
-    A channel that does not vary (a joint without a motor) is measured in the root mean square of those that do.
+    A channel that does not vary (a joint without a motor) is scaled by the root mean square of those that do.
 
     Raises:
-        InputError: no channel varies, so that the data cannot tell any Lagrangian from its multiples; or numbers are
-            so large or small that their squares are infinite or zero.
+        InputError: no channel varies, so that the data cannot distinguish a Lagrangian from its multiples; or the
+            squares of numbers are infinite or zero.
     """
     message = (
         "tau is constant in every training sample: motion without varying torque fits any multiple of an energy; "
@@ -52,7 +52,7 @@ def torque_scale(data: Trajectories) -> Float[Array, " d"]:
 
 
 def require_scales(data: Trajectories) -> None:
-    """Raises `InputError` where no model can be fitted to torques: they do not vary, or numbers are far too large."""
+    """Raises `InputError` if no model can be fitted to the torques: they do not vary, or numbers are far too large."""
     for key in ("q", "qd", "qdd"):
         spread(key, getattr(data, key))
     torque_scale(data)
@@ -67,7 +67,7 @@ TORQUE = Objective(
 """tau_hat(q, qd, qdd) - tau, the published loss of DeLaN."""
 
 SCALED_TORQUE = TORQUE._replace(selects_by="scaled")
-"""The same, selected by errors in units of each joint's `torque_scale`."""
+"""The same residual; validation errors are in units of the joints' `torque_scale`."""
 
 
 def _canonical_scale(data: Trajectories) -> Float[Array, " two_d"]:
@@ -86,10 +86,10 @@ def _canonical_residual(system: Energies, q: Vector, qd: Vector, qdd: Vector, p:
 CANONICAL = Objective(
     keys=("q", "qd", "qdd", "p", "tau"), scale=_canonical_scale, residual=_canonical_residual, selects_by="scaled"
 )
-"""[dH/dp - qd, d/dt dH/dp - qdd] with dp/dt = tau - dH/dq - friction: Hamilton's equations, by coordinates and momenta.
+"""[dH/dp - qd, d/dt dH/dp - qdd] with dp/dt = tau - dH/dq - friction: Hamilton's equations in coordinates and momenta.
 
-The published loss has dp/dt of the data instead of qdd. In the published arm data that is a difference quotient of p,
-wrong by 8e-6 (N m)² in mean square, while q, qd, qdd and tau are consistent to rounding."""
+The published loss uses dp/dt of the data instead of qdd. In the published arm data dp/dt is a difference quotient of p
+with a mean square error of 8e-6 (N m)², while q, qd, qdd and tau are consistent to rounding."""
 
 
 def _both_scales(data: Trajectories) -> Float[Array, " two_d"]:
@@ -113,23 +113,23 @@ BOTH_WAYS = Objective(
     ),
     selects_by="scaled",
 )
-"""[tau_hat - tau, qdd_hat - qdd], each in units of its standard deviation in the training samples: the loss of Lutter
-and Peters (2021, arXiv:2110.01894); also for models whose inverse and forward sides are different networks."""
+"""[tau_hat - tau, qdd_hat - qdd], in units of their standard deviations in the training samples: the loss of Lutter
+and Peters (2021, arXiv:2110.01894). It also serves models whose inverse and forward sides are different networks."""
 
 STATED = {"inverse": TORQUE, "forward": FORWARD, "both": BOTH_WAYS}
-"""The objectives that a user may ask for by name."""
+"""Objectives that a user may select by name."""
 
 
 def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Objective:
-    """What a model of the catalogue is fitted to: without momenta in the data, a Hamiltonian is fitted to torques.
+    """Returns the objective of a model of the catalogue; a Hamiltonian needs momenta, and otherwise fits torques.
 
     Args:
         name: of the model.
-        data: for training.
-        stated: from `STATED`, in place of the model's own.
+        data: training data.
+        stated: name from `STATED` that overrides the model's own objective.
 
     Raises:
-        InputError: one of two sides is asked for of a model that is no energy, whose other side would not be trained.
+        InputError: only one side is selected for a model without an energy, whose other side would not be trained.
     """
     properties = CATALOGUE[name].properties
     if stated is not None:
@@ -142,10 +142,10 @@ def objective_of(name: str, data: Trajectories, stated: str | None = None) -> Ob
 
 
 def arrays(objective: Objective, data: Trajectories, dtype: Any) -> tuple[Array, ...]:
-    """The arrays that an objective reads, on the device.
+    """Returns the arrays that an objective reads, on the device.
 
     Raises:
-        InputError: one is missing, or its squares overflow in that precision.
+        InputError: an array is missing, or its squares overflow in that precision.
     """
     missing = [key for key in objective.keys if getattr(data, key) is None]
     if missing:
@@ -159,9 +159,9 @@ def residuals(objective: Objective, system: System, batch: tuple[Array, ...]) ->
 
 
 def _scale(name: str, array: np.ndarray, message: str) -> Float[Array, " d"]:
-    """Standard deviation of each column; the typical one for a column that does not vary."""
+    """Standard deviations of the columns; a column that does not vary gets the root mean square of the others."""
     deviation = spread(name, array)
-    # Rounding leaves a constant channel with a deviation of some 1e-17 of the numbers it was computed from.
+    # Rounding leaves a constant channel with a deviation of about 1e-17 of the numbers that it was computed from.
     varies = deviation > 1e-12 * abs(array).max()
     if not varies.any():
         raise InputError(message)

@@ -2,13 +2,13 @@
 
     for visit in learn_online(references, drive, refit, model.init(key), empty_replay(2000, 2)): ...
 
-A replay has a fixed capacity and empty places have weight zero, so that every refit of a growing data set is one
-compiled program. The refit minimises
+A replay has a fixed capacity and its empty places have weight zero, so that all refits of a growing data set share one
+compiled program. A refit minimises
 
     sum over samples n and joints j of w_n (tau_hat_nj - tau_nj)² / variance of tau_j,   w_n = 1 for fitted samples
 
-with tau_hat the inverse dynamics of the model. Learning online with the model in the loop is the second experiment of
-Lutter, Ritter and Peters (2019, arXiv:1907.04490).
+with tau_hat from the inverse dynamics of the model. Learning online with the model in the loop is the second experiment
+of Lutter, Ritter and Peters (2019, arXiv:1907.04490).
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -38,18 +38,18 @@ class Replay(NamedTuple):
     qdd: Float[Any, "N d"]
     tau: Float[Any, "N d"]
     fitted: Float[Any, " N"]
-    """1 for a sample that is fitted, else 0."""
+    """1 for samples to fit, otherwise 0."""
     held_out: Float[Any, " N"]
-    """1 for a sample that selects among the iterates of a refit, else 0."""
+    """1 for samples that select among the iterates of a refit, otherwise 0."""
 
     @property
     def recorded(self) -> int:
-        """How many samples there are, fitted or held out."""
+        """Number of samples, fitted or held out."""
         return int(np.count_nonzero(np.asarray(self.fitted) + np.asarray(self.held_out)))
 
 
 def empty_replay(capacity: int, d: int) -> Replay:
-    """A replay with places for `capacity` samples of d joints.
+    """Returns a replay with `capacity` empty places for samples of d joints.
 
     Raises:
         InputError: a size that is not positive.
@@ -60,12 +60,12 @@ def empty_replay(capacity: int, d: int) -> Replay:
 
 
 def appended(replay: Replay, q: Any, qd: Any, qdd: Any, tau: Any, *, blocks: int = 10) -> Replay:
-    """The replay with one more recording, in its next empty places.
+    """Returns the replay with a further recording in its next empty places.
 
     Args:
-        replay: what was recorded before.
+        replay: earlier recordings.
         q, qd, qdd, tau: the recording [n, d], in order of time.
-        blocks: of equal length that the recording is cut into; one in its middle is held out, unless samples are fewer.
+        blocks: number of equal parts of the recording; the middle one is held out, unless there are fewer samples.
 
     Raises:
         InputError: numbers that are not finite, arrays of other shapes, or more samples than places.
@@ -94,19 +94,19 @@ def _with_rows(array: Any, places: slice, rows: np.ndarray) -> np.ndarray:
 
 
 Refit = Callable[[Parameters, Replay], Parameters]
-"""(parameters to start from, replay) -> parameters of the model fitted to the replay."""
+"""(initial parameters, replay) -> parameters of the model fitted to the replay."""
 
 
 def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
-    """Refits by Levenberg-Marquardt in float64: one compiled program for all replays of one capacity.
+    """Returns a refit by Levenberg-Marquardt in float64: one compiled program for all replays of one capacity.
 
-    Of the parameters after each round of iterations, the refit returns those with the lowest error on the held-out
-    samples, or on the fitted ones if none are held out.
+    The refit judges the parameters after every round of iterations. It returns those with the lowest error on the
+    held-out samples, or on the fitted ones if none are held out.
 
     Args:
-        model: parameters and energies in float64.
-        rounds: after each of which the parameters are judged.
-        iterations: of Levenberg-Marquardt in a round.
+        model: with parameters and energies in float64.
+        rounds: number of rounds.
+        iterations: Levenberg-Marquardt iterations per round.
 
     Raises:
         InputError: a number that is not positive, or a model that is not float64.
@@ -137,9 +137,9 @@ def make_refit(model: Model, *, rounds: int = 6, iterations: int = 5) -> Refit:
 
 
 def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
-    """Refits a model that is linear in its parameters by one least-squares problem on all samples.
+    """Returns a refit by one least-squares problem on all samples, for a model that is linear in its parameters.
 
-    The parameters given are not used. Combinations of parameters that the replay leaves undetermined are zero (the
+    Initial parameters are ignored. Combinations of parameters that the replay leaves undetermined are zero (the
     shortest solution, see `solvers.least_squares`).
 
     Args:
@@ -161,7 +161,7 @@ def make_linear_refit(model: Model, *, negligible: float = 1e-12) -> Refit:
 
 
 def _scale(replay: Replay) -> Float[Array, " d"]:
-    """Standard deviation of each joint's torque in the replay; 1 for a torque that does not vary."""
+    """Standard deviations of the joints' torques in the replay; 1 for a torque that does not vary."""
     weight = (replay.fitted + replay.held_out)[:, None]
     count = jnp.maximum(jnp.sum(weight), 1.0)
     mean = jnp.sum(weight * replay.tau, axis=0) / count
@@ -170,12 +170,12 @@ def _scale(replay: Replay) -> Float[Array, " d"]:
 
 
 class Visit(NamedTuple):
-    """One reference, driven with the model as it was before, and what was learned from it."""
+    """Result of one reference: the motion under the model before, and the model refitted after it."""
 
     outcome: Any
-    """What the robot did."""
+    """First result of `drive`."""
     parameters: Parameters
-    """After the refit."""
+    """Parameters after the refit."""
     replay: Replay
 
 
@@ -189,10 +189,10 @@ def learn_online(
     """Alternates driving the robot along a reference and refitting the model to all samples recorded so far.
 
     Args:
-        references: in the order in which they are driven; what one is only `drive` knows.
-        drive: (parameters, reference) -> what happened, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
+        references: in the order in which they are driven; only `drive` reads them.
+        drive: (parameters, reference) -> outcome, and the recorded q, qd, qdd and tau [n, d]; n may be zero.
         refit: from `make_refit` or `make_linear_refit`.
-        parameters: that drive the first reference.
+        parameters: of the model that drives the first reference.
         replay: with places for all recordings.
 
     Raises:

@@ -1,14 +1,14 @@
-"""What training data determine of a model's parameters: the covariance of a least-squares fit, and its noise.
+"""Posterior of a model's parameters from its training data: the covariance of a least-squares fit, and its noise.
 
 The fit minimises sum over samples and joints of ((tau_hat_i - tau_i) / unit_i)² + ridge |D (theta - theta_0)|², to
-first order about the parameters found, with D the norms of the columns of the Jacobian J of the scaled residuals. With
-J D⁻¹ = U S Vᵀ, noise of variance noise_i² in each torque, and a prior of variance Sigma / ridge,
+first order about the fitted parameters. D holds the norms of the columns of the Jacobian J of the scaled residuals.
+With J D⁻¹ = U S Vᵀ, torque noise of variance noise_i², and a prior of variance Sigma / ridge,
 
     Cov(D theta) = V (S² + ridge)⁻¹ (S Uᵀ Sigma U S + ridge Sigma) (S² + ridge)⁻¹ Vᵀ,   Sigma = diag(noise_i² / unit_i²)
 
-For ridge = 0 that is the covariance of weighted least squares on the directions that are determined, whatever the
-weights; where all joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. Degrees of
-freedom of joint i are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
+For ridge = 0 this is the covariance of weighted least squares on the determined directions, for any weights. If all
+joints have the same Sigma it is Laplace's approximation, Sigma (JᵀJ + ridge D²)⁻¹. The degrees of freedom of joint i
+are the trace of the hat matrix over its rows:  noise_i² = sum r_i² / (N - dof_i).
 """
 
 from collections.abc import Callable, Iterator
@@ -20,49 +20,49 @@ from jaxtyping import Float
 from dln_jax.solvers.least_squares import triangular_factor
 
 Rows = Iterator[tuple[np.ndarray, np.ndarray]]
-"""Phi [n, d, P] and tau_hat - tau [n, d] of some samples at a time."""
+"""Phi [n, d, P] and tau_hat - tau [n, d], some samples at a time."""
 ALONE = 1e-6
-"""Share of the information on a direction that is elsewhere, below which some samples alone determine it."""
+"""Some samples alone determine a direction if the others hold less than this share of the information on it."""
 
 
 class Spectrum(NamedTuple):
-    """The singular value decomposition of J D⁻¹, and what each joint has in it."""
+    """Singular value decomposition of J D⁻¹, with the parts of the joints."""
 
     scale: Float[np.ndarray, " P"]
     """D."""
     sizes: Float[np.ndarray, " P"]
-    """S, zero where a direction is undetermined."""
+    """S, zero for undetermined directions."""
     directions: Float[np.ndarray, "P P"]
     """V, in columns."""
     triangles: list[np.ndarray]
-    """Of each joint J_i D⁻¹ V up to a rotation of its rows, [.., P]."""
+    """J_i D⁻¹ V of every joint, up to a rotation of its rows, [.., P]."""
     squares: Float[np.ndarray, " d"]
-    """Of each joint the sum of squared residuals, (N m)² or N²."""
+    """Sums of squared residuals of the joints, (N m)² or N²."""
     unit: Float[np.ndarray, " d"]
-    """Of the residuals that were fitted, N m or N."""
+    """Scales of the fitted residuals, N m or N."""
     samples: int
 
 
 class Posterior(NamedTuple):
-    """Covariance of the parameters, noise, and how many parameters the data determine."""
+    """Covariance of the parameters, noise, and the number of parameters that the data determine."""
 
     along: Float[np.ndarray, "K r"]
     """Factor of the covariance of D theta along the directions of the spectrum."""
     noise: Float[np.ndarray, " d"]
-    """Standard deviation, N m or N."""
+    """Standard deviations, N m or N."""
     degrees_of_freedom: Float[np.ndarray, " d"]
 
 
 def spectrum(
     rows: Rows, unit: Float[np.ndarray, " d"], *, rank_tolerance: float | None = None, negligible: float = 0.0
 ) -> Spectrum:
-    """Of all rows; takes some N d P² operations, and d P² numbers.
+    """Computes the spectrum of all rows; takes about N d P² operations, and memory for d P² numbers.
 
     Args:
         rows: of the training data.
-        unit: by which the fit divided the residuals of each joint.
+        unit: scales by which the fit divided the joints' residuals.
         rank_tolerance: as for `solvers.least_squares.solve`.
-        negligible: as there.
+        negligible: as for `solvers.least_squares.solve`.
     """
     triangles, samples = _triangles(rows, len(unit))
     squares = np.array([np.sum(each[:, -1] ** 2) for each in triangles])
@@ -85,23 +85,23 @@ def left_out(
     columns: Float[np.ndarray, "n d P"],
     residual: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """Residuals that some training samples would have if they had not been fitted, and their variance by parameters.
+    """Returns the residuals of some training samples as if they had not been fitted, and the variance by parameters.
 
     With U their rows of the orthonormal factor of J, r~ = r + U (1 - UᵀU)⁻¹ Uᵀ r: exact for least squares without a
     ridge (Cook and Weisberg 1982, "Residuals and influence in regression", section 2.2, for groups of samples).
 
     Args:
         spectrum: of all training data.
-        noise: as `posterior` finds it.
+        noise: from `posterior`.
         columns: Phi D⁻¹ V of the samples.
-        residual: tau_hat - tau of them.
+        residual: tau_hat - tau of the samples.
     """
     counts, unit = spectrum.sizes > 0, spectrum.unit
     along = columns[:, :, counts] / spectrum.sizes[counts]
     relative = (noise / unit) ** 2
     U = along / unit[:, None]
     values, vectors = np.linalg.eigh(np.eye(U.shape[2]) - np.einsum("nip,niq->pq", U, U, optimize=True))
-    # What these samples alone determine is fitted exactly: its residual is zero, and says nothing.
+    # A direction that only these samples determine is fitted exactly: its residual is zero and carries no information.
     inverse = (vectors * np.divide(1, values, out=np.zeros_like(values), where=values > ALONE)) @ vectors.T
     inner = -np.einsum("nip,i,niq->pq", U, relative, U, optimize=True)
     for size, triangle in zip(relative, spectrum.triangles, strict=True):
@@ -114,7 +114,7 @@ def left_out(
 
 
 def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
-    """The triangular factor of each joint's [Phi_i r_i], and the number of samples."""
+    """Returns the triangular factors of the joints' [Phi_i r_i], and the number of samples."""
     folded: list[np.ndarray | None] = [None] * d
     samples = 0
     for columns, residual in rows:
@@ -130,17 +130,17 @@ def _triangles(rows: Rows, d: int) -> tuple[list[np.ndarray], int]:
 def leading_directions(
     rows: Callable[[], Rows], unit: Float[np.ndarray, " d"], count: int, *, passes: int = 3, seed: int = 0
 ) -> Float[np.ndarray, "P K"]:
-    """Combinations of parameters, those that the training data determine best, for models too large for all of them.
+    """Returns the combinations of parameters that the data determine best, for models too large for a full spectrum.
 
-    Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is what a
-    model has whose parameters move in that subspace alone (Izmailov et al. 2020, "Subspace inference").
+    Subspace iteration on D⁻¹JᵀJ D⁻¹ (Halko, Martinsson and Tropp 2011, algorithm 4.4). Phi times the result is the
+    Jacobian of a model whose parameters vary only in that subspace (Izmailov et al. 2020, "Subspace inference").
 
     Args:
-        rows: gives the training data anew at each call.
-        unit: by which the fit divided the residuals of each joint.
+        rows: iterates over the training data anew at every call.
+        unit: scales by which the fit divided the joints' residuals.
         count: K.
-        passes: over the data, the first of which finds D.
-        seed: of the start.
+        passes: over the data; the first computes D.
+        seed: of the initial subspace.
     """
     squares = sum(np.sum((columns / unit[:, None]) ** 2, axis=(0, 1)) for columns, _ in rows())
     scale = np.sqrt(np.where(squares > 0, squares, 1.0))
@@ -155,7 +155,7 @@ def leading_directions(
 
 
 def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
-    """The covariance for a ridge; with 0, directions that are undetermined have none."""
+    """Returns the posterior for a ridge; with 0, undetermined directions have no variance."""
     counts = (spectrum.sizes > 0) | (ridge > 0)
     damped = np.sqrt(spectrum.sizes[counts] ** 2 + ridge)
     shares = [each[:, counts] / damped for each in spectrum.triangles]
@@ -166,7 +166,7 @@ def posterior(spectrum: Spectrum, ridge: float) -> Posterior:
     for size, share in zip(relative, shares, strict=True):
         inner += size * (share.T @ share)
     along = np.zeros((len(counts), int(counts.sum())))
-    # Scaled by the largest: where a fit is exact, all are rounding's squares.
+    # Scaled by the largest, because the variances of an exact fit are squares of rounding errors.
     largest = max(float(relative.max(initial=0.0)), np.finfo(np.float64).tiny)
     along[counts] = np.sqrt(largest) * np.linalg.cholesky(inner / largest) / damped[:, None]
     return Posterior(along, noise, dof)

@@ -1,13 +1,13 @@
-"""Derivative matching: a phase field is fitted to measured rates (qd, pd) of states (q, p).
+"""Derivative matching: fits a phase field to measured rates (qd, pd) of states (q, p).
 
     loss = mean over samples and components of |rates(q, p) - (qd, pd)|²
 
-the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). By Gauss-Newton, Adam, or, for a
-field that is linear in its parameters, by one least-squares problem. The parameters kept are those with the lowest
-loss on validation trajectories, which are drawn from those for training; no test is looked at.
+This is the published loss of Hamiltonian networks (Greydanus, Dzamba and Yosinski 2019). It is minimised by
+Gauss-Newton, Adam, or, for a field that is linear in its parameters, by one least-squares problem. The validation
+trajectories, drawn from those for training, select the parameters; no test data are read.
 
-Where states carry noise and rates do not, the loss has a bias that more data do not remove: it flattens the field
-(regression dilution). `learning.motions` has not.
+If states are noisy and rates are not, the loss has a bias that more data do not remove: it flattens the field
+(regression dilution). `learning.motions` does not have it.
 """
 
 import functools
@@ -31,27 +31,27 @@ from dln_jax.types import Scalar, require_positive, require_seed
 
 
 def residual(model: Model, parameters: Parameters, q: Array, p: Array, qd: Array, pd: Array) -> Array:
-    """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d], whose sum of squares is the sample's part of the loss."""
+    """(rates - (qd, pd)) / sqrt(2 d) of one sample [2 d]; the sum of its squares is the sample's part of the loss."""
     velocity, force = flow(model.energies(parameters)).rates(q, p)
     return jnp.concatenate([velocity - qd, force - pd]) / math.sqrt(2 * q.shape[0])
 
 
 def loss(model: Model, parameters: Parameters, arrays: tuple[Array, ...]) -> Scalar:
-    """Mean square of rates - (qd, pd) over samples and components; arrays are q, p, qd, pd, [N, d] each."""
+    """Mean square of rates - (qd, pd) over samples and components; the arrays are q, p, qd and pd, of shape [N, d]."""
     return mean_square(functools.partial(residual, model, parameters), arrays)
 
 
 def problem(
     model: Model, train: Trajectories, validation: Trajectories, *, seed: int = 0, most_samples: int = 10_000
 ) -> Problem:
-    """The fit of a model to the rates of trajectories, in the precision of the model.
+    """Builds the problem of fitting a model to the rates of trajectories, in the precision of the model.
 
     Args:
         model: a phase model.
         train: with p and pd.
-        validation: likewise, to select by; `data.splits.hold_out` draws some.
-        seed: of the initial parameters, of the samples that are drawn, and of their order.
-        most_samples: to fit, and to select by, drawn from the trajectories where those have more.
+        validation: trajectories that select the parameters, with p and pd; `data.splits.hold_out` draws some.
+        seed: of the initial parameters, of the drawn samples, and of their order.
+        most_samples: largest number of samples to fit, and to validate; larger sets are drawn from.
 
     Raises:
         InputError: no p or pd in the data, numbers whose squares overflow, or settings out of range.
@@ -72,9 +72,9 @@ def problem(
 def match_linear(
     model: Model, data: Trajectories, *, validation: Trajectories | None = None
 ) -> tuple[Training, Float[np.ndarray, " N"]]:
-    """The least-squares fit of a field that is linear in its parameters, and the squared errors of the validation.
+    """Fits a field that is linear in its parameters by least squares, in float64, and returns the validation errors.
 
-    In float64; the errors are of each sample, and those of the fitted samples without a validation.
+    The errors are the squared errors of the validation samples, or of the fitted ones without a validation.
 
     Raises:
         InputError: no p or pd in the data, or numbers that are not finite or whose squares are not.

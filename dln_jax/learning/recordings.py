@@ -1,10 +1,10 @@
-"""From a laboratory's recording, q and the torques that were asked for, to models: identified, and learned.
+"""Fits models to a laboratory recording of q and commanded torques: an identified model and a network.
 
-1. The delay of the torques is the one with which an identified model leaves least, where it is not known.
-2. q is smoothed (`data.encoders`), which gives qd; torques stay as they are, held between samples.
-3. The identified model is the trigonometric one, fitted in weak form; what it leaves of each joint's equation is the
-   unit in which a network's errors are measured, and so both joints count, with a motor or without.
-4. The network is a structured DeLaN with the same laws of friction, by Gauss-Newton (`learning.momentum`).
+1. Unless it is known, the delay of the torques is the one with the smallest residual of an identified model.
+2. q is smoothed (`data.encoders`), which also gives qd; torques are not filtered, and held between samples.
+3. The identified model is the trigonometric one, fitted in weak form. Its residuals in the joints' equations are the
+   scales of a network's errors, so that joints with and without a motor both count.
+4. The network is a structured DeLaN with the same friction laws, fitted by Gauss-Newton (`learning.momentum`).
 """
 
 from typing import Any, NamedTuple
@@ -34,31 +34,31 @@ from dln_jax.types import FrictionLaw, InputError, Needs
 from dln_jax.zoo.descriptions import Description, build, describe
 
 LAWS: tuple[FrictionLaw, ...] = ("viscous", "coulomb")
-"""Of friction, that models are given; what a plant has more of, near rest, they do not know."""
+"""Friction laws of the models; other friction of the plant, near rest, is not modelled."""
 MOST_DELAY = 4
-"""Samples that are tried."""
+"""Largest delay that is tried, in samples."""
 ROUNDS = 2
-"""Fits, each weighted by what the one before left."""
+"""Number of fits; the later ones are weighted by the residuals of the one before."""
 DEGREES = {"revolute": 2, "prismatic": 0}
-"""Of the identified model: rigid bodies have no more, and displacements along a level rail change nothing."""
+"""Degrees of the identified model: enough for rigid bodies; displacements along a level rail have no effect."""
 NETWORK = {"width": 8, "depth": 2}
 STEPS = 40
-"""Of Gauss-Newton."""
+"""Gauss-Newton iterations."""
 FRICTION_START = 0.02
-"""Of each coefficient of a network's friction, times the deviation of the torques."""
+"""Initial friction coefficients of a network, relative to the deviation of the torques."""
 FLOOR = 0.05
-"""Of the diagonal of a network's Cholesky factor, times its typical size."""
+"""Lower bound on the diagonal of a network's Cholesky factor, relative to its typical size."""
 
 
 class Fitted(NamedTuple):
-    """A model as `zoo.run.save` stores it."""
+    """Description and parameters of a model, as `zoo.run.save` stores them."""
 
     description: Description
     parameters: Any
 
     @property
     def dynamics(self) -> Dynamics:
-        """Of the model."""
+        """Dynamics of the model."""
         found = dynamics(build(self.description).energies(self.parameters))
         if not isinstance(found, Dynamics):
             raise InputError(f"a {self.description['name']} has no energy; take a model that has")
@@ -66,27 +66,27 @@ class Fitted(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """A recording that is ready to be learned from."""
+    """A recording that is ready for fits."""
 
     train: Trajectories
-    """With rates; torques as they acted."""
+    """With rates, and torques as they acted."""
     validation: Trajectories
     delay: int
-    """Samples."""
+    """Delay of the torques in samples."""
     cutoff: float
-    """Of the filter, Hz."""
+    """Cut-off frequency of the filter, Hz."""
 
 
 def prepare(recording: Trajectories, *, delay: int | None = None, validation: int | None = None) -> Prepared:
-    """Rates, torques as they acted, and the split into episodes to fit and one to select by.
+    """Computes rates and acting torques, and splits the episodes into those to fit and one for validation.
 
     Args:
-        recording: with its needs; of several episodes.
-        delay: of the torques, samples (default: found).
-        validation: index of the episode to select by (default: the middle one).
+        recording: of several episodes, with its needs.
+        delay: of the torques, in samples (default: estimated).
+        validation: index of the validation episode (default: the middle one).
 
     Raises:
-        InputError: a recording without needs or with one episode only.
+        InputError: a recording without needs or with only one episode.
     """
     present = np.unique(recording.trajectory)
     if recording.needs is None or len(present) < 2:
@@ -114,7 +114,7 @@ def _linear(needs: Needs) -> Description:
 
 
 def identified(data: Trajectories, needs: Needs) -> Fitted:
-    """The trigonometric model with viscous and dry friction, linear in its parameters; errors as of `fit_momentum`."""
+    """Fits the trigonometric model with viscous and dry friction; raises the errors of `fit_momentum`."""
     description = _linear(needs)
     model, windows = build(description), cut_momentum_windows(data)
     unit = np.asarray(torque_scale(data))
@@ -128,18 +128,18 @@ def identified(data: Trajectories, needs: Needs) -> Fitted:
 def learned(
     prepared: Prepared, needs: Needs, *, steps: int = STEPS, seed: int = 0, report: Report = silent, **keywords: Any
 ) -> Fitted:
-    """A structured DeLaN with viscous and dry friction; the parameters that are best in validation.
+    """Trains a structured DeLaN with viscous and dry friction and keeps the parameters that are best in validation.
 
     Args:
         prepared: the recording.
         needs: of the plant.
-        steps: of Gauss-Newton.
+        steps: Gauss-Newton iterations.
         seed: of the initial parameters.
-        report: as of `learning.engine.fit`.
-        keywords: width, depth and activation, as of `models.make_delan`.
+        report: as for `learning.engine.fit`.
+        keywords: width, depth and activation, as for `models.make_delan`.
 
     Raises:
-        InputError: as `fit`.
+        InputError: as for `fit`.
     """
     windows, held_out = (cut_momentum_windows(each) for each in (prepared.train, prepared.validation))
     unit = deviations(identified(prepared.train, needs).dynamics, windows)
@@ -166,7 +166,7 @@ def _size_of_factor(data: Trajectories) -> float:
 
 
 def _of_size(parameters: Any, size: float, *, torque: float) -> Any:
-    """Initial parameters whose networks give what is typical of the plant: outputs of theirs are of order 1 else."""
+    """Scales the output layers of the initial networks, of order 1, to typical values of the plant."""
 
     def scaled(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path)

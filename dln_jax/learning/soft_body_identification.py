@@ -1,11 +1,10 @@
-"""Material, friction, actuation or shape of a soft body from what is observed of it, by Levenberg-Marquardt.
+"""Identifies material, friction, actuation or shape of a soft body from observations, by Levenberg-Marquardt.
 
     minimise over theta:  mean over motions of |x(t; theta) - x_observed(t)|² / noise²        (identification)
     minimise over theta:  |x*(theta) - x_wanted|² / noise²,   x* an equilibrium               (inverse design)
 
-Residuals are differentiated through the implicit steps, or through the equilibrium. theta is any tree of
-float64 arrays; `params_of(theta)` says which `Params` it stands for, such as `exp` of it where a parameter must stay
-positive.
+Residuals are differentiated through the implicit steps, or through the equilibrium. theta is any tree of float64
+arrays; `params_of(theta)` maps it to `Params`, for example by `exp` if a parameter must stay positive.
 """
 
 import functools
@@ -27,27 +26,27 @@ from dln_jax.types import require_positive
 
 
 class ObservedMotions(NamedTuple):
-    """Motions of one body, K of them, T steps each."""
+    """K observed motions of one body, with T steps."""
 
     x0: Float[Array, "K n dim"]
     """Positions at the start, in m."""
     v0: Float[Array, "K n dim"]
     """Velocities at the start, in m/s."""
     controls: Float[Array, "K T controls"]
-    """Actuation of each step; [K, T, 0] for a body without."""
+    """Actuation of the steps; [K, T, 0] for a body without."""
     x: Float[Array, "K T n dim"]
-    """Positions after each step, in m; not finite where a vertex was not seen."""
+    """Positions after every step, in m; not finite for vertices that were not seen."""
 
 
 class Fitted(NamedTuple):
-    """What was found."""
+    """Result of an identification or a design."""
 
     parameters: Any
     """theta."""
     misfit: float
-    """Root mean square of the residuals there, in units of the noise; NaN if a step did not converge."""
+    """Root mean square of the final residuals, in units of the noise; NaN if a step did not converge."""
     iterations: int
-    """Of Levenberg-Marquardt."""
+    """Number of Levenberg-Marquardt iterations."""
 
 
 def identify(
@@ -60,16 +59,16 @@ def identify(
     iterations: int = 30,
     mesh: Mesh | None = None,
 ) -> Fitted:
-    """theta at which the simulated motions are nearest to the observed ones.
+    """Fits theta so that the simulated motions come closest to the observed ones.
 
     Args:
         stepper: of `make_step`.
         params_of: theta -> the scene's parameters.
-        guess: theta to start from, float64 arrays.
-        motions: what was observed.
+        guess: initial theta, float64 arrays.
+        motions: observed motions.
         noise: of the positions, in m: the unit of the residuals.
-        iterations: of Levenberg-Marquardt at most.
-        mesh: devices that share the motions, of which each then simulates its own.
+        iterations: largest number of Levenberg-Marquardt iterations.
+        mesh: devices that share the motions; every device simulates its own.
 
     Raises:
         InputError: numbers that are not positive.
@@ -96,13 +95,13 @@ def design(
     noise: float = 1e-3,
     iterations: int = 30,
 ) -> Fitted:
-    """theta (a rest shape, say) for which the body's equilibrium is nearest to what is wanted.
+    """Finds theta (a rest shape, say) whose equilibrium is closest to the wanted positions.
 
     Held vertices stay where the scene's own rest shape has them; coordinates of `wanted` that are not finite do not
     count. The other arguments are those of `identify`.
 
     Raises:
-        InputError: as `identify`.
+        InputError: as for `identify`.
     """
     require_positive(noise=noise, iterations=iterations)
 
@@ -113,13 +112,13 @@ def design(
 
 
 def _seen_difference(x: Array, given: Array) -> Array:
-    """Zero where what is given is not finite, with derivatives that are."""
+    """Difference of positions, zero with finite derivatives where the observed ones are not finite."""
     seen = jnp.isfinite(given)
     return jnp.where(seen, x - jnp.where(seen, given, 0), 0)
 
 
 def _fitted(residual: Callable[[Any], Array], guess: Any, iterations: int, mesh: Mesh | None = None) -> Fitted:
-    # Forward mode: a handful of parameters against thousands of residuals.
+    # Forward mode, because there are few parameters and thousands of residuals.
     solver = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
     def solve(guess: Any) -> tuple[Any, Array, Array]:

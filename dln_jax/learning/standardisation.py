@@ -1,6 +1,7 @@
-"""Units in which a network sees data of any size: inputs and outputs of zero mean and unit standard deviation.
+"""Scales data for networks: inputs and outputs of zero mean and unit standard deviation.
 
-A network with the layer rule h W + b absorbs them exactly: what is trained in standard units is stored in the user's.
+A network with the layer rule h W + b absorbs the scales exactly: it is trained in standard units and stored in the
+user's.
 """
 
 from typing import NamedTuple
@@ -27,16 +28,16 @@ class Units(NamedTuple):
 
 
 def own_units(data: FunctionSamples) -> Units:
-    """Units that leave data as they are."""
+    """Returns units that leave the data unchanged."""
     n, m = data.inputs, data.outputs
     return Units(np.zeros(n), np.ones(n), np.zeros(m), np.ones(m))
 
 
 def standard_units(data: FunctionSamples) -> Units:
-    """Mean and standard deviation of each column; a column that does not vary has size 1.
+    """Returns the means and standard deviations of the columns; a column that does not vary has size 1.
 
     Raises:
-        InputError: numbers of x or y so large or small that their squares are infinite or zero.
+        InputError: the squares of numbers of x or y are infinite or zero.
     """
     deviations = (spread(name, array) for name, array in (("x", data.x), ("y", data.y)))
     sizes = [np.where(deviation > 0, deviation, 1.0) for deviation in deviations]
@@ -44,7 +45,7 @@ def standard_units(data: FunctionSamples) -> Units:
 
 
 def to_units(data: FunctionSamples, units: Units) -> FunctionSamples:
-    """The same samples in other units: derivatives follow the chain rule."""
+    """Converts samples to other units; derivatives follow the chain rule."""
     ratio = units.x_size[None, :] / units.y_size[:, None]  # of dy/dx, [m, n]
     return FunctionSamples(
         (data.x - units.x_origin) / units.x_size,
@@ -55,7 +56,7 @@ def to_units(data: FunctionSamples, units: Units) -> FunctionSamples:
 
 
 def layers_in_own_units(layers: Layers, units: Units) -> Layers:
-    """The network of x and y that equals a network of u and v; leading axes (members of an ensemble) stay."""
+    """Converts a network of u and v to the equal network of x and y; leading axes (members of an ensemble) stay."""
     weights, biases = ([np.asarray(layer[part], np.float64) for layer in layers] for part in range(2))
     weights[0] = weights[0] / units.x_size[:, None]
     biases[0] = biases[0] - units.x_origin @ weights[0]

@@ -1,9 +1,9 @@
-"""Unknowns of one window, such as the start of its motion, eliminated from a residual that depends on others too.
+"""Eliminates the unknowns of one window, such as the start of its motion, from a residual with other parameters.
 
     z(theta) = argmin over z of |r(theta, z)|²,   dr/dtheta = (1 - U Uᵀ) dr/dtheta at fixed z,   U a basis of dr/dz
 
-the derivative of Kaufman (1975, "A variable projection method for solving separable nonlinear least squares problems"),
-which leaves out a term that is small where the residual is.
+This is the derivative of Kaufman (1975, "A variable projection method for solving separable nonlinear least squares
+problems"), which omits a term that is small if the residual is.
 """
 
 from collections.abc import Callable
@@ -16,32 +16,32 @@ from jax import Array
 from dln_jax.solvers.elimination import solve
 
 STEPS = 3
-"""Of Gauss-Newton, from the measured to the nearest start."""
+"""Gauss-Newton steps from the measured to the nearest start."""
 
 
 def without_start(frozen: Callable[[Array], Array], residual: Callable[[Array], Array], start: Array) -> Array:
-    """What is left of a residual at its nearest start, with Kaufman's derivative by all that `frozen` does not see.
+    """Returns the residual at its nearest start, with Kaufman's derivative by parameters that `frozen` holds constant.
 
     Args:
-        frozen: start -> residual, as a constant function.
-        residual: the same function, of the parameters too.
-        start: to begin at.
+        frozen: start -> residual, with constant parameters.
+        residual: the same function, differentiable by the parameters.
+        start: initial value.
     """
     at = jax.lax.stop_gradient(_descended(frozen, start, STEPS))
     left = residual(at.start)
-    change = left - jax.lax.stop_gradient(left)  # zero, but for its derivative
+    change = left - jax.lax.stop_gradient(left)  # zero, with the derivative of `left`
     return left - at.slope @ solve(at.slope.T @ at.slope, at.slope.T @ change)
 
 
 def nearest(residual: Callable[[Array], Array], start: Array, *, steps: int = STEPS) -> Array:
-    """A start of lower residual, by steps of Gauss-Newton."""
+    """Returns a start of lower residual, by steps of Gauss-Newton."""
     return _descended(residual, start, steps).start
 
 
 class _Descended(NamedTuple):
     start: Array
     slope: Array
-    """Of the residual by the start, where the last step began."""
+    """Derivative of the residual by the start, at the beginning of the last step."""
 
 
 def _descended(residual: Callable[[Array], Array], start: Array, steps: int) -> _Descended:

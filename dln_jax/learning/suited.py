@@ -1,17 +1,17 @@
-"""The structured network, its optimiser and its samples that suit an arm of many joints.
+"""Chooses the structured network, its optimiser and its number of samples for an arm of many joints.
 
-Measured on the simulated arm of seven axes (`studies.robots.arm`, viscous friction, no noise), mean nMSE on twelve
-unseen motions, each after half a minute of processor time; of two seeds where two numbers stand:
+Measured on the simulated arm of seven axes (`studies.robots.arm`, viscous friction, no noise): mean nMSE on twelve
+unseen motions after half a minute of processor time; two numbers are two seeds.
 
     motions of 10 s                                15               30      75
     independent equations a parameter               4                8      19
     16 units, Gauss-Newton, 1,480 samples    0.026, 0.035         0.025   0.024
     64 x 64, AdamW, all samples (6,000 steps) 0.062, 0.059        0.023   0.0075
 
-From 15 motions wider and deeper small networks (16 x 16, 32) came to the same 0.025, slower, 8 units to 0.056, and a
-ridge to no better. A step of Gauss-Newton forms JᵀJ, some N d P² operations, and neighbouring samples of one motion say
-the same: a part of them is enough. A small network is limited by what it can hold, a large one by what the motions
-show: the number of independent equations decides.
+With 15 motions, wider and deeper small networks (16 x 16, 32) reached the same 0.025 more slowly, 8 units reached
+0.056, and a ridge did not help. A step of Gauss-Newton forms JᵀJ in about N d P² operations, and neighbouring samples
+of a motion are redundant: a part of them is enough. Its capacity limits a small network, the information in the motions
+a large one: the number of independent equations decides.
 """
 
 from typing import NamedTuple
@@ -26,31 +26,31 @@ from dln_jax.solvers.normal_equations import count
 from dln_jax.types import Needs
 
 MANY_JOINTS = 4
-"""Fewer have a small network and all their samples."""
+"""Arms with fewer joints get a small network and all their samples."""
 WIDTH = 16
-"""Of the one hidden layer that mass matrix and potential share."""
+"""Width of the hidden layer that mass matrix and potential share."""
 ROWS_PER_PARAMETER = 14
-"""Equations that a step of Gauss-Newton sees. Of 16 x 16 units, seven did as well."""
+"""Equations per parameter in a step of Gauss-Newton. For 16 x 16 units, seven did as well."""
 MOST_INDEPENDENT = 6
-"""Independent equations for each parameter of the small network, above which a large one by Adam is better."""
+"""Above this number of independent equations per parameter of the small network, a large one by Adam is better."""
 
 
 class Suited(NamedTuple):
-    """Of a structured network."""
+    """Settings of a structured network."""
 
     optimizer: str
     """gauss-newton or adam."""
     keywords: dict[str, int | bool]
-    """Of `make_delan`: width, depth, and whether there is one trunk."""
+    """Keywords of `make_delan`: width, depth, and whether networks share a trunk."""
     steps: int
-    """Of the optimiser: half a minute."""
+    """Steps of the optimiser that take half a minute."""
     samples: int | None
-    """Drawn for the fit; `None` for all."""
+    """Number of samples drawn for the fit; `None` for all."""
     reason: str
 
 
 def suited_network(needs: Needs, train: Trajectories) -> Suited:
-    """For joints that are many, by the needs and by how much the training motions say."""
+    """Returns the settings for an arm of many joints, from its needs and the information in the training motions."""
     d = needs.degrees_of_freedom
     small = {"width": WIDTH, "depth": 1, "shared_trunk": True}
     size = count(jax.eval_shape(make_delan(needs, **small).init, jax.random.key(0)))
@@ -65,9 +65,9 @@ def suited_network(needs: Needs, train: Trajectories) -> Suited:
 
 
 def independent_equations(data: Trajectories) -> int:
-    """d times the number of independent samples that say as much, by the accelerations of a typical joint.
+    """Returns d times the number of effective independent samples, the median over the joints' accelerations.
 
-    It stays the same where motions are sampled more often.
+    It does not change if motions are sampled more often.
     """
     counts = [effective_samples(column - column.mean(), data.trajectory) for column in data.qdd.T]
     return round(data.degrees_of_freedom * float(np.median(counts)))

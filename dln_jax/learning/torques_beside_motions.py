@@ -1,10 +1,10 @@
-"""Measured motions and the torques of the same samples, in one objective.
+"""Fits measured motions and the torques of the same samples in one objective.
 
     loss = mean over windows of |r_w|² + share * mean over samples of sum_j ((tau_hat_j - tau_j) / noise_j)²
 
-with r_w of `learning.measured_motions` and tau_hat = tau_hat(q, qd, qdd) of filtered motions. Matched motions give the
-parameters that predict; but where forces act that nobody measured, accelerations that follow from them enter the
-torques of filtered motions, and the parameters that explain those best are others. The share says what is wanted.
+r_w is that of `learning.measured_motions`, and tau_hat = tau_hat(q, qd, qdd) of filtered motions. Matched motions give
+the parameters that predict best. If unmeasured forces act, the accelerations that they cause enter the torques of
+filtered motions, and other parameters explain those best. The share sets the compromise.
 """
 
 from typing import NamedTuple
@@ -24,10 +24,10 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 class TorqueWindows(NamedTuple):
-    """The samples of W windows; the shorter ones repeat their last sample, with weight zero."""
+    """Samples of W windows; shorter ones repeat their last sample with weight zero."""
 
     q: np.ndarray
-    """[W, T, d], and so on."""
+    """[W, T, d], like qd, qdd and tau."""
     qd: np.ndarray
     qdd: np.ndarray
     tau: np.ndarray
@@ -36,7 +36,7 @@ class TorqueWindows(NamedTuple):
 
 
 def cut_torque_windows(data: Trajectories, length: int, *, gap: float = GAP) -> TorqueWindows:
-    """The windows that `cut_measured_windows` cuts of data with the same times; arguments and errors as there."""
+    """Cuts the same windows as `cut_measured_windows` on the same times, with the same arguments and errors."""
     indices, weight = window_indices(data, length, gap=gap)
     return TorqueWindows(data.q[indices], data.qd[indices], data.qdd[indices], data.tau[indices], weight)
 
@@ -50,14 +50,14 @@ def with_torques(
     noise: tuple[float, ...],
     share: float,
 ) -> Problem:
-    """The fit of measured motions, with torques beside them; selected is what is best for both on validation windows.
+    """Adds torques to the problem of measured motions; both together select the parameters on validation windows.
 
     Args:
-        task: that of `measured_motions.problem`.
-        model: the same.
-        windows: to fit, as many as there are motions.
-        validation: to select by.
-        noise: of the torque of each joint [d], or what a fit of torques alone is off by, N m or N.
+        task: the problem from `measured_motions.problem`.
+        model: the same model.
+        windows: windows to fit, as many as there are motions.
+        validation: windows that select the parameters.
+        noise: standard deviations of the joints' torques [d], or the residuals of a fit of torques alone, N m or N.
         share: of the torques in the loss.
 
     Raises:

@@ -1,28 +1,28 @@
-"""What a fitted model does not know, found from its training data and calibrated on validation trajectories.
+"""Estimates the uncertainty of a fitted model from its training data, calibrated on validation trajectories.
 
     found = estimate(model, parameters, train, validation, ridge=0.0)
     torque_std = predictive(model, parameters, found.uncertainty.factor, found.uncertainty.noise)
 
 The covariance of the parameters is that of the least-squares fit (`learning.posterior`). For models that are linear in
-them, as `fit_linear` fits them, `ridge=0.0` is exact; a network trained on torques is linearised about its parameters
-(Laplace's approximation) with the ridge of `RIDGES` under which the validation torques are most likely. Of networks
-with more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain, the rest taken as known.
+them, as `fit_linear` fits them, `ridge=0.0` is exact. A network trained on torques is linearised about its parameters
+(Laplace's approximation) with the ridge of `RIDGES` that makes the validation torques most likely. For networks with
+more than `MOST_PARAMETERS` only the `DIRECTIONS` leading combinations are uncertain; the rest counts as known.
 
-What is left over is not white noise but also what the model cannot express, and errors of neighbouring samples are
-alike. Motions that were not fitted therefore scale both parts of the variance of each joint,
+Residuals are not white noise only: they contain what the model cannot express, and those of neighbouring samples are
+correlated. Motions that were not fitted therefore scale both parts of the variance of every joint,
 
-    a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood,
+    a noise² + b |phi F|²,   (a, b) = (1, 1), (a, a) or (a, b), of the greatest likelihood.
 
-and keeps the simplest that no other betters by more than half the logarithm of the effective samples for each further
-factor (Schwarz 1978): a few seconds that agree with the training leave it as it is. These motions are the validation's,
-and for least squares also the training's, each as if it had been left out (`posterior.left_out`). Both parts are then
-multiplied by the `scatter` of the motions: what a model lacks shows more in some motions than in others, and a new one
-may be among the former.
+The simplest form is kept unless another betters it by more than half the logarithm of the effective samples per further
+factor (Schwarz 1978): a few seconds that agree with the training leave it unchanged. These motions are the validation's
+and, for least squares, also the training's, each as if it had been left out (`posterior.left_out`). Both parts are then
+multiplied by the `scatter` of the motions: the model error is larger in some motions than in others, and a new motion
+may be one of the former.
 
 A model that is linear in its parameters is right wherever the data determine its torque, however far that is from them.
-A deviation by the parameters below `HARMLESS` of the torque therefore puts none of its states outside. Above that, a
-state is outside if its deviation exceeds those on the data, or if it leaves the range of the data. A network is outside
-wherever it leaves that range.
+A deviation due to parameters below `HARMLESS` of the torque therefore puts no state out of distribution. Above that, a
+state is out of distribution if its deviation exceeds those on the data, or if it leaves the range of the data. For a
+network, every state outside that range is out of distribution.
 """
 
 from typing import NamedTuple
@@ -42,31 +42,31 @@ from dln_jax.solvers.normal_equations import count
 from dln_jax.types import InputError, require_positive
 
 RIDGES = tuple(10.0**power for power in range(-18, 0, 2))
-"""That are tried for networks."""
+"""Ridges that are tried for networks."""
 RATIOS = (0.0, *(10.0 ** (power / 4) for power in range(-8, 25)))
-"""b / a that are tried."""
+"""Ratios b / a that are tried."""
 MOST_PARAMETERS, DIRECTIONS = 1_500, 400
 FOLDS = 10
-"""Groups of training trajectories that are left out in turn."""
+"""Number of groups of training trajectories that are left out in turn."""
 MOST_SAMPLES = 2_000
-"""Of the validation, spread evenly."""
+"""Largest number of validation samples, evenly spaced."""
 HARMLESS = 0.01
-"""Share of a torque's standard deviation: a smaller uncertainty by the parameters puts no state of a linear model
-outside."""
+"""No state of a linear model is out of distribution if its uncertainty due to parameters is below this share of the
+torque's standard deviation."""
 STILL = 1e-3
-"""rad, m, 1/s or 1/s²: how far a coordinate may move that rests in all data."""
+"""Range in rad, m, 1/s or 1/s² of a coordinate that rests in all data."""
 UPPER = 0.975
-"""Quantile by which `scatter` widens bands of few motions: that of two-sided bands of 95 %."""
+"""Quantile of two-sided bands of 95 %, by which `scatter` widens bands from few motions."""
 TINY = np.finfo(np.float64).tiny
 
 
 class Estimate(NamedTuple):
-    """What is stored, and how it came about."""
+    """Stored uncertainty of a model, and details of its estimate."""
 
     uncertainty: Uncertainty
     ridge: float
     degrees_of_freedom: Float[np.ndarray, " d"]
-    """Parameters that the data of each joint determine."""
+    """Number of parameters that the joints' data determine."""
     training_noise: Float[np.ndarray, " d"]
     """Standard deviation of the training residuals, N m or N, before calibration."""
 
@@ -84,19 +84,19 @@ def estimate(
     quantile: float = 0.999,
     margin: float = 1.25,
 ) -> Estimate:
-    """The uncertainty of a model of torques, in float64 whatever the model's dtype.
+    """Estimates the uncertainty of a model of torques, in float64 whatever the model's dtype.
 
     Args:
-        model: whose parameters were fitted to torques.
-        parameters: as they were found.
-        train: what they were fitted to.
-        validation: other trajectories, by which nothing but choices was made.
+        model: fitted to torques.
+        parameters: fitted parameters.
+        train: data of the fit.
+        validation: other trajectories, used for model selection at most.
         ridge: dimensionless, as in `learning.posterior`; 0 for least squares; by default chosen by validation.
-        unit: by which the fit divided the residuals of each joint, N m or N; by default `torque_scale`.
+        unit: scales by which the fit divided the joints' residuals, N m or N; by default `torque_scale`.
         rank_tolerance: as for `solvers.least_squares.solve`.
-        negligible: as there, and as it was given to `fit_linear`.
-        quantile: of the data, that the thresholds of `outside` are taken from.
-        margin: by which the thresholds are larger: held-out motions of the same kind go a little further.
+        negligible: the value that `fit_linear` used.
+        quantile: of the data, for the thresholds of `outside`.
+        margin: factor on the thresholds: held-out motions of the same kind go a little further.
 
     Raises:
         InputError: a setting out of range, parameters that are not finite, or torques that do not vary.
@@ -146,13 +146,13 @@ def estimate(
 def calibration(
     residual: Float[np.ndarray, " N"], noise: float, variance: Float[np.ndarray, " N"], samples: float
 ) -> tuple[float, float, float]:
-    """(a, b) of a noise² + b variance that residuals of one joint call for, and their mean negative log-likelihood.
+    """Returns (a, b) of a noise² + b variance for the residuals of one joint, and their mean negative log-likelihood.
 
     Args:
         residual: of the validation, N m or N.
         noise: standard deviation, of the training.
-        variance: by the parameters.
-        samples: how many of the residuals are independent.
+        variance: due to parameters.
+        samples: number of independent residuals.
     """
     ratios = np.asarray(RATIOS)[:, None]
     relative = np.maximum(noise**2 + ratios * variance, TINY)
@@ -172,7 +172,7 @@ def calibration(
 
 
 def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
-    """Factor by which a variance that is right on average is raised for one more motion, at least 1.
+    """Returns the factor, at least 1, by which a variance that is right on average is raised for a new motion.
 
     With s_m the mean square of the relative residuals of motion m, of M, and n_m their effective samples,
 
@@ -188,7 +188,7 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
 
     Args:
         relative: residuals in units of their predicted standard deviations.
-        trajectory: motion of each; 1 where there are fewer than three.
+        trajectory: motion of every residual; with fewer than three motions the factor is 1.
     """
     motions = [relative[trajectory == each] for each in np.unique(trajectory)]
     if len(motions) < 3:
@@ -199,13 +199,13 @@ def scatter(relative: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
     beyond = np.var(squares, ddof=1) - chance * np.mean(squares) ** 2
     if not beyond > 0:
         return 1.0
-    from scipy.special import ndtri, stdtrit  # commands first decide on BLAS's threads
+    from scipy.special import ndtri, stdtrit  # imported here, after commands have set BLAS's threads
 
     return float((1 + np.sqrt((1 + 1 / M) * beyond)) * (stdtrit(M - 1, UPPER) / ndtri(UPPER)) ** 2)
 
 
 def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray) -> float:
-    """How many independent samples say as much of the variance: N / (1 + 2 sum of squared autocorrelations).
+    """Effective number of independent samples for the variance: N / (1 + 2 sum of squared autocorrelations).
 
     The sum ends at the first lag whose autocorrelation is below 0.05 (Bayley and Hammersley 1946, for the squares).
     """
@@ -222,7 +222,7 @@ def effective_samples(residual: Float[np.ndarray, " N"], trajectory: np.ndarray)
 
 
 def thinned(data: Trajectories, most: int) -> Trajectories:
-    """At most so many samples, spread evenly."""
+    """Returns at most `most` samples, evenly spaced."""
     rows = np.unique(np.linspace(0, len(data.t) - 1, min(most, len(data.t))).round().astype(int))
     keys = ("t", "q", "qd", "qdd", "tau", "trajectory")
     return data._replace(**{key: getattr(data, key)[rows] for key in keys})
@@ -286,7 +286,7 @@ def _along(found: Spectrum, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reach(train: Trajectories, validation: Trajectories, quantile: float) -> tuple[np.ndarray, np.ndarray]:
-    """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, each [3 d]."""
+    """Middle of the range of (q, qd, qdd) in training, and the quantile of all data's distance from it, both [3 d]."""
     states, others = (np.concatenate([each.q, each.qd, each.qdd], axis=1) for each in (train, validation))
     centre = (states.max(axis=0) + states.min(axis=0)) / 2
     return centre, np.quantile(abs(np.concatenate([states, others]) - centre), quantile, axis=0)

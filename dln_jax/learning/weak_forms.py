@@ -1,15 +1,15 @@
-"""Models linear in their parameters from q, qd and tau alone: the equations of motion in weak form, without qdd.
+"""Fits models linear in their parameters to q, qd and tau: the equations of motion in weak form, without qdd.
 
-With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd has gravity, friction and what
-is left of the Coriolis forces. Multiplied by a window w(t) that is zero at both its ends, and integrated by parts:
+With the momentum p = M(q) qd, tau = dp/dt + s(q, qd), where s = tau(q, qd, 0) - dM/dt qd holds gravity, friction and
+the rest of the Coriolis forces. Multiplied by a window w(t) that is zero at both ends, and integrated by parts:
 
     - integral w' p dt + integral w s dt = integral w tau dt
 
 (modulating functions, Shinbrot 1957; for robots the filtered forms of Slotine and Li 1987.) Both sides are linear in
-the parameters, one equation for each joint and window. No acceleration appears, whose noise grows with the square of
-the frequency, and both sides go through the same low-pass, so that dry friction is not distorted: the result hardly
-depends on the cut-off of q. The energy E = T + V obeys the same with the power of motors and of friction (Gautier and
-Khalil 1988), qdᵀ tau = dE/dt + qdᵀ dD/dqd: one equation for all joints, less to compute and less to learn from.
+the parameters, with one equation per joint and window. No acceleration appears, whose noise grows with the square of
+the frequency. Both sides pass through the same low-pass, so that dry friction is not distorted, and the result hardly
+depends on the cut-off of q. The energy E = T + V satisfies the same form with the power of motors and of friction
+(Gautier and Khalil 1988), qdᵀ tau = dE/dt + qdᵀ dD/dqd: one equation for all joints, cheaper but with less information.
 
 The windows are sin⁴ (pi t / W), with weights that make plain sums over samples exact to the smoothness of the motion.
 """
@@ -37,11 +37,11 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Vector, require_positive
 
 WINDOW = 0.16
-"""s: some two periods of what a low-pass at 12 Hz lets through."""
+"""Length of a window in s: about two periods of the highest frequency that a low-pass at 12 Hz passes."""
 FEWEST = 8
-"""Steps of a window."""
+"""Smallest number of steps of a window."""
 OVERLAP = 5
-"""Windows that begin within the length of one: more are all but copies."""
+"""Number of windows that start within the length of one: further windows would be nearly copies."""
 CHUNK = 4096
 """Samples whose columns are in memory at a time."""
 
@@ -50,25 +50,25 @@ class WeakFit(NamedTuple):
     """Identified parameters, and how well the data determine them; otherwise as `learning.linear.LinearFit`."""
 
     parameters: Any
-    """Of the model, in its dtype."""
+    """Parameters of the model, in its dtype."""
     parameter_count: int
     rank: int
     condition: float
     equations: int
-    """Windows, times joints for the momentum."""
+    """Number of windows, times the number of joints for the momentum."""
     mse: float
-    """Mean over windows of the squared error of their mean torque, summed over joints, or power; (N m)² or W²."""
+    """Mean over windows of the squared error of the mean torque, summed over joints, or of the power; (N m)² or W²."""
 
 
 class _Form(NamedTuple):
-    """Of which equations there are windows: `right` = d/dt of the first of `left` + the second."""
+    """Equations of the windows: `right` = d/dt of the first of `left` + the second."""
 
     left: Callable[[Dynamics, Vector, Vector], tuple[Array, Array]]
-    """(plant, q, qd) -> [k] each."""
+    """(plant, q, qd) -> two arrays [k]."""
     right: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """(qd, tau) [N, d] -> [N, k]."""
     noise: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """(qd [N, d], deviations of tau [d]) -> those of the right side [N, k]."""
+    """(qd [N, d], deviations of tau [d]) -> deviations of the right side [N, k]."""
 
 
 def fit_momentum(
@@ -81,20 +81,20 @@ def fit_momentum(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> WeakFit:
-    """The parameters of least squared error of the windows' momenta, in float64; qdd is not read.
+    """Fits the momenta of windows by least squares, in float64; qdd is not read.
 
     Args:
         model: linear in its parameters, such as `models.make_rigid_tree` and `models.make_trigonometric`.
-        data: at equal steps, with velocities that are fit to be used and torques as they were measured, such as
-            `data.encoders.smooth` gives.
-        window: s, at least `FEWEST` steps.
-        noise: standard deviation of each torque's noise, by which its equations are divided (default: that of each
-            torque's variation).
-        ridge: as in `solvers.least_squares.solve`, as are `rank_tolerance` and `negligible`.
+        data: at equal time steps, with smooth velocities and torques as measured, for example from
+            `data.encoders.smooth`.
+        window: length in s, at least `FEWEST` steps.
+        noise: standard deviations of the torques' noise, by which the equations are divided (default: those of the
+            torques themselves).
+        ridge: as in `solvers.least_squares.solve`, like `rank_tolerance` and `negligible`.
 
     Raises:
-        InputError: steps that are not equal, no stretch as long as a window, torques that do not vary, or settings
-            out of range.
+        InputError: steps that are not equal, no segment as long as a window, torques that do not vary, or settings out
+            of range.
     """
     form = _Form(momentum_and_rest, lambda qd, tau: tau, lambda qd, noise: np.broadcast_to(noise, qd.shape))
     tolerances = {"ridge": ridge, "rank_tolerance": rank_tolerance, "negligible": negligible}
@@ -111,7 +111,7 @@ def fit_energy(
     rank_tolerance: float | None = None,
     negligible: float = 0.0,
 ) -> WeakFit:
-    """The same of the windows' energies; arguments and errors as for `fit_momentum`."""
+    """Fits the energies of windows by least squares; arguments and errors as for `fit_momentum`."""
     form = _Form(
         energy_and_loss,
         lambda qd, tau: np.sum(qd * tau, axis=1, keepdims=True),
@@ -166,12 +166,12 @@ def momentum_and_rest(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Vector, V
 
 
 def energy_and_loss(plant: Dynamics, q: Vector, qd: Vector) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-    """E = T + V and the power that friction takes, of one state: qdᵀ tau = dE/dt + loss."""
+    """E = T + V and the power lost to friction, of one state: qdᵀ tau = dE/dt + loss."""
     return plant.energy(q, qd)[None], (qd @ plant.friction(q, qd))[None]
 
 
 def window_weights(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """w dt and w' dt [steps + 1] of a window of so many steps, whose integral of w is 1."""
+    """w dt and w' dt [steps + 1] of a window of this number of steps, scaled so that the integral of w is 1."""
     phase = np.pi * np.arange(steps + 1) / steps
     w, slope = np.sin(phase) ** 4, 4 * np.pi / (steps * dt) * np.sin(phase) ** 3 * np.cos(phase)
     return w / w.sum(), slope / w.sum()
@@ -186,7 +186,7 @@ def _equations(
     noise: Float[np.ndarray, " d"],
     window: float,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Columns [W, k, P], right-hand sides and their deviations [W, k] of the windows of one chunk after the other."""
+    """Columns [W, k, P], right-hand sides and their deviations [W, k] of windows, one chunk after the other."""
 
     def both(theta: Parameters, q: Vector, qd: Vector) -> Array:
         return jnp.concatenate(form.left(dynamics(model.energies(unravel(theta))), q, qd))

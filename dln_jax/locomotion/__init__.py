@@ -1,4 +1,4 @@
-"""Policies that move soft creatures: learned by gradients through the simulator, by evolution, or by PPO."""
+"""Locomotion of soft creatures: policies learned by gradients through the simulator, by evolution, or by PPO."""
 
 from dln_jax.locomotion.learning import Goal, Learned, Record
 from dln_jax.locomotion.methods import Trained, shown_walk, train

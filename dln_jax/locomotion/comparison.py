@@ -1,4 +1,4 @@
-"""Ways of learning side by side: how many environment steps and seconds they need for a distance, and one figure."""
+"""Comparison of learning methods: environment steps and seconds until a distance is reached, and a figure."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,31 +14,31 @@ from dln_jax.figures import style
 from dln_jax.locomotion.learning import Record
 
 Curves = Mapping[str, Sequence[Sequence[Record]]]
-"""Records of each seed, by the name of the way of learning."""
+"""Records of the seeds, by the name of the method."""
 
 COLOURS = {"gradient": style.BLUE, "evolution": style.GREEN, "ppo": style.ORANGE}
 BELOW_LEGEND = 0.62
-"""Share of a panel's height that curves may take."""
+"""Share of a panel's height for the curves, below the legend."""
 
 
 def first_reaching(records: Sequence[Record], distance: float) -> Record | None:
-    """The first evaluation of a seed that went so far; `None` where none did."""
+    """First evaluation of a seed that reached the distance; `None` if none did."""
     return next((record for record in records if record.distance >= distance), None)
 
 
 def median_to_reach(seeds: Sequence[Sequence[Record]], distance: float, field: str) -> float:
-    """Median over seeds of the "steps" or "seconds" needed; infinite where at least half of them never got there."""
+    """Median over seeds of the "steps" or "seconds" to the distance; infinite if at least half never reached it."""
     found = [first_reaching(records, distance) for records in seeds]
     return float(np.median([math.inf if record is None else getattr(record, field) for record in found]))
 
 
 def farthest_so_far(records: Sequence[Record]) -> Float[np.ndarray, " r"]:
-    """The best distance up to each evaluation, 0 at least."""
+    """The best distance up to every evaluation, at least 0."""
     return np.maximum.accumulate(np.fmax([record.distance for record in records], 0.0))
 
 
 def median_curve(seeds: Sequence[Sequence[Record]], field: str) -> tuple[np.ndarray, np.ndarray]:
-    """Median over seeds of the farthest so far, at all their places; a seed that has ended keeps its last."""
+    """Median over seeds of the best distance so far, at all evaluations; a seed that has ended keeps its last value."""
     own = [[getattr(record, field) for record in records] for records in seeds]
     places = np.unique(np.concatenate(own))
     held = [_held(at, farthest_so_far(records), places) for at, records in zip(own, seeds, strict=True)]
@@ -46,7 +46,7 @@ def median_curve(seeds: Sequence[Sequence[Record]], field: str) -> tuple[np.ndar
 
 
 def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Record]], field: str) -> float | None:
-    """The place after which the first's median stays ahead of the second's; `None` where it always or never is."""
+    """Point after which the first method's median stays ahead of the second's; `None` if it always or never is."""
     curves = [median_curve(seeds, field) for seeds in (first, second)]
     places = np.unique(np.concatenate([places for places, _ in curves]))
     behind = np.flatnonzero(_held(*curves[0], places) < _held(*curves[1], places))
@@ -56,7 +56,7 @@ def crossover(first: Sequence[Sequence[Record]], second: Sequence[Sequence[Recor
 
 
 def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
-    """Farthest distance so far against environment steps and against wall seconds: seeds thin, their median thick."""
+    """Best distance so far against environment steps and against wall seconds: seeds thin, their median thick."""
     figure, [panels] = style.figure(1, 2, height=3.6, sharey=True)
     labels = {"steps": "environment steps", "seconds": "wall time incl. compilation, s"}
     for axis, (field, label) in zip(panels, labels.items(), strict=True):
@@ -72,7 +72,7 @@ def comparison_figure(curves: Curves, *, distance: float, title: str) -> Figure:
 
 
 def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure:
-    """The distance of every evaluation against environment steps, a line for each seed."""
+    """Distance of every evaluation against environment steps, with a line per seed."""
     figure, [[axis]] = style.figure(height=3.4)
     for records in seeds:
         steps, distances = [record.steps for record in records], [record.distance for record in records]
@@ -84,7 +84,7 @@ def learning_figure(seeds: Sequence[Sequence[Record]], *, method: str) -> Figure
 
 
 def _held(own: Any, values: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The last value up to each place, 0 before the first."""
+    """Last value up to every place, 0 before the first."""
     return np.concatenate([[0.0], values])[np.searchsorted(own, places, side="right")]
 
 

@@ -1,4 +1,4 @@
-"""The task as a `gymnasium.Env`, for other libraries' learners: NumPy in float32, actions in [-1, 1]."""
+"""The task as a `gymnasium.Env`, for learners of other libraries: NumPy in float32, actions in [-1, 1]."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ from dln_jax.locomotion.task import FALLEN, Task, actuation_of, advance, beginni
 
 
 def spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Of observations and of actions."""
+    """Spaces of observations and of actions."""
     seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.observation_size,), np.float32)
     return seen, gymnasium.spaces.Box(-1.0, 1.0, (task.muscle_count,), np.float32)
 
 
 class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One creature: an action in [-1, 1] per muscle is an actuation in [0.25, 1], the reward is that of the task.
+    """Environment of one creature, with the task's rewards; actions in [-1, 1] are actuations in [0.25, 1].
 
-    An episode is truncated after the task's number of steps. It is terminated by a fall, and by a step of the simulator
-    that does not converge, which `info["converged"]` tells apart.
+    An episode is truncated after the task's number of steps. It is terminated by a fall, or by a step of the simulator
+    that does not converge; `info["converged"]` distinguishes the two.
     """
 
     def __init__(self, task: Task):
@@ -33,7 +33,7 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " o"], dict[str, Any]]:
-        """The observation of the rest shape at rest; nothing is random."""
+        """Returns the observation of the rest shape at rest; nothing is random."""
         super().reset(seed=seed, options=options)
         self._place = self._start
         return self._observation(), {}
@@ -41,7 +41,7 @@ class CreatureEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(
         self, action: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " o"], float, bool, bool, dict[str, Any]]:
-        """Observation, reward, terminated, truncated, and `info` with "x" [n, 2] in m and "converged"."""
+        """Returns observation, reward, terminated, truncated, and `info` with "x" [n, 2] in m and "converged"."""
         self._place, seen = self._advance(self._place, np.asarray(action, self._place.state.x.dtype))
         converged = bool(seen.converged)
         terminated = not converged or abs(float(seen.tilt)) > FALLEN

@@ -2,8 +2,8 @@
 
     g = 1 / (2 n sigma) sum_i (u_i+ - u_i-) eps_i,    eps_i ~ N(0, I)
 
-u± are the fitnesses of theta ± sigma eps_i, or their centred ranks in [-1/2, 1/2], which no outlier can sway. With
-fitnesses and many pairs g is the gradient of E[f(theta + sigma eps)], and of f where f is quadratic.
+u± are the fitnesses of theta ± sigma eps_i, or their centred ranks in [-1/2, 1/2], which are robust against outliers.
+With fitnesses and many pairs g is the gradient of E[f(theta + sigma eps)], and of f if f is quadratic.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from dln_jax.types import require_positive
 
 
 class EvolutionSettings(NamedTuple):
-    """How the strategy searches; the same for all creatures and seeds."""
+    """Settings of the strategy, the same for all creatures and seeds."""
 
     pairs: int = 16
     """n; a generation is 2 n episodes."""
@@ -36,15 +36,15 @@ class EvolutionSettings(NamedTuple):
 
     @property
     def lanes(self) -> int:
-        """Creatures side by side."""
+        """Number of creatures simulated side by side."""
         return 2 * self.pairs
 
 
 class EvolutionState(NamedTuple):
-    """Where the search is."""
+    """State of the search."""
 
     parameters: Any
-    """Of the policy, as a vector [p]."""
+    """Parameters of the policy, as a vector [p]."""
     optimiser: Any
     seed: Int[Array, ""]
     generation: Int[Array, ""]
@@ -54,12 +54,12 @@ class EvolutionState(NamedTuple):
 def estimate(
     plus: Float[Array, " n"], minus: Float[Array, " n"], noise: Float[Array, "n p"], deviation: float
 ) -> Float[Array, " p"]:
-    """g of the fitnesses, or ranks, of theta + sigma eps and theta - sigma eps."""
+    """g from the fitnesses, or ranks, of theta + sigma eps and theta - sigma eps."""
     return (plus - minus) @ noise / (2.0 * deviation * len(noise))
 
 
 def centred_ranks(fitness: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Places in ascending order, from -1/2 to 1/2; what is not a number comes first."""
+    """Ranks in ascending order, from -1/2 to 1/2; NaN ranks lowest."""
     order = jnp.argsort(jnp.argsort(jnp.where(jnp.isnan(fitness), -jnp.inf, fitness)))
     return order / (len(fitness) - 1) - 0.5
 
@@ -71,7 +71,7 @@ def make_evolution_learner(
     *,
     mesh: Mesh | None = None,
 ) -> Learner:
-    """The learner; episodes with a step that does not converge rank last and count as skipped.
+    """Returns the learner; episodes with a step that does not converge rank last and count as skipped.
 
     Raises:
         InputError: settings that are not positive, or a mesh that does not divide the lanes.

@@ -2,11 +2,11 @@
 
     J(theta) = E[ reward of a window of H steps under theta + sigma eps ],    eps ~ N(0, I)
 
-Each lane walks H steps from where its last window ended, with parameters of its own; gradients go back to the beginning
-of the window and no further, so that they neither explode nor vanish over the length of an episode (Xu et al. 2022,
-"Accelerated policy learning with parallel differentiable simulation"). Windows are longer than the clock's period, so
-that what a step does for the next stride is seen and no value function is needed. Lanes come in pairs, +eps and -eps.
-The gradient is the mean of the lanes' own, in their order, so that it does not depend on which device has which.
+Every lane walks H steps from the end of its last window, with its own parameters. Gradients go back to the beginning of
+the window and no further, so that they neither explode nor vanish over the length of an episode (Xu et al. 2022,
+"Accelerated policy learning with parallel differentiable simulation"). Windows are longer than the clock's period: they
+include the effect of a step on the next stride, and no value function is needed. Lanes come in pairs, +eps and -eps.
+The gradient is the mean over lanes in their order, so that it does not depend on their assignment to devices.
 """
 
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from dln_jax.types import InputError, require_positive
 
 
 class GradientSettings(NamedTuple):
-    """How gradients are taken and followed."""
+    """Settings of the gradients and of their descent."""
 
     window: int = 40
     """Steps that gradients go back; divides the episode."""
@@ -40,17 +40,17 @@ class GradientSettings(NamedTuple):
 
     @property
     def lanes(self) -> int:
-        """Creatures side by side."""
+        """Number of creatures simulated side by side."""
         return 2 * self.pairs
 
 
 class GradientState(NamedTuple):
-    """Where learning is."""
+    """State of the learning."""
 
     parameters: Parameters
     optimiser: Any
     lanes: Place
-    """Of each lane."""
+    """Places of the lanes."""
     seed: Int[Array, ""]
     updates: Int[Array, ""]
     skipped: Int[Array, ""]
@@ -70,10 +70,10 @@ def make_gradient_learner(
     *,
     mesh: Mesh | None = None,
 ) -> Learner:
-    """The learner.
+    """Returns the learner.
 
     Raises:
-        InputError: what `check` finds, or a mesh that does not divide the lanes.
+        InputError: raised by `check`, or a mesh that does not divide the lanes.
     """
     check(settings, task.episode)
     shares(mesh, settings.lanes, LANES)
@@ -82,7 +82,7 @@ def make_gradient_learner(
 
     def start(seed: int) -> GradientState:
         parameters = policy.init(jax.random.key(seed))
-        # Lanes are in different parts of the episode, so that every update sees several.
+        # Lanes start in different parts of the episode, so that every update sees several.
         counts = jnp.arange(lanes) * window % task.episode
         places = jax.vmap(lambda steps: beginning(task)._replace(steps=steps))(counts)
         zero = jnp.asarray(0)
@@ -103,7 +103,7 @@ def make_gradient_learner(
         noise = _pairs_of_noise(key, state.parameters, settings.pairs)
         gradients, (ends, usable_ends) = descents(state.parameters, (signs, noise, state.lanes))
         gradient = jax.tree.map(lambda of_lanes: of_lanes.mean(axis=0), gradients)
-        # A step that does not converge has NaN for a gradient.
+        # A step that does not converge has NaN as its gradient.
         usable = finite(gradient)
         change, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         moved = optax.apply_updates(state.parameters, change)
@@ -123,7 +123,7 @@ def make_gradient_learner(
 
 
 def _pairs_of_noise(key: Array, like: Parameters, pairs: int) -> Parameters:
-    """The same normal numbers for the two lanes of each pair."""
+    """Normal numbers that are the same for the two lanes of a pair."""
     leaves, structure = jax.tree.flatten(like)
     keys = jax.random.split(key, len(leaves))
     drawn = [jax.random.normal(k, (pairs, *leaf.shape), leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)]

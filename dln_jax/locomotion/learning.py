@@ -1,7 +1,7 @@
-"""What the ways of learning share: learn, evaluate, record, until a distance or a number of environment steps.
+"""Loop of all learning methods: learn, evaluate, record, until a distance or a number of environment steps.
 
-An environment step is one step of the simulator for one creature. Those of evaluations are counted apart; every way of
-learning is evaluated alike, by one episode from rest, after each call of `improve` or each update of PPO.
+An environment step is one step of the simulator for one creature. Those of evaluations are counted separately. All
+methods are evaluated alike, by one episode from rest, after every call of `improve` or every update of PPO.
 """
 
 import math
@@ -26,9 +26,9 @@ from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
 CHECKPOINT = "checkpoint"
-"""Beginning of the names of the files from which a seed can continue."""
+"""Prefix of the checkpoint files of a seed."""
 LANES = "creatures side by side"
-"""What devices share."""
+"""What devices share, for messages."""
 
 
 class Record(NamedTuple):
@@ -37,47 +37,47 @@ class Record(NamedTuple):
     steps: int
     """Environment steps of learning so far."""
     seconds: float
-    """Wall time so far: compilation, learning and evaluation, interruptions apart."""
+    """Wall time so far: compilation, learning and evaluation, without interruptions."""
     distance: float
     """Body lengths in one episode from rest."""
     skipped: int
-    """Updates so far that were left out because a step of the simulator did not converge."""
+    """Updates skipped so far because a step of the simulator did not converge."""
 
 
 class Learner(NamedTuple):
-    """A way of learning."""
+    """A learning method."""
 
     policy: Policy
     start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays; but for PPO, whose state is its model, and is not stored."""
+    """Seed -> state, a tree of arrays; except for PPO, whose state is its model and is not stored."""
     improve: Callable[[Any], Any]
-    """State -> state after some updates; of trees, traceable."""
+    """State -> state after some updates; traceable for trees."""
     parameters: Callable[[Any], Parameters]
-    """Of the policy in a state."""
+    """State -> parameters of the policy."""
     steps: int
-    """Environment steps that `improve` takes."""
+    """Environment steps per call of `improve`."""
     skipped: Callable[[Any], Any] = lambda state: state.skipped
-    """Updates that a state has left out."""
+    """State -> number of skipped updates."""
 
 
 class Compiled(NamedTuple):
-    """A learner with its programs, for any number of seeds."""
+    """A learner with its compiled programs, for any number of seeds."""
 
     learner: Learner
     improve: Callable[[Any], Any]
     evaluate: Callable[[Parameters], Any]
     episode: int
     seconds: float
-    """That compiling took."""
+    """Compilation time."""
     mesh: Mesh | None = None
-    """On whose devices they run."""
+    """Devices that run the programs."""
 
 
 class Learned(NamedTuple):
-    """What learning gives."""
+    """Result of learning."""
 
     parameters: Parameters
-    """Those that went farthest in an evaluation."""
+    """Parameters with the longest distance in an evaluation."""
     records: list[Record]
     compile_seconds: float
     evaluation_steps: int
@@ -85,12 +85,12 @@ class Learned(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """The farthest, in body lengths."""
+        """Longest distance in an evaluation, in body lengths."""
         return max((r.distance for r in self.records if math.isfinite(r.distance)), default=math.nan)
 
 
 class Goal(NamedTuple):
-    """When learning ends."""
+    """Conditions that end learning."""
 
     steps: int
     """Environment steps; the last update may exceed it."""
@@ -102,7 +102,7 @@ Report = Callable[[Record], None]
 
 
 def compile_learner(task: Task, learner: Learner, mesh: Mesh | None = None) -> Compiled:
-    """Compiles what a learner runs, for the mesh that it was made for."""
+    """Compiles a learner's programs, for the mesh that it was built for."""
     began = time.perf_counter()
     state = jax.eval_shape(lambda: learner.start(0))
     improve = program(learner.improve, mesh).lower(state).compile(quick_compilation())
@@ -113,12 +113,12 @@ def compile_learner(task: Task, learner: Learner, mesh: Mesh | None = None) -> C
 def compile_evaluation(
     task: Task, policy: Policy, parameters: Parameters, mesh: Mesh | None = None
 ) -> Callable[[Parameters], Any]:
-    """Parameters -> body lengths in one episode from rest; every device walks, and the first one's counts for all."""
+    """Parameters -> body lengths in one episode from rest; every device walks, and the first device's result counts."""
 
     def judged(parameters: Parameters, ones: Array) -> Array:
         return ones * run_episode(task, lambda seen: policy.apply(parameters, seen)).distance
 
-    # Devices of other makes may round differently, and must come to the same decisions.
+    # Devices of different models may round differently, and must come to the same decisions.
     judge = program(lambda parameters: spread(judged, mesh)(parameters, jnp.ones(1))[0], mesh)
     return judge.lower(parameters).compile(quick_compilation())
 
@@ -133,20 +133,20 @@ def learn(
     resume: bool = False,
     report: Report = lambda record: None,
 ) -> Learned:
-    """Learns until the goal; with a directory, stores every evaluation's state there and can continue bit for bit.
+    """Learns until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
 
     Args:
-        compiled: by `compile_learner`, or by `compile_ppo` without a directory.
+        compiled: from `compile_learner`, or from `compile_ppo` without a directory.
         seed: decides everything random.
-        goal: when to end.
+        goal: conditions that end learning.
         directory: an existing folder for checkpoints.
-        settings: JSON values that decide the result; a stored run of others is not continued.
-        resume: continue the run in the directory, if it has come to a first checkpoint.
+        settings: JSON values that decide the result; a stored run with others is not continued.
+        resume: continue the run in the directory, if it has a checkpoint.
         report: called after every evaluation.
 
     Raises:
         InputError: the stored run had other settings, or its files are damaged.
-        KeyboardInterrupt: raised only after the evaluation at hand is stored.
+        KeyboardInterrupt: raised only after the current evaluation is stored.
     """
     learner, name = compiled.learner, f"{CHECKPOINT}-{seed}"
     identity = {"settings": {**(settings or {}), "seed": seed}}
@@ -175,17 +175,17 @@ def learn(
 
 
 def finite(tree: Any) -> Any:
-    """Whether every number of a tree is."""
+    """Whether all numbers of a tree are finite."""
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
 
 
 def chosen(condition: Any, new: Any, old: Any) -> Any:
-    """One of two trees."""
+    """Selects one of two trees."""
     return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
 
 
 def reached(records: list[Record], goal: Goal) -> bool:
-    """Whether the last evaluation is the last of all."""
+    """Whether the last evaluation meets the goal."""
     return bool(records) and (records[-1].steps >= goal.steps or records[-1].distance >= goal.distance)
 
 

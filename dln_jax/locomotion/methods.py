@@ -1,4 +1,4 @@
-"""The ways of learning by name, and several seeds of one of them."""
+"""Learning methods by name, and training of several seeds."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,22 +22,22 @@ Method = Literal["gradient", "evolution", "ppo"]
 METHODS: tuple[Method, ...] = get_args(Method)
 SETTINGS: dict[str, Any] = {"gradient": GradientSettings(), "evolution": EvolutionSettings(), "ppo": PPOSettings()}
 WINDOWS = {"crawler": 40, "biped": 80, "quadruped": 40}
-"""Steps that gradients go back, by creature: balance on two legs takes the whole episode."""
+"""Steps that gradients go back, by creature: balance on two legs needs the whole episode."""
 STEPS = {"gradient": 40_000, "evolution": 500_000, "ppo": 300_000}
-"""Environment steps by default."""
+"""Default numbers of environment steps."""
 
 Report = Callable[[int, Record], None]
 
 
 class Trained(NamedTuple):
-    """Several seeds of one way of learning."""
+    """Several seeds of one learning method."""
 
     policy: Policy
     learned: list[Learned]
 
     @property
     def best(self) -> Learned:
-        """The seed that went farthest."""
+        """The seed with the longest distance."""
         return max(self.learned, key=lambda of: of.distance if np.isfinite(of.distance) else -np.inf)
 
 
@@ -55,24 +55,24 @@ def train(
     mesh: Mesh | None = None,
     report: Report = lambda seed, record: None,
 ) -> Trained:
-    """Learns with each seed; settings are the same for all seeds and, but for the window, for all creatures.
+    """Learns with several seeds; settings are the same for all seeds and, except the window, for all creatures.
 
     Args:
-        task: what is learned.
+        task: to learn.
         method: "gradient", "evolution" or "ppo".
-        seeds: one after the other; programs are compiled once.
-        goal: when each ends.
+        seeds: trained one after the other; programs are compiled once.
+        goal: conditions that end the learning of a seed.
         width: of the hidden layer of a policy that is learned by gradients or evolution.
         window: steps that gradients go back (default: those of `WINDOWS`).
         lanes: creatures side by side, an even number for gradients and evolution (default: those of `SETTINGS`).
         directory: where gradients and evolution store their states.
-        resume: continue what is stored there.
-        mesh: devices that share the creatures which are stepped side by side.
+        resume: continue the runs stored there.
+        mesh: devices that share the creatures simulated side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: an unknown method, PPO without stable-baselines3 or to be resumed, a stored run of other settings, a
-            mesh that does not divide the creatures.
+        InputError: an unknown method, PPO without stable-baselines3 or with resume, a stored run with other settings,
+            or a mesh that does not divide the creatures.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
@@ -92,7 +92,7 @@ def train(
 
 
 def settings_of(method: Method, creature: str, window: int | None = None, lanes: int | None = None) -> Any:
-    """Settings of a method for a creature; only the window of gradients depends on it.
+    """Returns the settings of a method for a creature; only the window of gradients depends on the creature.
 
     Raises:
         InputError: an odd number of lanes, for a method that takes them in pairs.
@@ -108,6 +108,6 @@ def settings_of(method: Method, creature: str, window: int | None = None, lanes:
 
 
 def shown_walk(task: Task, policy: Policy, parameters: Parameters, steps: int) -> Walk:
-    """What a policy does from rest, as NumPy arrays."""
+    """Runs a policy from rest and returns its steps as NumPy arrays."""
     program = jax.jit(lambda p: walk(task, lambda seen: policy.apply(p, seen), beginning(task), steps)[1])
     return jax.tree.map(np.asarray, program(jax.tree.map(jnp.asarray, parameters)))

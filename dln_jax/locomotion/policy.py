@@ -2,7 +2,7 @@
 
     h = tanh(W_b body + W_c clock + b),    actuation = 0.25 + 0.75 sigmoid(W_a h + b_a + 1)
 
-Layers start with variances 0.3, 1 and 1 over their fan-in: at first the clock drives the body more than the body does.
+Layers start with variances 0.3, 1 and 1 over their fan-in: initially the clock has more influence than the body.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ Parameters = Any
 
 
 class Policy(NamedTuple):
-    """The (init, apply) pair."""
+    """Policy as an (init, apply) pair."""
 
     init: Callable[[Array], Parameters]
     """Random key -> parameters."""
@@ -32,7 +32,7 @@ class Policy(NamedTuple):
 
 
 def make_policy(task: Task, *, width: int = WIDTH) -> Policy:
-    """The policy of a task."""
+    """Returns the policy of a task."""
     require_network(width=width, depth=1)
 
     def network(observation: Float[Array, " o"]) -> Float[Array, " k"]:

@@ -43,13 +43,13 @@ class PPOSettings(NamedTuple):
 
 
 def require_stable_baselines3() -> None:
-    """Raises `InputError` where stable-baselines3 is not installed."""
+    """Raises `InputError` if stable-baselines3 is not installed."""
     if importlib.util.find_spec("stable_baselines3") is None:
         raise InputError("--method ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
 
 
 def make_actor(task: Task) -> Policy:
-    """The actor's mean as a policy; parameters are "w" and "b" of each layer, without an initialisation."""
+    """Returns the actor's mean as a policy; parameters are "w" and "b" of the layers, and `init` raises."""
 
     def apply(parameters: Parameters, observation: Float[Array, " o"]) -> Float[Array, " k"]:
         h, (*hidden, last) = observation.astype(parameters[0]["w"].dtype), parameters
@@ -65,7 +65,7 @@ def make_actor(task: Task) -> Policy:
 
 
 def actor_parameters(model: Any) -> Parameters:
-    """Of `make_actor`, from a stable-baselines3 model."""
+    """Returns the parameters of `make_actor` from a stable-baselines3 model."""
     stored = model.policy.state_dict()
     return tuple(
         {"w": jnp.asarray(stored[f"{name}.weight"].numpy()), "b": jnp.asarray(stored[f"{name}.bias"].numpy())}
@@ -79,10 +79,10 @@ def compile_ppo(
     *,
     mesh: Mesh | None = None,
 ) -> Compiled:
-    """The learner with its programs; each update is one of `settings.steps` of every lane.
+    """Returns the learner with its programs; an update takes `settings.steps` steps of every lane.
 
-    Devices of a mesh share the lanes. The networks are trained by every process, alike, because all see the same lanes
-    and draw the same numbers.
+    Devices of a mesh share the lanes. All processes train the networks identically, because they see the same lanes and
+    draw the same numbers.
 
     Raises:
         InputError: stable-baselines3 is not installed, or a mesh that does not divide the lanes.
@@ -94,9 +94,9 @@ def compile_ppo(
     from dln_jax.locomotion.vector_environment import VectorEnvironment
 
     began = time.perf_counter()
-    # Networks this small are slower on several threads.
+    # Networks of this size are slower on several threads.
     torch.set_num_threads(1)
-    # Body lengths per second: rewards of a size that suits the critic.
+    # Rewards in body lengths per second, a scale that suits the critic.
     lanes = VectorEnvironment(task, settings.lanes, reward_scale=1.0 / TIME_STEP, mesh=mesh)
 
     def start(seed: int) -> Any:

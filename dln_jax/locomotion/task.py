@@ -5,10 +5,10 @@
     posture = 1 - cos tilt + (max(0, 0.8 - h / h_rest) / 0.2)²
 
 L is the creature's body length, t the time since the episode of T steps began, and P the period of the clock. Heights
-are those above the ground; along the ground only positions relative to the mean x are seen, so that places are alike.
-h is the mean height, and the tilt that of the rotation which takes the rest shape nearest to the body (Procrustes). A
-body that has tilted by more than 1 rad has fallen, and what it travels from then on does not count: tall bodies would
-go far by rolling.
+are relative to the ground; along the ground only positions relative to the mean x are observed, so that all places are
+equivalent. h is the mean height, and the tilt is that of the rotation which takes the rest shape nearest to the body
+(Procrustes). A body that has tilted by more than 1 rad has fallen, and distance after a fall does not count: tall
+bodies would go far by rolling.
 """
 
 from collections.abc import Callable
@@ -30,24 +30,24 @@ CREATURES: dict[str, Callable[[], Creature]] = {"crawler": crawler, "biped": bip
 EPISODE = 80
 """Steps of an episode."""
 CLOCK_PERIOD = 16.0
-"""Steps of one turn of the clock."""
+"""Period of the clock in steps."""
 SHORTEST = 0.25
-"""Least actuation: length of a muscle relative to its rest length; the greatest is 1."""
+"""Smallest actuation: length of a muscle relative to its rest length; the largest is 1."""
 POSITION_UNIT = 0.1
-"""In body lengths."""
+"""Unit of observed positions, in body lengths."""
 UPRIGHT = 4.0
 """w, in body lengths per episode."""
 CROUCHED = 0.8
-"""Mean height, relative to that at rest, below which crouching costs."""
+"""Mean height, relative to that at rest, below which crouching is penalised."""
 FALLEN = 1.0
-"""Tilt in rad."""
+"""Tilt of a fall, in rad."""
 
 Act = Callable[[Float[Array, " o"]], Float[Array, " k"]]
 """Observation -> actuation."""
 
 
 class Task(NamedTuple):
-    """A creature and how it is stepped."""
+    """A creature with its scene and time step."""
 
     creature: Creature
     scene: SoftScene
@@ -63,28 +63,28 @@ class Task(NamedTuple):
 
     @property
     def observation_size(self) -> int:
-        """Numbers in an observation."""
+        """Length of an observation."""
         return 2 * self.creature.mesh.vertices.size + 2
 
     @property
     def muscle_count(self) -> int:
-        """Numbers in an actuation."""
+        """Length of an actuation."""
         return len(self.creature.muscles)
 
 
 class Place(NamedTuple):
-    """Where an episode is."""
+    """State of an episode."""
 
     state: State
     steps: Int[Array, ""]
-    """Since its beginning."""
+    """Steps since its beginning."""
 
 
 class Walk(NamedTuple):
-    """What is seen of each of T steps."""
+    """Records of T steps."""
 
     x: Float[Array, "T n 2"]
-    """Positions after it, in m."""
+    """Positions after the steps, in m."""
     actuation: Float[Array, "T k"]
     converged: Bool[Array, " T"]
     reward: Float[Array, " T"]
@@ -96,26 +96,26 @@ class Walk(NamedTuple):
 def make_task(
     creature: Creature, *, episode: int = EPISODE, clock_period: float = CLOCK_PERIOD, upright: float = UPRIGHT
 ) -> Task:
-    """The task of a creature of the "creature" preset, stepped at its published time step."""
+    """Returns the task of a creature of the "creature" preset, with its published time step."""
     require_positive(episode=episode, clock_period=clock_period)
     scene = creature_scene(creature)
     return Task(creature, scene, make_step(scene, TIME_STEP), body_length(creature), episode, clock_period, upright)
 
 
 def creature_named(name: str) -> Creature:
-    """The creature of a name; `InputError` lists the names."""
+    """Returns the creature of this name; `InputError` lists the names."""
     if name not in CREATURES:
         raise InputError(f"creature '{name}' is unknown; choose from {', '.join(CREATURES)}")
     return CREATURES[name]()
 
 
 def beginning(task: Task) -> Place:
-    """The creature's rest shape at rest."""
+    """Returns the creature's rest shape at rest."""
     return Place(task.stepper.init(), jnp.asarray(0))
 
 
 def observe(task: Task, place: Place) -> Float[Array, " o"]:
-    """The observation of the module's heading."""
+    """Returns the observation defined at the top of the module."""
     rest = jnp.asarray(task.creature.mesh.vertices, place.state.x.dtype)
     moved = place.state.x - rest
     moved = moved.at[:, 0].add(-moved[:, 0].mean()) / (POSITION_UNIT * task.length)
@@ -125,7 +125,7 @@ def observe(task: Task, place: Place) -> Float[Array, " o"]:
 
 
 def advance(task: Task, place: Place, actuation: Float[Array, " k"]) -> tuple[Place, Walk]:
-    """The place after one step, and what is seen of the step."""
+    """Returns the place after one step, and the record of the step."""
     state, info = task.stepper.step(task.scene.params, place.state, actuation)
     after = Place(state, place.steps + 1)
     cost, angle = _posture(task, state.x)
@@ -134,7 +134,7 @@ def advance(task: Task, place: Place, actuation: Float[Array, " k"]) -> tuple[Pl
 
 
 def walk(task: Task, act: Act, start: Place, steps: int) -> tuple[Place, Walk]:
-    """Steps of a policy from a place."""
+    """Runs a policy for a number of steps from a place."""
 
     def one(place: Place, _: None) -> tuple[Place, Walk]:
         return advance(task, place, act(observe(task, place)))
@@ -148,23 +148,23 @@ def travelled(task: Task, start: Place, end: Place) -> Float[Array, ""]:
 
 
 class Episode(NamedTuple):
-    """What an episode from rest comes to; NaN where a step did not converge."""
+    """Results of an episode from rest; NaN if a step did not converge."""
 
     distance: Float[Array, ""]
-    """Body lengths before the fall, if there is one: what policies are judged by."""
+    """Body lengths before a fall, if any; the criterion for policies."""
     total_reward: Float[Array, ""]
-    """Before the fall."""
+    """Reward before a fall."""
 
 
 def run_episode(task: Task, act: Act) -> Episode:
-    """One episode from rest."""
+    """Runs one episode from rest."""
     start = beginning(task)
     _, seen = walk(task, act, start, task.episode)
     return judged(task, start, seen)
 
 
 def judged(task: Task, start: Place, seen: Walk) -> Episode:
-    """What the steps of an episode come to."""
+    """Evaluates the steps of an episode."""
     before_fall = jnp.cumsum(jnp.abs(seen.tilt) > FALLEN) == 0
     means = jnp.concatenate([start.state.x[None, :, 0], seen.x[:, :, 0]]).mean(axis=1)
     distance = (before_fall * jnp.diff(means)).sum() / task.length
@@ -173,7 +173,7 @@ def judged(task: Task, start: Place, seen: Walk) -> Episode:
 
 
 def actuation_of(command: Float[Array, "*k"] | Float[np.ndarray, "*k"]) -> Float[Array, "*k"]:
-    """Actuation in [0.25, 1] of commands in [-1, 1]; what lies outside counts as the nearest."""
+    """Actuation in [0.25, 1] of commands, which are clipped to [-1, 1]."""
     return SHORTEST + (1.0 - SHORTEST) * 0.5 * (1.0 + jnp.clip(command, -1.0, 1.0))
 
 

@@ -1,4 +1,4 @@
-"""Many creatures at once for stable-baselines3: one compiled, vmapped step for all lanes, which restarts them too."""
+"""Many creatures at once for stable-baselines3: one compiled, vmapped step that also restarts lanes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,9 +16,9 @@ from dln_jax.scale.mesh import program, shares, spread
 
 
 class VectorEnvironment(VecEnv):
-    """Lanes of `CreatureEnvironment`, with rewards times a constant; devices share them if a mesh divides them.
+    """Lanes of `CreatureEnvironment`, with rewards times a constant; devices of a mesh share them.
 
-    Raises `InputError` for a mesh that does not.
+    Raises `InputError` for a mesh that does not divide the lanes.
     """
 
     def __init__(self, task: Task, lanes: int, *, reward_scale: float = 1.0, mesh: Mesh | None = None):
@@ -44,16 +44,16 @@ class VectorEnvironment(VecEnv):
         self._first = np.asarray(jax.jit(jax.vmap(lambda place: observe(task, place)))(self._start), np.float32)
 
     def reset(self) -> np.ndarray:
-        """All lanes at the beginning of an episode."""
+        """Starts an episode in all lanes and returns their observations."""
         self._places = self._start
         return self._first.copy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions for `step_wait`."""
+        """Stores the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """One step of all lanes; those that ended are restarted, their last observation is in their info."""
+        """Steps all lanes and restarts those that ended, with their last observation in their info."""
         actions = np.asarray(self._actions, self._places.state.x.dtype)
         self._places, seen = self._advance(self._places, actions)
         observed, rewards, terminated, truncated, last = (np.asarray(values) for values in seen)
@@ -63,24 +63,24 @@ class VectorEnvironment(VecEnv):
         return observed.copy(), self._scale * rewards, terminated | truncated, infos
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Does nothing, because nothing is open."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute, for each lane."""
+        """Returns the attribute once per lane."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets it for all lanes."""
+        """Sets the attribute for all lanes."""
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **keywords: Any) -> list[Any]:
-        """There is one method for all lanes."""
+        """Calls the method, which all lanes share, once per lane."""
         return [getattr(self, method_name)(*arguments, **keywords) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No lane is."""
+        """Returns False for every lane."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """None are drawn."""
+        """Returns None for every lane, because images are not drawn."""
         return [None] * self.num_envs

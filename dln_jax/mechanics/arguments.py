@@ -1,7 +1,7 @@
-"""What a caller gives as one state: converted to vectors of one floating type, or refused in one line.
+"""Arguments of one state: converts them to vectors of one floating type, or refuses them in one line.
 
-This is for the edge, where functions are handed out; the mechanics behind it checks nothing. Shapes are static, so that
-a compiled function pays nothing for it.
+These checks belong to the boundary where functions are handed out; the mechanics behind it checks nothing. Shapes are
+static, so that they cost a compiled function nothing.
 """
 
 from collections.abc import Callable
@@ -20,16 +20,16 @@ Answer = TypeVar("Answer")
 
 
 def vectors(size: int | None = None, /, **given: Any) -> tuple[Array, ...]:
-    """The arguments as vectors [size] of one floating type, in the order given.
+    """Converts the arguments to vectors [size] of one floating type, in order.
 
-    The type is the widest floating one among them, and JAX's own for whole numbers.
+    The type is the widest floating one among them, and JAX's default for whole numbers.
 
     Args:
-        size: of each; without it, whatever the first one has.
-        given: by their names, anything; `types.VectorLike` is what passes.
+        size: of all vectors; by default that of the first.
+        given: the arguments by name; `types.VectorLike` is accepted.
 
     Raises:
-        InputError: names the argument that holds no real numbers, or has another shape; a batch is for `jax.vmap`.
+        InputError: names the argument that holds no real numbers, or has another shape; use `jax.vmap` for a batch.
     """
     arrays = {name: _real_array(name, value) for name, value in given.items()}
     expected = None if size is None else (size,)
@@ -42,13 +42,13 @@ def vectors(size: int | None = None, /, **given: Any) -> tuple[Array, ...]:
 
 @dataclass(frozen=True, eq=False)
 class OfSize:
-    """A function of vectors [size], which refuses others."""
+    """A function of vectors [size], which refuses other sizes."""
 
     function: Callable[..., Any]
     size: int
 
     def __call__(self, *state: Array) -> Any:
-        """The function's value; `InputError` for vectors of another size."""
+        """Returns the function's value; raises `InputError` for vectors of another size."""
         for each in state:
             require_shape("a state of this model", each.shape, (self.size,))
         return self.function(*state)
@@ -57,14 +57,14 @@ class OfSize:
 def require_size_of(energy: Callable[..., Any], size: int) -> None:
     """Raises `InputError` unless an energy (q, x) takes vectors [size].
 
-    It does not if it reads entries beyond them, or if it depends on neither q nor x of some coordinate. The first is
-    found where the energy takes NumPy's arrays, the second where it depends on nothing that is traced.
+    It raises if the energy reads entries beyond them, or depends on neither q nor x of some coordinate. The first test
+    requires an energy that takes NumPy arrays, the second one that depends on no traced values.
     """
     q, x = 0.3 + 0.1 * np.arange(size), 0.7 + 0.2 * np.arange(size)
     wrong = f"the system takes no states of size {size}"
     try:
         jax.eval_shape(lambda: energy(q, x))
-    except IndexError as error:  # of NumPy's arrays, where JAX takes the last element
+    except IndexError as error:  # NumPy arrays raise it; JAX would take the last element
         raise InputError(f"{wrong} ({error}); give vectors [d] of its own size") from error
     except Exception:  # an energy need not take NumPy's arrays
         pass
@@ -72,17 +72,17 @@ def require_size_of(energy: Callable[..., Any], size: int) -> None:
         slopes = jax.jit(jax.grad(energy, argnums=(0, 1)))(jnp.asarray(q), jnp.asarray(x))
     if any(isinstance(slope, Tracer) for slope in slopes):
         return
-    # A coordinate may be without a potential or, where the mass matrix is singular, without inertia, but not both.
+    # A coordinate may have no potential or, if the mass matrix is singular, no inertia, but one of them.
     if not (read := np.any(slopes, axis=0)).all():
         unused = ", ".join(str(k) for k in np.flatnonzero(~read))
         raise InputError(f"{wrong}: its energy does not depend on coordinate {unused} (counted from 0) or its rate")
 
 
 def answer(function: Callable[..., Answer], *state: Array) -> Answer:
-    """What a system's function answers to vectors of one size.
+    """Calls a system's function with vectors of one size.
 
     Raises:
-        InputError: the system is of another size, as its own operations on arrays then say.
+        InputError: the system has another size; the message quotes the error of its own array operations.
     """
     try:
         return function(*state)
@@ -98,7 +98,7 @@ def answer(function: Callable[..., Answer], *state: Array) -> Answer:
 
 
 def require_shape(name: str, shape: tuple[int, ...], expected: tuple[int, ...] | None) -> None:
-    """Raises `InputError` unless an argument has this shape, or, for `None`, is a vector of some length."""
+    """Raises `InputError` unless an argument has this shape or, for `None`, is a vector of any length."""
     if len(shape) == 1 and shape[0] > 0 if expected is None else shape == expected:
         return
     wanted = "[d]" if expected is None else str(expected)

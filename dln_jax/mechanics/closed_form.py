@@ -1,8 +1,8 @@
-"""Equations of motion of natural systems whose mass matrix and forces are written out, for one state.
+"""Equations of motion of natural systems with explicit mass matrix and forces, for one state.
 
     tau = M(q) qdd + c(q, qd) + g(q) [+ dD/dqd]
 
-Where closed forms are at hand they take less time than derivatives of the energy, in which M is a second one.
+Closed forms take less time than derivatives of the energy, in which M is a second derivative.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from dln_jax.types import Dissipation, Lagrangian, Potential, Scalar, Vector
 
 
 class ClosedForm(NamedTuple):
-    """The energies of a natural system and the forces that follow from them, as functions of one state."""
+    """Energies of a natural system and the resulting forces, as functions of one state."""
 
     mass_matrix: Callable[[Array], Array]
     """q -> M [d, d]."""
@@ -39,7 +39,7 @@ def lagrangian(system: ClosedForm) -> Lagrangian:
 
 
 def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial, Coriolis and gravity force, each [d]."""
+    """Inertial, Coriolis and gravity force, all [d]."""
     return Decomposition(
         inertial=system.mass_matrix(q) @ qdd,
         coriolis=system.coriolis(q, qd),
@@ -48,7 +48,7 @@ def decompose(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Decompo
 
 
 def inverse_dynamics(system: ClosedForm, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] that a motion takes, friction included."""
+    """Generalised force tau [d] of a motion, friction included."""
     tau = system.mass_matrix(q) @ qdd + system.coriolis(q, qd)
     if system.gravity is not None:
         tau += system.gravity(q)
@@ -67,7 +67,7 @@ def energy(system: ClosedForm, q: Vector, qd: Vector) -> Scalar:
 
 
 def dynamics(system: ClosedForm, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
+    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size."""
     return make_dynamics(
         inverse_dynamics=lambda q, qd, qdd: inverse_dynamics(system, q, qd, qdd),
         forward_dynamics=lambda q, qd, tau: forward_dynamics(system, q, qd, tau),

@@ -1,11 +1,11 @@
-"""Dynamics in discrete time, x_next = F(x, u, dt), with A = dF/dx and B = dF/du: what a controller calls.
+"""Dynamics in discrete time for controllers: x_next = F(x, u, dt), with A = dF/dx and B = dF/du.
 
     x = (q, qd) [2 d],   qdd = forward_dynamics(q, qd, tau),   tau = actuation u, held over the step
     x = (q, p) [2 d] in a phase space, without u
 
-A step takes a number of operations that is known beforehand: the implicit midpoint rule takes a fixed number of Newton
-steps, where that of `mechanics.integrators` iterates until it has converged. Derivatives are exact, of the implicit
-step by the implicit function theorem at the last iterate, and share the Jacobians of `mechanics.jacobians`.
+A step takes a fixed number of operations: its implicit midpoint rule takes a fixed number of Newton steps, while that
+of `mechanics.integrators` iterates until it has converged. Derivatives are exact (for the implicit step by the implicit
+function theorem at the last iterate) and share the Jacobians of `mechanics.jacobians`.
 """
 
 import functools
@@ -28,13 +28,13 @@ ITERATIONS = 3
 Step = Callable[[Any, Any, Any], Any]
 """(x, u, dt) -> x_next."""
 PhaseStep = Callable[[Any, Any, Any], Any]
-"""(q, p, dt) -> (q, p) after it."""
+"""(q, p, dt) -> (q, p) after the step."""
 Actuation = Sequence[Sequence[float]] | Float[np.ndarray, "d u"] | None
-"""Of `types.Needs`; by `None` u is tau."""
+"""Actuation matrix of `types.Needs`; with `None`, u is tau."""
 
 
 def rk4(forward_dynamics: Callable[..., Array], *, actuation: Actuation = None) -> Step:
-    """Runge-Kutta's classical step, of order 4, of (q, qd, tau) -> qdd."""
+    """Returns the classical Runge-Kutta step of order 4 for (q, qd, tau) -> qdd."""
 
     def step(x: Array, u: Array, dt: Array) -> Array:
         tau = _force(actuation, u)
@@ -47,15 +47,15 @@ def rk4(forward_dynamics: Callable[..., Array], *, actuation: Actuation = None) 
 def implicit_midpoint(
     forward_dynamics: Callable[..., Array], *, actuation: Actuation = None, iterations: int = ITERATIONS
 ) -> Step:
-    """The implicit midpoint rule, of order 2, by Newton's method for qdd at the midpoint.
+    """Returns a step of the implicit midpoint rule, of order 2, with Newton's method for qdd at the midpoint.
 
         qdd = forward_dynamics(q + dt/2 v, v, tau),   v = qd + dt/2 qdd;   (q, qd) <- (q + dt v, qd + dt qdd)
 
     Args:
         forward_dynamics: (q, qd, tau) -> qdd; for derivatives of the step, `jacobians.differentiable_forward_dynamics`.
         actuation: u -> tau.
-        iterations: Newton steps, from the acceleration at x. Where the last one still moves the state by more than
-            sqrt(eps) (1 + |x|), after which the error is that squared, the step is NaN: take a smaller dt.
+        iterations: Newton steps, from the acceleration at x. If the last one still moves the state by more than
+            sqrt(eps) (1 + |x|), the step is NaN: take a smaller dt. The error is about the square of the last move.
 
     Raises:
         InputError: iterations that are not positive.
@@ -77,12 +77,12 @@ def implicit_midpoint(
 
 
 def phase_rk4(rates: Rates) -> PhaseStep:
-    """As `rk4`, of (q, p) -> (qd, pd)."""
+    """Returns the step of `rk4` for (q, p) -> (qd, pd)."""
     return lambda q, p, dt: integrators.rk4(lambda t, state: rates(*state))(0.0, (q, p), dt)
 
 
 def phase_implicit_midpoint(rates: Rates, *, iterations: int = ITERATIONS) -> PhaseStep:
-    """As `implicit_midpoint`, of (q, p) -> (qd, pd); symplectic where they are those of a Hamiltonian."""
+    """Returns the step of `implicit_midpoint` for (q, p) -> (qd, pd); symplectic for the rates of a Hamiltonian."""
     require_positive(iterations=iterations)
 
     def field(x: Array) -> Array:
@@ -98,7 +98,7 @@ def phase_implicit_midpoint(rates: Rates, *, iterations: int = ITERATIONS) -> Ph
 
 
 def linearised(step: Callable[[Any, Any, Any], Any]) -> Callable[[Array, Array, Array], tuple[Any, Any]]:
-    """(x, u, dt) -> x_next and (A, B) of a step, in one pass; (q, p, dt) likewise of a `PhaseStep`."""
+    """(x, u, dt) -> x_next and (A, B) of a step, in one pass; of (q, p, dt) for a `PhaseStep`."""
 
     @functools.wraps(step)
     def function(x: Array, u: Array, dt: Array) -> tuple[Any, Any]:
@@ -117,11 +117,11 @@ def _force(actuation: Actuation, u: Array) -> Array:
 
 
 def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array, iterations: int) -> Array:
-    """The rate of a state x that solves the equations after so many Newton steps, or NaN."""
+    """Returns the rate of a state x that solves the equations after a number of Newton steps, or NaN."""
     identity = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def solve_linear(product: Callable[[Array], Array], right: Array) -> Array:
-        # The inverse, since derivatives of a step bring many right-hand sides, each of which would be eliminated anew.
+        # The inverse serves the many right-hand sides of a step's derivatives; elimination would be repeated for each.
         return solve(jax.vmap(product, out_axes=1)(identity), identity) @ right
 
     def search(equations: Callable[[Array], Array], start: Array) -> tuple[Array, Array]:
@@ -134,5 +134,5 @@ def _root(equations: Callable[[Array], Array], start: Array, x: Array, dt: Array
 
     rate, change = jax.lax.custom_root(equations, start, search, solve_linear, has_aux=True)
     settled = jnp.abs(dt) * change <= jnp.sqrt(jnp.finfo(x.dtype).eps) * (1 + jnp.max(jnp.abs(x)))
-    # A factor, and not a choice: derivatives become NaN as well.
+    # A factor rather than a selection, so that derivatives also become NaN.
     return rate * jnp.where(settled, jnp.ones_like(dt), jnp.nan)

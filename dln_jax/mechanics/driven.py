@@ -1,4 +1,4 @@
-"""Motions under torques that were recorded: samples of a function of time, held or interpolated between them."""
+"""Motions under recorded torques: samples of a function of time, held or interpolated."""
 
 from collections.abc import Callable
 from typing import Any, Literal
@@ -15,7 +15,7 @@ Torque = Literal["held", "interpolated"]
 
 
 def torque_slopes(tau: Float[Array, "T d"], t: Float[Array, " T"], torque: Torque) -> Float[Array, "T-1 d"]:
-    """Rates of the torque inside each interval; zero where it is held, and where time stands still.
+    """Rates of the torque within the intervals; zero if it is held, and for intervals of length zero.
 
     Raises:
         InputError: a `torque` of another name.
@@ -39,16 +39,16 @@ def driven(
     substeps: int,
     method: Callable[[Field], Step] = rk4,
 ) -> State:
-    """States of y' = rate(y, tau(t)) at the samples, by steps of RK4; each leaf gets a leading axis T.
+    """Integrates y' = rate(y, tau(t)) by RK4 and returns the states at the samples; leaves get a leading axis T.
 
     Args:
         rate: (state, tau) -> rate of the state.
         start: state at the first sample.
-        tau: [T - 1, d], at the start of each interval, within which the torque is tau + slopes s.
+        tau: [T - 1, d], torque at the start of every interval; within it the torque is tau + slopes s.
         slopes: [T - 1, d], from `torque_slopes`.
-        durations: [T - 1] in s; the state rests where one is zero.
-        substeps: in each interval.
-        method: field -> step; `looped_rk4` where compiling counts.
+        durations: [T - 1] in s; over a duration of zero the state stays.
+        substeps: per interval.
+        method: field -> step; `looped_rk4` compiles faster.
     """
 
     def interval(state: State, drive: tuple[Array, Array, Array]) -> tuple[State, None]:
@@ -61,9 +61,9 @@ def driven(
 
 
 def looped_rk4(field: Field) -> Step:
-    """`rk4` whose stages are a loop: the field is in the program once and not four times.
+    """`rk4` with its stages in a loop: the field is in the program once instead of four times.
 
-    For fits through an integrator and motions that run once, whose compilation takes longer than they do.
+    For fits through an integrator and motions that run once, where compilation takes longer than execution.
     """
     nodes, weights = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
 

@@ -1,4 +1,4 @@
-"""What every mechanical system answers, whatever energy it comes from: under forces, and in a phase space."""
+"""Functions of any mechanical system, whatever its energy: dynamics under forces, and flow in a phase space."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,7 +13,7 @@ from dln_jax.types import Dissipation, Potential, Scalar, Vector, VectorLike
 
 
 class Decomposition(NamedTuple):
-    """Parts of the generalised force, `tau = inertial + coriolis + gravity` for a natural system, each [d]."""
+    """Parts of the generalised force, `tau = inertial + coriolis + gravity` for a natural system, all [d]."""
 
     inertial: Array
     """tau(q, 0, qdd) - tau(q, 0, 0)."""
@@ -24,11 +24,11 @@ class Decomposition(NamedTuple):
 
 
 class Dynamics(NamedTuple):
-    """What an energy answers in coordinates and velocities; functions of one state, which `vmap` takes over samples.
+    """Functions of an energy in coordinates and velocities, for one state; use `vmap` for samples.
 
-    Symbols and units as in `dln_jax.types`. Analytic systems and learned ones are the same type, so whatever consumes
-    dynamics (losses, metrics, rollouts, controllers) cannot tell them apart. The functions take arrays, or lists of
-    numbers, and refuse in one line (InputError) what is no state of one system.
+    Symbols and units are those of `dln_jax.types`. Analytic and learned systems are the same type, so losses, metrics,
+    rollouts and controllers do not distinguish them. The functions take arrays, or lists of numbers, and raise a
+    one-line InputError for arguments that are not one state of the system.
     """
 
     inverse_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
@@ -38,16 +38,16 @@ class Dynamics(NamedTuple):
     energy: Callable[[VectorLike, VectorLike], Array]
     """(q, qd) -> T + V, scalar."""
     mass_matrix: Callable[..., Array]
-    """(q, qd=None) -> M [d, d], by default at rest, qd = 0: of a natural system M depends on q alone, of any other
-    energy on qd too."""
+    """(q, qd=None) -> M [d, d], by default at rest, qd = 0: M of a natural system depends on q alone, that of any other
+    energy also on qd."""
     decompose: Callable[[VectorLike, VectorLike, VectorLike], Decomposition]
     """(q, qd, qdd) -> inertial, Coriolis and gravity force, without friction."""
     friction: Callable[[VectorLike, VectorLike], Array]
-    """(q, qd) -> the force dD/dqd [d] that friction takes; zero without friction."""
+    """(q, qd) -> the friction force dD/dqd [d]; zero without friction."""
 
 
 class PlainDynamics(NamedTuple):
-    """What answers without an energy, and has no mass matrix either; otherwise as `Dynamics`."""
+    """Functions of a system without energy and mass matrix; otherwise as `Dynamics`."""
 
     inverse_dynamics: Callable[[VectorLike, VectorLike, VectorLike], Array]
     """(q, qd, qdd) -> tau [d]."""
@@ -58,11 +58,11 @@ class PlainDynamics(NamedTuple):
 
 
 Rates = Callable[[VectorLike, VectorLike], tuple[Array, Array]]
-"""(q, p) -> (qd, pd), each [d]."""
+"""(q, p) -> (qd, pd), both [d]."""
 
 
 class Flow(NamedTuple):
-    """What an energy answers in coordinates and momenta, without applied forces; otherwise as `Dynamics`."""
+    """Functions of an energy in coordinates and momenta, without applied forces; otherwise as `Dynamics`."""
 
     rates: Rates
     energy: Callable[[VectorLike, VectorLike], Array]
@@ -70,7 +70,7 @@ class Flow(NamedTuple):
 
 
 class PlainFlow(NamedTuple):
-    """What moves without an energy."""
+    """Flow of a system without energy."""
 
     rates: Rates
 
@@ -85,9 +85,9 @@ def make_dynamics(
     dissipation: Dissipation | None = None,
     degrees_of_freedom: int | None = None,
 ) -> Dynamics:
-    """`Dynamics` whose functions convert their arguments or refuse them, from functions of vectors [d] of one type.
+    """Builds `Dynamics` from functions of vectors [d] of one type; its functions convert or refuse their arguments.
 
-    Without `degrees_of_freedom` the arguments of a call need to agree with one another only; `mass_matrix` is called
+    Without `degrees_of_freedom` the arguments of a call only need to agree with one another; `mass_matrix` is called
     with both q and qd.
     """
     d = degrees_of_freedom
@@ -117,7 +117,7 @@ def make_plain_dynamics(
     *,
     degrees_of_freedom: int | None = None,
 ) -> PlainDynamics:
-    """Dynamics without an energy; arguments as those of `make_dynamics`."""
+    """Builds dynamics without an energy; arguments as those of `make_dynamics`."""
     d = degrees_of_freedom
     return PlainDynamics(
         lambda q, qd, qdd: answer(inverse_dynamics, *vectors(d, q=q, qd=qd, qdd=qdd)),
@@ -127,12 +127,12 @@ def make_plain_dynamics(
 
 
 def plus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
-    """T + V(q), of an energy."""
+    """Returns T + V(q), an energy."""
     return kinetic if V is None else kinetic + V(q)
 
 
 def minus_potential(kinetic: Scalar, V: Potential | None, q: Vector) -> Scalar:
-    """T - V(q), of a Lagrangian."""
+    """Returns T - V(q), a Lagrangian."""
     return kinetic if V is None else kinetic - V(q)
 
 
@@ -144,9 +144,9 @@ def friction_force(D: Dissipation, q: Vector, qd: Vector) -> Vector:
 def decompose_by_differences(
     inverse_dynamics: Callable[[Array, Array, Array], Array], q: Vector, qd: Vector, qdd: Vector
 ) -> Decomposition:
-    """Inertial, Coriolis and gravity force, each [d], as differences of (q, qd, qdd) -> tau between moving and resting.
+    """Inertial, Coriolis and gravity force, all [d], as differences of (q, qd, qdd) -> tau between motion and rest.
 
-    Their sum is tau(q, qd, qdd) when M depends on q alone.
+    Their sum is tau(q, qd, qdd) if M depends on q alone.
     """
     rest = jnp.zeros_like(qd)
     gravity = inverse_dynamics(q, rest, rest)

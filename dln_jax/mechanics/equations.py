@@ -1,6 +1,6 @@
 """Equations of motion of any record of energies: `dynamics` in coordinates and velocities, `flow` in a phase space.
 
-| record | energies | found in |
+| record | energies | module |
 |---|---|---|
 | `NaturalSystem` | factor of M, V, D | `mechanics.natural` |
 | `ClosedForm` | M, V, D, and the forces that follow | `mechanics.closed_form` |
@@ -12,7 +12,7 @@
 | `InverseForward` | none: tau and qdd | `mechanics.plain` |
 | `PhaseRates` | none: (qd, pd) | `mechanics.plain` |
 
-Each energy gives both; `InverseForward` has dynamics only, and `PhaseRates` a flow only.
+All energies have both; `InverseForward` has dynamics only, and `PhaseRates` a flow only.
 """
 
 from typing import Any, overload
@@ -42,10 +42,10 @@ from dln_jax.mechanics.recursive import RecursiveSystem
 from dln_jax.types import Hamiltonian, InputError, Vector
 
 Canonical = NaturalHamiltonian | HamiltonianSystem
-"""Energies that are given in momenta."""
+"""Energies in terms of momenta."""
 Energies = NaturalSystem | ClosedForm | RecursiveSystem | LagrangianSystem | Canonical | LoadedSystem
 Driven = Energies | InverseForward
-"""Systems on which forces act."""
+"""Systems with applied forces."""
 System = Driven | PhaseRates
 
 
@@ -71,15 +71,15 @@ def dynamics(system: Energies, *, degrees_of_freedom: int | None = None) -> Dyna
 @overload
 def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics: ...
 def dynamics(system: System, *, degrees_of_freedom: int | None = None) -> Dynamics | PlainDynamics:
-    """The functions of a system in coordinates and velocities.
+    """Returns the functions of a system in coordinates and velocities.
 
     Args:
-        system: a record of energies, or of what is known in their place.
-        degrees_of_freedom: d, by which states of another size are refused; without it the arguments of a call need to
-            agree with one another only.
+        system: a record of energies, or `InverseForward`.
+        degrees_of_freedom: d; states of another size are refused. Without it the arguments of a call only need to agree
+            with one another.
 
     Raises:
-        InputError: the rates of a phase space, which say nothing of forces, or no record.
+        InputError: the rates of a phase space, which do not define forces, or no record.
     """
     make = _DYNAMICS.get(type(system))
     if make is None:
@@ -93,10 +93,10 @@ def flow(system: Energies, *, degrees_of_freedom: int | None = None) -> Flow: ..
 @overload
 def flow(system: PhaseRates, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow: ...
 def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | PlainFlow:
-    """The functions of a system in coordinates and momenta, without applied forces; arguments as for `dynamics`.
+    """Returns the functions of a system in coordinates and momenta, without applied forces; arguments as in `dynamics`.
 
     Raises:
-        InputError: two functions that are no flow, or no record.
+        InputError: an `InverseForward`, which has no flow, or no record.
     """
     d = degrees_of_freedom
     if isinstance(system, PhaseRates):
@@ -121,14 +121,14 @@ def flow(system: System, *, degrees_of_freedom: int | None = None) -> Flow | Pla
 
 
 def driving_force(system: Energies, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """What of a generalised force is left to move the system [d], friction overcome."""
+    """Generalised force [d] that remains to move the system after friction."""
     if isinstance(system, LoadedSystem):
         return loaded.link_force(system, q, qd, tau)
     return tau if system.dissipation is None else tau - friction_force(system.dissipation, q, qd)
 
 
 def hamiltonian_of(system: Energies) -> Hamiltonian:
-    """H(q, p) of any energies; of a Lagrangian by the Legendre transform, which takes a Newton iteration in general."""
+    """H(q, p) of any energies; for a Lagrangian by the Legendre transform, in general with a Newton iteration."""
     match system:
         case HamiltonianSystem():
             return system.hamiltonian

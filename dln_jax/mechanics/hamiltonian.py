@@ -7,9 +7,9 @@ In coordinates and velocities, with qdd = H_pq qd + H_pp dp/dt along the motion,
     inverse:  H_pp dp/dt = qdd - H_pq qd,   tau = dp/dt + dH/dq + dD/dqd
     forward:  dp/dt from Hamilton,          qdd = d/dt dH/dp
 
-The momentum p(q, qd) comes from the Legendre transform (`legendre`), which takes a Newton iteration in general; a
-natural system, whose inverse mass matrix is given by its factor, needs two triangular solves instead
-(`mechanics.natural_hamiltonian`). Nothing is regularised: a singular H_pp gives non-finite values.
+The momentum p(q, qd) comes from the Legendre transform (`legendre`), in general with a Newton iteration. A natural
+system with a factor of the inverse mass matrix needs two triangular solves instead (`mechanics.natural_hamiltonian`).
+Nothing is regularised: a singular H_pp gives non-finite values.
 """
 
 import functools
@@ -27,13 +27,13 @@ from dln_jax.types import Dissipation, Hamiltonian, Scalar, Vector, require_posi
 Energy = Callable[[Array, Array], Array]
 """Lagrangian or Hamiltonian."""
 Guess = Callable[[Array, Array], Array]
-"""(q, slope [d]) -> where a Newton iteration starts [d]."""
+"""(q, slope [d]) -> initial value of a Newton iteration [d]."""
 MOST_STEPS = 30
-"""Newton steps after which the Legendre transform is given up, and NaN."""
+"""Newton steps after which the Legendre transform is NaN."""
 
 
 class HamiltonianSystem(NamedTuple):
-    """The energies of any Hamiltonian system, as functions of one state, and how its momenta are found."""
+    """Energies of any Hamiltonian system, as functions of one state, and settings of the momentum solve."""
 
     hamiltonian: Hamiltonian
     """(q, p) -> H, scalar."""
@@ -42,7 +42,7 @@ class HamiltonianSystem(NamedTuple):
     iterations: int | None = None
     """Newton steps to p(q, qd), as for `conjugate`; Hamilton's equations need none."""
     initial_guess: Guess | None = None
-    """(q, qd) -> p [d] where they start; zero by default."""
+    """(q, qd) -> initial p [d] of these steps; zero by default."""
 
 
 def velocity(H: Hamiltonian, q: Vector, p: Vector) -> Vector:
@@ -53,14 +53,14 @@ def velocity(H: Hamiltonian, q: Vector, p: Vector) -> Vector:
 def time_derivative(
     H: Hamiltonian, q: Vector, p: Vector, tau: Vector, *, dissipation: Dissipation | None = None
 ) -> tuple[Vector, Vector]:
-    """(qd, pd), each [d], under a generalised force: Hamilton's equations."""
+    """(qd, pd), both [d], under a generalised force: Hamilton's equations."""
     force, qd = jax.grad(H, argnums=(0, 1))(q, p)
     pd = tau - force
     return qd, pd if dissipation is None else pd - friction_force(dissipation, q, qd)
 
 
 def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector, *, dissipation: Dissipation | None = None) -> Vector:
-    """Generalised force tau = pd + dH/dq + dD/dqd [d] that a motion takes."""
+    """Generalised force tau = pd + dH/dq + dD/dqd [d] of a motion."""
     force, qd = jax.grad(H, argnums=(0, 1))(q, p)
     tau = pd + force
     return tau if dissipation is None else tau + friction_force(dissipation, q, qd)
@@ -69,14 +69,15 @@ def inverse(H: Hamiltonian, q: Vector, p: Vector, pd: Vector, *, dissipation: Di
 def conjugate(
     energy: Energy, q: Vector, slope: Vector, *, iterations: int | None = None, initial_guess: Guess | None = None
 ) -> Vector:
-    """x [d] where d(energy)/dx (q, x) = slope: the momentum of a velocity (of H), or the reverse (of L).
+    """Solves d(energy)/dx (q, x) = slope for x [d]: the momentum of a velocity (for H), or the reverse (for L).
 
-    Full Newton steps from `initial_guess(q, slope)`, by default from zero, until they have converged; NaN, derivatives
-    included, where they have not after `MOST_STEPS`. No step is damped: an energy that is not convex in x may have no
-    solution. With `iterations` they are so many and unchecked: one is exact for an energy that is quadratic in x, as
-    every natural system's is; otherwise see what `velocity(H, q, x) - slope` leaves.
-    Derivatives are those of the implicit function, of every order; what `energy` closes over is differentiated too.
+    It takes full Newton steps from `initial_guess(q, slope)`, by default from zero, until they have converged. After
+    `MOST_STEPS` without convergence the result and its derivatives are NaN. Steps are not damped: an energy that is not
+    convex in x may have no solution. With `iterations` their number is fixed and convergence is not checked: one is
+    exact for an energy that is quadratic in x, as for every natural system; otherwise check `velocity(H, q, x) -
+    slope`.
 
+    Derivatives of all orders are those of the implicit function, also by values that `energy` closes over.
     Raises InputError if `iterations` is not positive.
     """
     _require_iterations(iterations)
@@ -99,7 +100,8 @@ def conjugate(
         def turn(state):
             count, x, _ = state
             better, left = step(residual, x)
-            # After a step this small the error is of the order of its square. A root at zero shrinks with its steps.
+            # After a step this small the error is of the order of its square. Near a root at zero this relative test
+            # fails, and that of the residual decides.
             settled = jnp.max(jnp.abs(better - x)) < jnp.sqrt(eps) * jnp.max(jnp.abs(better))
             return count + 1, better, settled | (jnp.max(jnp.abs(left)) <= 16 * eps * jnp.max(jnp.abs(slope)))
 
@@ -116,7 +118,7 @@ def conjugate(
     if iterations is not None:
         return jax.lax.custom_root(residual, start, so_many, solve_hessian)
     x, converged = jax.lax.custom_root(residual, start, until_converged, solve_hessian, has_aux=True)
-    # A factor, and not a choice: derivatives become NaN as well.
+    # A factor rather than a selection, so that derivatives also become NaN.
     return x * jnp.where(converged > 0, 1, jnp.nan).astype(x.dtype)
 
 
@@ -128,7 +130,7 @@ def legendre(energy: Energy, *, iterations: int | None = None) -> Energy:
     _require_iterations(iterations)
 
     def transform(q: Vector, slope: Vector) -> Scalar:
-        # What the energy closes over becomes arguments, which a function with its own derivative rule needs.
+        # A function with its own derivative rule needs the energy's closed-over values as arguments.
         function, closed_over = jax.closure_convert(energy, q, slope)
         return _legendre(function, iterations, q, slope, *closed_over)
 
@@ -143,7 +145,7 @@ def _legendre(function, iterations, q, slope, *closed_over):
 
 @_legendre.defjvp
 def _legendre_jvp(function, iterations, primals, tangents):
-    """The envelope theorem: dx drops out of the first derivative, which leaves no solve to differentiate."""
+    """The envelope theorem: dx drops out of the first derivative, so that no solve has to be differentiated."""
     q, slope, *closed_over = primals
     q_dot, slope_dot, *closed_over_dot = tangents
     x = _conjugate(function, iterations, *primals)
@@ -161,7 +163,7 @@ def _require_iterations(iterations: int | None) -> None:
 
 
 def dynamics(system: HamiltonianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once, of (q, qd); with `degrees_of_freedom` they refuse states of another size."""
+    """Returns all functions of the system in (q, qd); with `degrees_of_freedom` they refuse states of another size."""
     H, dissipation, iterations, initial_guess = system
     _require_iterations(iterations)
 

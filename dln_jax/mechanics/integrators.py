@@ -1,12 +1,12 @@
-"""Time stepping: `step(t, state, dt) -> state` for a state that is any pytree, and rollouts of it.
+"""Time stepping: `step(t, state, dt) -> state` for any pytree as state, and rollouts.
 
-| step | order | takes | keeps |
+| step | order | fields | properties |
 |---|---|---|---|
 | `explicit_euler` | 1 | any field | |
 | `rk4` | 4 | any field | |
 | `implicit_midpoint` | 2 | any field | symplectic, reversible, quadratic invariants |
 | `gauss_legendre4` | 4 | any field | symplectic, reversible, quadratic invariants |
-| `radau3` | 3 | any field | stiff ones at any dt: what decays fast is damped (L-stable) |
+| `radau3` | 3 | any field | for stiff fields at any dt: fast decay stays damped (L-stable) |
 | `symplectic_euler` | 1 | partitioned fields | symplectic if separable |
 | `stormer_verlet` | 2 | separable fields | symplectic, reversible |
 
@@ -14,7 +14,6 @@ A field is `(t, state) -> rate` of a first-order system y' = f(t, y). A partitio
 q' = velocity, p' = force; it is separable when the velocity reads p alone and the force q alone, as for
 H = T(p) + V(q). The partitioned steps are explicit. For a Hamiltonian that is not separable they would be implicit,
 or not symplectic: take `implicit_midpoint` or `gauss_legendre4`.
-
 Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration" (2006), chapters I, II and VI.
 """
 
@@ -45,9 +44,9 @@ class Tableau(NamedTuple):
     """Coefficients of a Runge-Kutta method; it is explicit when `stages` is strictly lower triangular."""
 
     stages: tuple[tuple[float, ...], ...]
-    """a [s, s]: what each stage takes of the rates at the others."""
+    """a [s, s]: weights of the stages' rates in the stages."""
     weights: tuple[float, ...]
-    """b [s]: what the step takes of the rates."""
+    """b [s]: weights of the stages' rates in the step."""
 
     @property
     def nodes(self) -> tuple[float, ...]:
@@ -67,19 +66,19 @@ RADAU_3 = Tableau(stages=((5 / 12, -1 / 12), (0.75, 0.25)), weights=(0.75, 0.25)
 
 
 def runge_kutta(tableau: Tableau, field: Field, *, tolerance: float = 1e-9, iterations: int = 20) -> Step:
-    """One step of y' = f(t, y) by the method of a tableau.
+    """Returns a step of y' = f(t, y) by the method of a tableau.
 
         Y_i = y + dt sum_j a_ij f(t + c_j dt, Y_j),    y <- y + dt sum_i b_i f(t + c_i dt, Y_i)
 
-    The stages of an implicit method are found by Newton's method, with derivatives by the implicit function theorem.
-    A step whose stages are not found gives NaN: take a smaller dt.
+    Newton's method solves for the stages of an implicit method; derivatives use the implicit function theorem. A step
+    whose stages do not converge gives NaN: take a smaller dt.
 
     Args:
         tableau: the method.
         field: (t, state) -> rate.
         tolerance: largest error of the equations for Y before the last Newton step, which about squares it, in the
             state's units; implicit methods only.
-        iterations: Newton steps after which a step is given up; implicit methods only.
+        iterations: largest number of Newton steps; implicit methods only.
     """
     field = jax.jit(field)  # traced once for all stages
     if any(entry for i, row in enumerate(tableau.stages) for entry in row[i:]):
@@ -95,11 +94,11 @@ radau3 = functools.partial(runge_kutta, RADAU_3)
 
 
 def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) -> Step:
-    """Euler's method with the new momentum in the second half; state (q, p).
+    """Returns Euler's method with the new momentum in the second half; state (q, p).
 
         p <- p + dt force(t, q, p),    q <- q + dt velocity(t, q, p)
 
-    Order 1. Symplectic when the force does not read p; (q, qd) with force = qdd(t, q, qd) is the usual
+    Order 1. Symplectic if the force does not read p; (q, qd) with force = qdd(t, q, qd) is the usual
     "semi-implicit Euler" of game engines.
     """
 
@@ -112,11 +111,11 @@ def symplectic_euler(velocity: Callable[..., Any], force: Callable[..., Any]) ->
 
 
 def stormer_verlet(velocity: Callable[[Any, Any], Any], force: Callable[[Any, Any], Any]) -> Step:
-    """Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); state (q, p).
+    """Returns Störmer-Verlet (leapfrog) for separable systems q' = velocity(t, p), p' = force(t, q); state (q, p).
 
         p_half = p + dt/2 force(t, q),    q <- q + dt velocity(t + dt/2, p_half),    p <- p_half + dt/2 force(t + dt, q)
 
-    Order 2, symplectic and reversible. The halves cannot be given a field that is not separable.
+    Order 2, symplectic and reversible. The signatures of the halves exclude fields that are not separable.
     """
 
     def step(t, state, dt):
@@ -139,7 +138,7 @@ def second_order(acceleration: Callable[[Any, Array, Array], Array]) -> Field:
 
 
 def advance(step: Step, t, state: State, duration, *, substeps: int = 1) -> State:
-    """The state after `duration`, by as many equal steps as asked for."""
+    """Returns the state after `duration`, in `substeps` equal steps."""
     dt = duration / substeps
     if substeps == 1:
         return step(t, state, dt)
@@ -147,12 +146,12 @@ def advance(step: Step, t, state: State, duration, *, substeps: int = 1) -> Stat
     def body(state, index):
         return step(t + index * dt, state, dt), None
 
-    # A scan and not a counted loop, which has no derivative in reverse mode when the count is traced.
+    # A scan, because a loop with a traced count has no reverse-mode derivative.
     return jax.lax.scan(body, state, jnp.arange(substeps))[0]
 
 
 def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, substeps: int = 1) -> State:
-    """States at the times t [T], the first of which is the given one; each leaf gets a leading axis T.
+    """Returns the states at the times t [T], including the initial one; leaves get a leading axis T.
 
     Args:
         step: (t, state, dt) -> state.
@@ -161,7 +160,7 @@ def rollout(step: Step, state: State, t: Float[Array | np.ndarray, " T"], *, sub
         substeps: steps per interval; only the states at t are kept.
     """
     require_positive(substeps=substeps)
-    # A step must not change the type of the state that it is given.
+    # A step must not change the type of its state.
     times = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(state)))
 
     def interval(state, start_and_duration):
@@ -181,10 +180,10 @@ def adaptive_rollout(
         field: (t, state) -> rate.
         state: at t[0].
         t: increasing times in s.
-        tolerance: on the error of each step, relative and absolute.
-        max_steps: after which the integration is given up; states not reached are infinite.
+        tolerance: on the error per step, relative and absolute.
+        max_steps: largest number of steps; states not reached are infinite.
     """
-    import diffrax  # here, since it takes longer to import than the rest of this package
+    import diffrax  # here, because it takes longer to import than the rest of this package
 
     require_positive(tolerance=tolerance)
     solution = diffrax.diffeqsolve(
@@ -228,7 +227,7 @@ def _implicit_step(tableau: Tableau, field: Field, tolerance: float, iterations:
     def rates(values, t, dt):
         return jax.vmap(lambda t, value: ravel_pytree(field(t, unravel(value)))[0])(t + nodes * dt, values)
 
-    # The unknowns are the states of the stages, whose size says what rounding is even where all rates vanish.
+    # The unknowns are the states of the stages, whose size sets the scale of rounding even where all rates vanish.
     def equations(values, start, t, dt):
         values = values.reshape(len(weights), -1)
         return (values - start - dt * stages @ rates(values, t, dt)).ravel()

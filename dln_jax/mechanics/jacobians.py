@@ -1,17 +1,17 @@
-"""Jacobians of the equations of motion, by the way that costs least, for one state.
+"""Jacobians of the equations of motion, in the cheapest way for the kind of system, for one state.
 
-Of a natural system, tau = M qdd + c + g + dD/dqd with p = M(q) qd and A = dp/dq,
+For a natural system, tau = M qdd + c + g + dD/dqd with p = M(q) qd and A = dp/dq,
 
     dtau/dqdd = M,   dtau/dqd = dM/dt + A - Aᵀ + d²D/dqd²,   dtau/dq by d tangents of tau and p together
 
-(the second from dL/dq = ½ d(qdᵀ M qd)/dq, whose slope in qd is Aᵀ), so that no velocity and no acceleration is pushed
-through a network. Of another system all come from one reverse sweep of d rows. The forward model is the inverse one's
-implicit function:
+The second follows from dL/dq = ½ d(qdᵀ M qd)/dq, whose derivative in qd is Aᵀ. No tangent of a velocity or an
+acceleration is pushed through a network. For other systems all Jacobians come from one reverse sweep of d rows. The
+forward model is the inverse one's implicit function:
 
     dqdd/dq = -M⁻¹ dtau/dq,   dqdd/dqd = -M⁻¹ dtau/dqd,   dqdd/dtau = M⁻¹        at qdd
 
-M⁻¹ is formed: it is a result, and one factorisation serves the acceleration and all columns. Where the forward model is
-given, by a Hamiltonian or a network of its own, a reverse sweep of that takes the place.
+M⁻¹ is formed, because it is a result, and one factorisation serves the acceleration and all columns. Forward models of
+a Hamiltonian or a network of their own are differentiated by a reverse sweep instead.
 """
 
 import functools
@@ -34,9 +34,9 @@ from dln_jax.solvers.elimination import solve, solve_lower
 from dln_jax.types import Matrix, Vector
 
 Natural = NaturalSystem | ClosedForm | RecursiveSystem | NaturalHamiltonian
-"""Energies whose mass matrix depends on q alone."""
+"""Energies with a mass matrix that depends on q alone."""
 Jacobians = tuple[Array, Array, Array]
-"""By each of three arguments [d, d]; row i is of the i-th result."""
+"""Derivatives [d, d] by three arguments; row i belongs to the i-th result."""
 
 
 def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vector) -> Jacobians:
@@ -52,7 +52,7 @@ def inverse_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, qdd: Vecto
 
 
 def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Array]:
-    """dc/dq and dc/dqd, each [d, d], of the Coriolis force of `decompose`."""
+    """dc/dq and dc/dqd, both [d, d], of the Coriolis force of `decompose`."""
     decompose = dynamics(system).decompose
 
     def coriolis(q: Vector, qd: Vector) -> Vector:
@@ -64,7 +64,7 @@ def coriolis_jacobians(system: Driven, q: Vector, qd: Vector) -> tuple[Array, Ar
 
 
 def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vector) -> tuple[Vector, Jacobians]:
-    """qdd [d] under a generalised force; and dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
+    """qdd [d] under a generalised force, with dqdd/dq, dqdd/dqd and dqdd/dtau = M⁻¹ there."""
     motion = dynamics(system)
     if isinstance(system, HamiltonianSystem | LoadedSystem | InverseForward):
 
@@ -83,9 +83,10 @@ def forward_dynamics_jacobians(system: Driven, q: Vector, qd: Vector, tau: Vecto
 def differentiable_forward_dynamics(
     system: Driven, *, degrees_of_freedom: int
 ) -> tuple[Callable[..., Array], Callable[..., tuple[Vector, Jacobians]]]:
-    """(q, qd, tau) -> qdd [d], whose derivatives are products with its Jacobians; and `forward_dynamics_jacobians`.
+    """(q, qd, tau) -> qdd [d], with derivatives that are products with its Jacobians; and `forward_dynamics_jacobians`.
 
-    For derivatives in many directions, as those of a step by all of its state, which then share one Jacobian. Both are
+    For derivatives in many directions, such as those of a step by its whole state, which then share one Jacobian. Both
+    are
     jitted: a step that calls them several times traces, compiles and exports them once.
     """
     forward_dynamics = jax.custom_jvp(jax.jit(dynamics(system, degrees_of_freedom=degrees_of_freedom).forward_dynamics))
@@ -101,13 +102,13 @@ def differentiable_forward_dynamics(
 
 
 def _natural_jacobians(system: Natural, force: Callable[[Vector], Vector], q: Vector, qd: Vector) -> Jacobians:
-    """Of a force by q, of the Coriolis force by qd, and M."""
+    """Derivatives of a force by q and of the Coriolis force by qd, and M."""
     mass_matrix = dynamics(system).mass_matrix
 
     def force_and_momentum(q: Vector) -> tuple[Vector, Vector]:
         return force(q), _momentum(system, q, qd)
 
-    # Together, since both push the same tangents through the mass matrix.
+    # Together, because both push the same tangents through the mass matrix.
     force_q, momentum_q = jax.jacfwd(force_and_momentum)(q)
     mass, mass_rate = jax.jvp(mass_matrix, (q,), (qd,))
     return force_q, mass_rate + momentum_q - momentum_q.T, mass
@@ -116,9 +117,9 @@ def _natural_jacobians(system: Natural, force: Callable[[Vector], Vector], q: Ve
 def _momentum(system: Natural, q: Vector, qd: Vector) -> Vector:
     if isinstance(system, NaturalSystem):
         factor = system.cholesky(q)
-        return factor @ (factor.T @ qd)  # two small products, where M takes a large one
+        return factor @ (factor.T @ qd)  # two small products; M would take a large one
     if isinstance(system, RecursiveSystem):
-        return system.mass_matrix(q) @ qd  # whose parts would be differences of recursions
+        return system.mass_matrix(q) @ qd  # decompose would take differences of recursions
     return dynamics(system).decompose(q, jnp.zeros_like(qd), qd).inertial
 
 

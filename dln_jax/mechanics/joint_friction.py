@@ -1,4 +1,4 @@
-"""Friction of joints beside any record of energies, or of what is known in their place."""
+"""Adds friction of joints to any record of energies, or to a system without energy."""
 
 from typing import Any
 
@@ -15,14 +15,15 @@ from dln_jax.types import Dissipation, Scalar, Vector
 
 
 def with_friction(system: Any, dissipation: Dissipation | None, load: Load | None = None) -> Any:
-    """The same system with the friction of its joints, added to any that it has.
+    """Returns the same system with friction in its joints, added to the friction that it has.
 
-    A system without an energy keeps its kind: its inverse side gains the force, its forward side and its rates lose it.
+    A system without an energy keeps its kind: the force is added on its inverse side, and subtracted on its forward
+    side and in its rates.
 
     Args:
         system: one of `mechanics.equations.System`.
-        dissipation: (q, qd) -> Rayleigh function, as `joint_dissipation` gives it.
-        load: what the transmissions take; all other friction, the system's own too, is then before them.
+        dissipation: (q, qd) -> Rayleigh function, as from `joint_dissipation`.
+        load: friction of the transmissions by load; all other friction, the system's own too, is then before them.
 
     Returns:
         The record, or with a load a `LoadedSystem`.

@@ -2,9 +2,10 @@
 
     d/dt dL/dqd - dL/dq = tau        (Euler-Lagrange)
 
-Only the derivatives that a quantity needs are taken: the inverse model is one `jvp` of the gradient; the forward model
-adds the Hessian in qd alone, which is solved and never inverted.
-A mass matrix that is singular gives non-finite accelerations rather than a regularised answer.
+Only the necessary derivatives are taken: the inverse model is one `jvp` of the gradient; the forward model adds the
+Hessian in qd, which is solved and never inverted.
+
+A singular mass matrix gives non-finite accelerations rather than a regularised answer.
 """
 
 from functools import partial
@@ -20,12 +21,12 @@ from dln_jax.types import Dissipation, Lagrangian, Matrix, Scalar, Vector
 
 
 class LagrangianSystem(NamedTuple):
-    """The energies of any Lagrangian system, as functions of one state."""
+    """Energies of any Lagrangian system, as functions of one state."""
 
     lagrangian: Lagrangian
     """(q, qd) -> L, scalar."""
     dissipation: Dissipation | None = None
-    """(q, qd) -> Rayleigh function D, scalar; friction enters only where there is one."""
+    """(q, qd) -> Rayleigh function D, scalar; `None` for no friction."""
 
 
 def momentum(L: Lagrangian, q: Vector, qd: Vector) -> Vector:
@@ -45,9 +46,9 @@ def mass_matrix(L: Lagrangian, q: Vector, qd: Vector) -> Matrix:
 
 
 def inverse_dynamics(L: Lagrangian, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau = d/dt dL/dqd - dL/dq [d] that a motion takes."""
-    # One gradient for force and momentum, and not one each: a reverse sweep then passes it once, at two thirds of the
-    # work of a Jacobian.
+    """Generalised force tau = d/dt dL/dqd - dL/dq [d] of a motion."""
+    # One gradient for force and momentum together: a reverse sweep then passes it once, at two thirds of the work of a
+    # Jacobian.
     (force, _), (_, momentum_rate) = jax.jvp(jax.grad(L, argnums=(0, 1)), (q, qd), (qd, qdd))
     return momentum_rate - force
 
@@ -59,9 +60,9 @@ def forward_dynamics(L: Lagrangian, q: Vector, qd: Vector, tau: Vector) -> Vecto
 
 
 def dynamics(system: LagrangianSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size.
+    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size.
 
-    Without it, states are refused for which L reads entries that they lack, or ignores rates that they have.
+    Without it, they refuse states that lack entries that L reads, or have rates that L ignores.
     """
     given, dissipation = system
     right = set() if degrees_of_freedom is None else {degrees_of_freedom}

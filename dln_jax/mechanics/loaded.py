@@ -1,14 +1,14 @@
-"""Systems whose transmissions take a share of the force that they carry, for one state.
+"""Systems whose transmissions have friction proportional to the force that they carry, for one state.
 
     tau = tau_link + μ |tau_link| tanh(u / v) + dD/dqd,   tau_link = M qdd + c + g
 
-joint by joint, u the joint's rate. What is carried is not known before the motion is, so that this is no Rayleigh
-function of qd; but for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes 1 ± μ tanh, and its
+joint by joint, u the joint's rate. This is no Rayleigh function of qd, because the carried force depends on the
+acceleration. But for μ < 1 the map from tau_link to tau is piecewise linear with positive slopes 1 ± μ tanh, and its
 inverse keeps the sign:
 
     tau_link = y / (1 + sign(y) μ tanh(u / v)),   y = tau - dD/dqd
 
-The corner at tau_link = 0 stays: derivatives there are those of μ = 0, the mean of both sides. Free motion (tau = 0)
+The corner at tau_link = 0 remains: derivatives there are those of μ = 0, the mean of both sides. Free motion (tau = 0)
 loses nothing by load unless other friction loads the transmission.
 """
 
@@ -24,46 +24,46 @@ from dln_jax.types import Dissipation, Potential, Vector
 
 
 class Load(NamedTuple):
-    """Friction in proportion to what a transmission carries."""
+    """Friction proportional to the force that a transmission carries."""
 
     share: Any
-    """μ, for each joint [d] or one for all, 0 <= μ < 1."""
+    """μ, one per joint [d] or one for all, 0 <= μ < 1."""
     velocity_scale: Any = 0.01
     """v, 1/s or m/s."""
     joint_map: Any = None
-    """Matrix J [d, d], known, of joint rates J qd; `None` where coordinates are those of the joints."""
+    """Known matrix J [d, d] of joint rates J qd; `None` if the coordinates are those of the joints."""
 
 
 class LoadedSystem(NamedTuple):
-    """Any system on which forces act, behind transmissions with friction that depends on load."""
+    """Any system with applied forces, behind transmissions with friction that depends on load."""
 
     link: Any
     """The record without dissipation."""
     load: Load
     dissipation: Dissipation | None = None
-    """(q, qd) -> Rayleigh function D, scalar, of what the motors overcome besides."""
+    """(q, qd) -> Rayleigh function D, scalar, of the other friction that the motors overcome."""
 
     @property
     def potential(self) -> Potential | None:
-        """That of the links."""
+        """Potential of the links."""
         return getattr(self.link, "potential", None)
 
 
 def carrying(load: Load, qd: Vector, tau_link: Vector) -> Vector:
-    """Generalised force tau [d] before the transmissions, of tau_link behind them."""
+    """Generalised force tau [d] before the transmissions, from tau_link behind them."""
     at_joints = _to_joints(load, tau_link)
-    # By the sign, whose derivative is 0, where that of the absolute value is one-sided.
+    # By the sign, whose derivative is 0; that of the absolute value is one-sided.
     return _from_joints(load, at_joints * (1 + jnp.sign(at_joints) * _slope(load, qd)))
 
 
 def carried(load: Load, qd: Vector, tau: Vector) -> Vector:
-    """Generalised force tau_link [d] behind the transmissions, of tau before them: the inverse of `carrying`."""
+    """Generalised force tau_link [d] behind the transmissions, from tau before them: the inverse of `carrying`."""
     at_joints = _to_joints(load, tau)
     return _from_joints(load, at_joints / (1 + jnp.sign(at_joints) * _slope(load, qd)))
 
 
 def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """What of a generalised force moves the links [d]."""
+    """Part of a generalised force that moves the links [d]."""
     if system.dissipation is not None:
         tau = tau - friction_force(system.dissipation, q, qd)
     return carried(system.load, qd, tau)
@@ -72,7 +72,7 @@ def link_force(system: LoadedSystem, q: Vector, qd: Vector, tau: Vector) -> Vect
 def dynamics(
     system: LoadedSystem, link: Dynamics | PlainDynamics, *, degrees_of_freedom: int | None = None
 ) -> Dynamics | PlainDynamics:
-    """All functions of the system, from those of its links.
+    """Returns all functions of the system, from those of its links.
 
     `friction(q, qd)` is that of the dissipation alone, and `decompose` is of the links.
     """
@@ -97,7 +97,7 @@ def _slope(load: Load, qd: Vector) -> Vector:
 
 
 def _to_joints(load: Load, tau: Vector) -> Vector:
-    """The forces at the joints, of which Jᵀ makes generalised ones."""
+    """Forces at the joints; Jᵀ maps them to generalised forces."""
     if load.joint_map is None:
         return tau
     return jnp.asarray(np.linalg.inv(np.asarray(load.joint_map, float)).T, tau.dtype) @ tau

@@ -1,9 +1,9 @@
-"""Equations of motion of natural systems, T = ½ qdᵀ M(q) qd with M = L Lᵀ given as a Cholesky factor.
+"""Equations of motion of natural systems, T = ½ qdᵀ M(q) qd with M = L Lᵀ and a Cholesky factor L.
 
     tau = M qdd + dM/dt qd - dT/dq + dV/dq
 
 The factor makes M definite by construction, gives the momentum without a derivative, and turns the forward model
-into two triangular solves. The potential is `None` where a scene has none, and is then never traced.
+into two triangular solves. An absent potential is `None` and is never traced.
 """
 
 from functools import partial
@@ -25,7 +25,7 @@ from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Lagrangian, 
 
 
 class NaturalSystem(NamedTuple):
-    """The energies of a natural system, as functions of one state."""
+    """Energies of a natural system, as functions of one state."""
 
     cholesky: CholeskyFactor
     """q -> lower triangular L [d, d], M = L Lᵀ."""
@@ -51,18 +51,18 @@ def energy(system: NaturalSystem, q: Vector, qd: Vector) -> Scalar:
 
 
 def mass_matrix(system: NaturalSystem, q: Vector, qd: Vector | None = None) -> Matrix:
-    """Mass matrix M = L Lᵀ [d, d]; the velocity is accepted, and not needed."""
+    """Mass matrix M = L Lᵀ [d, d]; the velocity is accepted but not used."""
     factor = system.cholesky(q)
     return factor @ factor.T
 
 
 def inverse_dynamics(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] that a motion takes, friction included.
+    """Generalised force tau [d] of a motion, friction included.
 
     With y = Lᵀ qd: dp/dt = L (Lᵀ qdd + dL/dtᵀ qd) + dL/dt y, and dT/dq_k = qdᵀ dL/dq_k y.
     """
     # One derivative of the factor along the motion and one pull-back, instead of all of its d partial derivatives:
-    # faster to train through from d = 2 on. With one coordinate a single derivative gives both.
+    # faster to train through for d >= 2. With one coordinate a single derivative gives both.
     if q.shape[0] == 1:
         factor, slope = jax.jvp(system.cholesky, (q,), (jnp.ones_like(q),))
         factor_rate = slope * qd
@@ -79,14 +79,14 @@ def inverse_dynamics(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) 
 
 
 def forward_dynamics(system: NaturalSystem, q: Vector, qd: Vector, tau: Vector) -> Vector:
-    """Acceleration qdd [d] under a generalised force, by two triangular solves with the factor at hand."""
+    """Acceleration qdd [d] under a generalised force, by two triangular solves with the factor."""
     bias = inverse_dynamics(system, q, qd, jnp.zeros_like(qd))
     factor = system.cholesky(q)
     return solve_lower_transposed(factor, solve_lower(factor, tau - bias))
 
 
 def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial M qdd, Coriolis dM/dt qd - dT/dq and gravity dV/dq, each [d]."""
+    """Inertial M qdd, Coriolis dM/dt qd - dT/dq and gravity dV/dq, all [d]."""
     inertial_only = NaturalSystem(system.cholesky)
     return Decomposition(
         inertial=mass_matrix(system, q) @ qdd,
@@ -96,7 +96,7 @@ def decompose(system: NaturalSystem, q: Vector, qd: Vector, qdd: Vector) -> Deco
 
 
 def dynamics(system: NaturalSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
+    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size."""
     return make_dynamics(
         partial(inverse_dynamics, system),
         partial(forward_dynamics, system),

@@ -1,9 +1,9 @@
-"""Hamilton's equations of natural systems whose inverse mass matrix is given by its factor, for one state.
+"""Hamilton's equations of natural systems with a factor of the inverse mass matrix, for one state.
 
     H = ½ |Lᵀ p|² + V(q),   M⁻¹ = L Lᵀ
 
 In coordinates and velocities they take triangular solves with the factor, where a general Hamiltonian
-(`mechanics.hamiltonian`) takes a Newton iteration for the momentum. The potential is `None` where a scene has none.
+(`mechanics.hamiltonian`) takes a Newton iteration for the momentum. An absent potential is `None`.
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ from dln_jax.types import CholeskyFactor, Dissipation, Hamiltonian, Potential, S
 
 
 class NaturalHamiltonian(NamedTuple):
-    """The energies of a natural system whose inverse mass matrix is given, T = ½ |Lᵀ p|² with M⁻¹ = L Lᵀ."""
+    """Energies of a natural system with a factor of the inverse mass matrix, T = ½ |Lᵀ p|² with M⁻¹ = L Lᵀ."""
 
     inverse_factor: CholeskyFactor
     """q -> lower triangular L [d, d] with M⁻¹ = L Lᵀ."""
@@ -34,7 +34,7 @@ def hamiltonian(system: NaturalHamiltonian) -> Hamiltonian:
 
 
 def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once, by triangular solves with the factor.
+    """Returns all functions of the system, by triangular solves with the factor.
 
     With `degrees_of_freedom` they refuse states of another size.
 
@@ -54,7 +54,7 @@ def dynamics(system: NaturalHamiltonian, *, degrees_of_freedom: int | None = Non
         return solve_lower_transposed(factor, solve_lower(factor, qdd - drift) - momentum_drift) + slope
 
     def load(q: Vector, qd: Vector) -> Vector:
-        """What potential and friction add to tau."""
+        """Contribution of potential and friction to tau."""
         force = jnp.zeros_like(q) if system.potential is None else jax.grad(system.potential)(q)
         return force if system.dissipation is None else force + friction_force(system.dissipation, q, qd)
 

@@ -1,4 +1,4 @@
-"""Systems that come from no energy: networks for what a motion takes, for how it goes on, or for rates of a state."""
+"""Systems without energy: networks for inverse dynamics, forward dynamics, or rates of a phase space."""
 
 import functools
 from collections.abc import Callable
@@ -23,15 +23,15 @@ class PhaseRates(NamedTuple):
     """Rates of a state of a phase space."""
 
     rates: Callable[[Array, Array], tuple[Array, Array]]
-    """(q, p) -> (qd, pd), each [d]."""
+    """(q, p) -> (qd, pd), both [d]."""
     hamiltonian: Hamiltonian | None = None
-    """(q, p) -> the energy of a part of the field; `None` for a field without one."""
+    """(q, p) -> energy of a part of the field; `None` for a field without one."""
 
 
 def dynamics(system: InverseForward, *, degrees_of_freedom: int | None = None) -> PlainDynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size.
+    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size.
 
-    The force decomposition is that of differences of the inverse function, so friction counts as Coriolis force.
+    The force decomposition takes differences of the inverse function, so friction counts as Coriolis force.
     """
     decompose = functools.partial(decompose_by_differences, system.inverse_dynamics)
     return make_plain_dynamics(*system, decompose, degrees_of_freedom=degrees_of_freedom)

@@ -1,4 +1,4 @@
-"""Equations of motion of natural systems whose forces come all at once, by a recursion over bodies, for one state.
+"""Equations of motion of natural systems whose forces come from one recursion over bodies, for one state.
 
 tau = forces(q, qd, qdd) [+ dD/dqd],   forces = M(q) qdd + c(q, qd) + g(q)
 """
@@ -23,7 +23,7 @@ from dln_jax.types import Dissipation, Lagrangian, Potential, Scalar, Vector
 
 
 class RecursiveSystem(NamedTuple):
-    """The energies of a natural system and the forces that follow from them, as functions of one state."""
+    """Energies of a natural system and the resulting forces, as functions of one state."""
 
     mass_matrix: Callable[[Array], Array]
     """q -> M [d, d]."""
@@ -43,7 +43,7 @@ def lagrangian(system: RecursiveSystem) -> Lagrangian:
 
 
 def inverse_dynamics(system: RecursiveSystem, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] that a motion takes, friction included."""
+    """Generalised force tau [d] of a motion, friction included."""
     tau = system.forces(q, qd, qdd)
     return tau if system.friction is None else tau + system.friction(q, qd)
 
@@ -55,7 +55,7 @@ def forward_dynamics(system: RecursiveSystem, q: Vector, qd: Vector, tau: Vector
 
 
 def decompose(system: RecursiveSystem, q: Vector, qd: Vector, qdd: Vector) -> Decomposition:
-    """Inertial, Coriolis and gravity force, each [d]."""
+    """Inertial, Coriolis and gravity force, all [d]."""
     return decompose_by_differences(system.forces, q, qd, qdd)
 
 
@@ -65,7 +65,7 @@ def energy(system: RecursiveSystem, q: Vector, qd: Vector) -> Scalar:
 
 
 def dynamics(system: RecursiveSystem, *, degrees_of_freedom: int | None = None) -> Dynamics:
-    """All functions of the system at once; with `degrees_of_freedom` they refuse states of another size."""
+    """Returns all functions of the system; with `degrees_of_freedom` they refuse states of another size."""
     return make_dynamics(
         partial(inverse_dynamics, system),
         partial(forward_dynamics, system),

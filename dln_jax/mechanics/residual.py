@@ -1,9 +1,9 @@
-"""What a known system leaves unexplained, as energies beside its own, for one state.
+"""Residual of a known system as additional energies, for one state.
 
     tau = tau_known + d/dt dT/dqd - dT/dq + dV/dq + dD/dqd,   T = ½ |Lᵀ qd|²
 
-A potential explains what repeats with the position (springs, cables, the teeth of gears), a Rayleigh function what
-depends on the velocity too, and a kinetic energy, which only adds inertia, what is not rigid.
+A potential explains forces that repeat with the position (springs, cables, gear teeth), a Rayleigh function forces that
+also depend on the velocity, and a kinetic energy, which only adds inertia, flexible parts.
 """
 
 from collections.abc import Callable
@@ -26,22 +26,24 @@ from dln_jax.types import CholeskyFactor, Dissipation, Lagrangian, Potential, Sc
 
 
 class Residual(NamedTuple):
-    """Energies beside those of a system; `None` for what is not there."""
+    """Energies added to those of a system; `None` for absent ones."""
 
     potential: Potential | None = None
     """q -> V, scalar."""
     dissipation: Dissipation | None = None
-    """(q, qd) -> D, scalar; where it corrects friction that is there, it may be negative."""
+    """(q, qd) -> D, scalar; it may be negative if it corrects existing friction."""
     cholesky: CholeskyFactor | None = None
     """q -> lower triangular L [d, d]."""
 
 
 def with_residual(system: Any, residual: Residual) -> RecursiveSystem | LagrangianSystem | LoadedSystem:
-    """The system with these energies added to its own; behind the transmission, where load counts.
+    """Adds energies to those of a system.
+
+    In a `LoadedSystem`, potential and inertia are added behind the transmission, and dissipation before it.
 
     Args:
-        system: a natural system as any of its records, a Lagrangian, or one of them behind transmissions.
-        residual: what is added.
+        system: any record of a natural system, a Lagrangian, or one of them behind transmissions.
+        residual: the added energies.
     """
     if isinstance(system, LoadedSystem):
         behind = with_residual(system.link, residual._replace(dissipation=None))
@@ -66,7 +68,7 @@ def _sum(L: Lagrangian, residual: Residual) -> Lagrangian:
 
 
 def _recursive(system: RecursiveSystem | ClosedForm | NaturalSystem) -> RecursiveSystem:
-    """The same system by its forces."""
+    """Returns the same system as a recursive one."""
     if isinstance(system, RecursiveSystem):
         return system
     D = system.dissipation

@@ -1,4 +1,4 @@
-"""Numbers about a model: errors, rollouts, definiteness, misfit, latency, coverage."""
+"""Metrics of a model: errors, rollouts, definiteness, misfit, latency, coverage."""
 
 from dln_jax.metrics.coverage import Coverage, coverage
 from dln_jax.metrics.definiteness import Definiteness, definiteness

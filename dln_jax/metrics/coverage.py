@@ -1,7 +1,7 @@
-"""Whether predicted standard deviations are right: how often errors stay within the bands that they promise.
+"""Coverage of predicted standard deviations: how often errors lie within the bands that they predict.
 
-The band of level p about a prediction has half the width z_p sd, with z_p the quantile of a standard normal variable
-between whose negative and itself there is the probability p: 1.96 sd for 95 %.
+The band of level p about a prediction has the half width z_p sd. A standard normal variable lies between -z_p and z_p
+with probability p: 1.96 sd for 95 %.
 """
 
 from statistics import NormalDist
@@ -13,30 +13,30 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 LEVELS = tuple(np.round([*np.arange(0.05, 0.95, 0.05), 0.95, 0.975, 0.99], 3).tolist())
-"""Of a curve."""
+"""Levels of a curve."""
 LEVEL = 0.95
-"""Of one number."""
+"""Level of a single number."""
 
 
 class Coverage(NamedTuple):
-    """Share of samples within the bands of each level and joint."""
+    """Shares of samples within the bands, by level and joint."""
 
     levels: Float[np.ndarray, " n"]
     shares: Float[np.ndarray, "n d"]
 
 
 def half_width(level: float) -> float:
-    """z_p, in standard deviations; `InputError` for a level outside (0, 1)."""
+    """z_p, in standard deviations; raises `InputError` for a level outside (0, 1)."""
     if not 0 < level < 1:
         raise InputError(f"the level of a band is {level}; expected a number between 0 and 1")
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 def coverage(error: Any, std: Any, levels: tuple[float, ...] = LEVELS) -> Coverage:
-    """Shares of errors within z_p standard deviations.
+    """Returns the shares of errors within z_p standard deviations.
 
     Args:
-        error: predicted less measured, [N, d].
+        error: predicted minus measured, [N, d].
         std: predicted standard deviations, [N, d].
         levels: p.
 

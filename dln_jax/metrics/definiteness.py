@@ -1,4 +1,4 @@
-"""Whether a model's mass matrix is one: a kinetic energy has a positive definite M, a black-box network need not."""
+"""Definiteness of mass matrices: a kinetic energy has a positive definite M, a black-box network need not."""
 
 from typing import NamedTuple
 
@@ -11,20 +11,20 @@ from dln_jax.types import InputError
 
 
 class Definiteness(NamedTuple):
-    """What the mass matrices of a set of states are like."""
+    """Eigenvalue statistics of the mass matrices of several states."""
 
     smallest_eigenvalue: float
     """Over all states, in the unit of M; NaN if a matrix is not finite."""
     share_not_definite: float
     """Share of states, 0 to 1, whose M is indefinite, singular to rounding, or not finite."""
     largest_condition_number: float
-    """Largest ratio of eigenvalues' magnitudes; infinite where M is singular or not finite."""
+    """Largest ratio of eigenvalues' magnitudes; infinite if M is singular or not finite."""
 
 
 def definiteness(
     dynamics: Dynamics | PlainDynamics, q: Float[Array | np.ndarray, "N d"], qd: Float[Array | np.ndarray, "N d"]
 ) -> Definiteness:
-    """Eigenvalues of the mass matrix at N states. Nothing is repaired: it reports, and the caller decides.
+    """Evaluates the eigenvalues of the mass matrix at N states. It only reports; nothing is repaired.
 
     An eigenvalue counts as positive above d times the rounding unit times the largest magnitude of its matrix.
     A Hamiltonian model gives M = H_pp⁻¹, which is not finite where H_pp is singular.

@@ -22,9 +22,9 @@ DECOMPOSITION = ("inertial", "coriolis", "gravity")
 def predictions(
     system: Driven, data: Trajectories, dtype, *, H: Hamiltonian | None = None, mesh: Mesh | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns what energies predict of every sample: `tau`, `qdd`, and the parts of the torque, [N, d] in float64.
+    """Returns predictions of a system for every sample: `tau`, `qdd`, and the parts of the torque, [N, d] in float64.
 
-    With a Hamiltonian, the given one or that of a system in momenta, and recorded momenta also `tau_from_momenta` =
+    With recorded momenta and a Hamiltonian (`H`, or that of a system in momenta) also `tau_from_momenta` =
     pd + dH/dq + friction: as published results of Hamiltonian models were computed.
 
     Devices of a mesh share the samples.
@@ -69,7 +69,7 @@ def prediction_program(
 
 
 def samples_of(data: Trajectories, dtype) -> tuple[Any, ...]:
-    """Returns the samples that a `prediction_program` takes: q, qd, qdd, tau, and the momenta if they were recorded."""
+    """Returns the samples for a `prediction_program`: q, qd, qdd, tau, and the momenta if they were recorded."""
     momenta = () if data.p is None or data.pd is None else (data.p, data.pd)
     states = (np.asarray(array, dtype) for array in (data.q, data.qd, data.qdd, data.tau))
     return *states, tuple(np.asarray(array, dtype) for array in momenta)
@@ -81,12 +81,12 @@ def as_arrays(answers: dict[str, Array]) -> dict[str, np.ndarray]:
 
 
 def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, float]:
-    """Mean squared errors over samples, each the sum over joints (the published metric; SI units squared).
+    """Mean squared errors over samples, as sums over joints (the published metric; SI units squared).
 
-    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction), and, where the data
-    have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`. `torque_from_momenta_mse`, of a Hamiltonian,
-    has in it what recorded pd are wrong by: the true plant's own is its floor (4.4e-6 on the published test letters,
-    whose pd are difference quotients).
+    `torque_mse`, `forward_mse` (of qdd), `power_mse` (of qdᵀ tau, which is dE/dt without friction), and, if the data
+    have the true parts, `inertial_mse`, `coriolis_mse`, `gravity_mse`. `torque_from_momenta_mse` of a Hamiltonian
+    includes the error of the recorded pd. Its lower bound is the value of the true plant (4.4e-6 on the published test
+    letters, whose pd are difference quotients).
     """
     torque_error = predicted["tau"] - data.tau
     result = {
@@ -106,7 +106,7 @@ def errors(predicted: dict[str, np.ndarray], data: Trajectories) -> dict[str, fl
 def normalised_error(
     predicted: Float[np.ndarray, "N d"], measured: Float[np.ndarray, "N d"]
 ) -> Float[np.ndarray, " d"]:
-    """nMSE of each joint: mean squared error over the variance of what was measured; NaN where that is zero."""
+    """nMSE of the joints: mean squared error over the variance of the measurements; NaN if that is zero."""
     variance = np.var(measured, axis=0)
     return np.mean((predicted - measured) ** 2, axis=0) / np.where(variance > 0, variance, np.nan)
 

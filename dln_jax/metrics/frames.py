@@ -1,11 +1,11 @@
-"""Errors of motions that are predicted as pictures: the physical state is read from the pictures, and its energy.
+"""Errors of motions that are predicted as images: estimates the physical state, and its energy, from the images.
 
     q       argmin |render(q) - frame|², on a grid and then by Gauss-Newton
     qd      such that the rod moves from the first frame's q to the second's in the time between them
     energy  mean over starts and times of (H(q, qd) - H(q_true, qd_true))², in J²
 
 The velocity comes from the rod's own motion, and not from a difference quotient, so that true frames have the true
-energy: what is left is the estimator's floor, which `energy_floor` measures.
+energy up to the estimator's error, which `energy_floor` measures.
 """
 
 import functools
@@ -28,10 +28,10 @@ from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
 GRID = 180
-"""Angles of the full circle at which the search starts; a step of Gauss-Newton is at most their distance."""
+"""Angles of the full circle at which the search starts; a Gauss-Newton step is at most their distance."""
 ITERATIONS = 20
 LATE = 1000 + np.arange(32.0)
-"""Numbers of frames."""
+"""Frame numbers of late predictions."""
 _BATCH, _CLIMB, _CORRECTIONS = 256, 20, 3
 
 
@@ -39,18 +39,18 @@ class FrameMotions(NamedTuple):
     """K predicted motions."""
 
     latent: Motions
-    """By frame number; z_q as q and z_p as p."""
+    """Latent motions by frame number; z_q as q and z_p as p."""
     pairs: Float[np.ndarray, "K T input"]
-    """Two decoded frames for each time."""
+    """Two decoded frames per time."""
 
     @property
     def frames(self) -> Float[np.ndarray, "K T pixels"]:
-        """The first frame of each pair."""
+        """The first frames of the pairs."""
         return self.pairs[..., : self.pairs.shape[-1] // 2]
 
 
 def fitted_angle(frame: Float[Array, " pixels"], grid: Float[Array, " G"], drawn: Float[Array, "G pixels"]) -> Scalar:
-    """q of a frame, in rad, from the best of a grid's angles and their frames."""
+    """q of a frame, in rad, starting from the best angle of a grid with known frames."""
     spacing = 2 * jnp.pi / GRID
 
     def iteration(_, q: Scalar) -> Scalar:
@@ -62,7 +62,7 @@ def fitted_angle(frame: Float[Array, " pixels"], grid: Float[Array, " G"], drawn
 
 
 def velocity_between(first: Scalar, second: Scalar) -> Scalar:
-    """qd at the first of two angles, in rad/s, with which the rod is at the second after the time of a frame."""
+    """qd at the first of two angles, in rad/s, with which the rod reaches the second within one frame."""
     scene = rod()
     step = rk4(second_order(lambda t, q, qd: closed_form_forward_dynamics(scene, q, qd, jnp.zeros_like(q))))
 
@@ -85,7 +85,7 @@ def physical_energy(q: Float[np.ndarray, "*shape"], qd: Float[np.ndarray, "*shap
 
 @in_float64
 def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, qd) at the first of two frames, in rad and rad/s, each of the shape before the pixels."""
+    """(q, qd) at the first of two frames, in rad and rad/s, without the pixel axis."""
     q, qd = _states(jnp.asarray(pairs, float).reshape(-1, 2, PIXELS))
     return np.asarray(q).reshape(pairs.shape[:-1]), np.asarray(qd).reshape(pairs.shape[:-1])
 
@@ -94,7 +94,7 @@ def physical_states(pairs: Float[np.ndarray, "*shape input"]) -> tuple[np.ndarra
 def predict_frames(
     model: LatentModel, parameters: Parameters, pairs: Float[np.ndarray, "K input"], times: int
 ) -> FrameMotions:
-    """The motions from two frames each, integrated adaptively in the latent plane, decoded for `times` frames."""
+    """Predicts motions from pairs of frames: integrated adaptively in the latent plane, decoded for `times` frames."""
     parameters = with_float64(parameters)
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, pairs), np.arange(float(times)))
     return FrameMotions(latent, decoded(model, parameters, latent))
@@ -104,7 +104,7 @@ def predict_frames(
 def encoded(
     model: LatentModel, parameters: Parameters, pairs: Float[np.ndarray, "*shape input"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(z_q, z_p) of pairs of frames, each [..., 1]."""
+    """(z_q, z_p) of pairs of frames, both [..., 1]."""
     flat = jnp.asarray(pairs, float).reshape(-1, pairs.shape[-1])
     q, p = _applied("encode", model, with_float64(parameters), flat)
     shape = (*pairs.shape[:-1], 1)
@@ -120,19 +120,22 @@ def decoded(model: LatentModel, parameters: Parameters, latent: Motions) -> Floa
 
 
 def recoded(model: LatentModel, parameters: Parameters, truth: Frames) -> Float[np.ndarray, "K T input"]:
-    """True pairs of frames, encoded and decoded: what the autoencoder alone makes of them."""
+    """Encodes and decodes true pairs of frames, which shows the error of the autoencoder alone."""
     return decoded(model, parameters, Motions(truth.t[:-1], *encoded(model, parameters, truth.pairs)))
 
 
 def energy_errors(pairs: Float[np.ndarray, "K T input"], truth: Frames) -> Float[np.ndarray, " K"]:
-    """Mean over times of (H - H_true)² for each motion, in J²; infinite for one that is not finite."""
+    """Mean over times of (H - H_true)² of the motions, in J²; infinite for motions that are not finite."""
     q, qd = physical_states(pairs)
     true = physical_energy(truth.q, truth.qd)[:, : q.shape[1]]
     return finite_or_infinite(np.mean((physical_energy(q, qd) - true) ** 2, axis=1))
 
 
 def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tuple[dict[str, float], FrameMotions]:
-    """`energy_mse` and `frame_mse`, each as by `phase_space.summary`, of motions from the first pairs; and these."""
+    """Predicts motions from the first pairs; returns their errors and the motions.
+
+    The errors are `energy_mse` and `frame_mse`, both by `phase_space.summary`.
+    """
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
     pictures = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))
@@ -141,7 +144,7 @@ def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tu
 
 @in_float64
 def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames) -> Float[np.ndarray, " K"]:
-    """As `energy_errors`, for the `LATE` frames: whether the energy drifts."""
+    """`energy_errors` of the `LATE` frames, which show a drift of the energy."""
     parameters = with_float64(parameters)
     frames = np.concatenate([[0.0], LATE])
     latent = predict(model.field, parameters["field"], *encoded(model, parameters, test.pairs[:, 0]), frames)
@@ -151,25 +154,25 @@ def late_energy_errors(model: LatentModel, parameters: Parameters, test: Frames)
 
 
 def energy_floor(test: Frames) -> float:
-    """The estimator's own mean square error of the energy, in J², on true frames."""
+    """Mean square error of the energy estimate on true frames, in J²."""
     return float(np.mean(energy_errors(test.pairs, test)))
 
 
 class Injection(NamedTuple):
-    """A motion of `times` frames before the energy is raised, and as many after, all in one."""
+    """One motion with `times` frames before and `times` frames after its energy is raised."""
 
     latent: Motions
-    """One motion [1, 2 times, 1], by frame number; both states of the moment of injection are in it."""
+    """One motion [1, 2 times, 1], by frame number, with both states of the moment of injection."""
     pairs: Float[np.ndarray, "T input"]
-    """Decoded."""
+    """Decoded pairs of frames."""
     level: Float[np.ndarray, " T"]
-    """Latent H above rest, relative to that at the start."""
+    """Latent H above rest, relative to its initial value."""
     physical: Float[np.ndarray, " T"]
-    """Energy read from the frames, in J."""
+    """Energy estimated from the frames, in J."""
 
 
 def raise_energy(H: Hamiltonian, q: Vector, p: Vector, wanted: Scalar) -> tuple[Vector, Vector]:
-    """The state with H = wanted on the shortest way from (q, p): along dz/ds = grad H / |grad H|², which adds s to H.
+    """Moves (q, p) to the level H = wanted along dz/ds = grad H / |grad H|², the steepest ascent, which adds s to H.
 
     The gradient must not vanish on the way.
     """
@@ -197,9 +200,9 @@ def inject_energy(
     factor: float = 2.0,
     times: int = 50,
 ) -> Injection:
-    """The motion from two frames, with `factor` times the energy from the frame number `times` on.
+    """Predicts the motion from two frames, with `factor` times the energy from frame number `times` on.
 
-    H is counted from the rod at rest, whose latent state is where the encoder puts two frames of it hanging still.
+    H is relative to the rod at rest, whose latent state is the encoding of two frames of the hanging rod.
 
     Raises:
         InputError: a model without an energy, or a factor or times that are not positive.
@@ -242,7 +245,7 @@ def _states(pairs: Array) -> tuple[Array, Array]:
     return jax.lax.map(state, pairs, batch_size=_BATCH)
 
 
-# Compiled once for each model, whatever its parameters.
+# Compiled once per model, for all parameters.
 @functools.partial(jax.jit, static_argnames=("model", "function"))
 def _applied(function: str, model: LatentModel, parameters: Parameters, *arrays: Array):
     return jax.vmap(getattr(model.apply(parameters), function))(*arrays)

@@ -1,4 +1,4 @@
-"""What differential networks say of a function and its derivatives, and how wrong they are."""
+"""Predictions of differential networks for a function and its derivatives, and their errors."""
 
 import functools
 from typing import NamedTuple
@@ -14,20 +14,20 @@ from dln_jax.nn.activations import Activation
 from dln_jax.nn.differential_mlp import Layers
 
 QUANTITIES = {"y": "value", "dy": "gradient", "d2y": "hessian"}
-"""Name of each field in the metrics."""
+"""Names of the fields in the metrics."""
 
 
 class Prediction(NamedTuple):
-    """Answers of an ensemble at N inputs, with the inputs in `x` of both; arrays are float64."""
+    """Predictions of an ensemble at N inputs, with the inputs in `x` of both fields; arrays are float64."""
 
     mean: FunctionSamples
-    """Value, Jacobian and Hessian: of the one network, or means over the members."""
+    """Value, Jacobian and Hessian: of a single network, or means over the members."""
     spread: FunctionSamples | None
-    """Sample standard deviation over the members; `None` for one network."""
+    """Sample standard deviation over the members; `None` for a single network."""
 
 
 def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Prediction:
-    """Answers at x [N, n]; `layers` have the members of an ensemble on their leading axis, also when there is one."""
+    """Evaluates networks at x [N, n]; `layers` have a leading axis of ensemble members, even for one."""
     members, dtype = layers[0][0].shape[0], layers[0][0].dtype
     network = functools.partial(differential_mlp.value_jacobian_and_hessian, activation=activation)
 
@@ -43,7 +43,7 @@ def predictions(layers: Layers, x: np.ndarray, *, activation: Activation) -> Pre
 def errors(predicted: FunctionSamples, truth: FunctionSamples) -> dict[str, float]:
     """Mean over samples of the squared error summed over components (the published metric).
 
-    `value_mse`, and `gradient_mse` and `hessian_mse` where the truth has derivatives; units are squares of the data's.
+    `value_mse`, and `gradient_mse` and `hessian_mse` if the truth has derivatives; units are squares of the data's.
     """
     result = {}
     for key, name in QUANTITIES.items():

@@ -1,4 +1,4 @@
-"""How long calls take: single ones, as a control loop would see them, and whole programs that take turns."""
+"""Timing of calls: single ones, as in a control loop, and whole programs in turns."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Latency(NamedTuple):
-    """Wall-clock time of single calls, results waited for, compilation apart."""
+    """Wall-clock time of single calls until their results are ready, without compilation."""
 
     compile_seconds: float
     p50_us: float
@@ -20,10 +20,10 @@ class Latency(NamedTuple):
 
 
 def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, warm_up: int = 200) -> Latency:
-    """Times calls of a compiled function, one state at a time, going round the given states.
+    """Times calls of a compiled function, one state at a time, cycling through the states.
 
-    The function is jitted, or one of NumPy arrays, and called as `function(*state)`; states have one shape, and are
-    varied, so that nothing is answered from a cache.
+    The function is jitted, or one of NumPy arrays, and called as `function(*state)`. All states have one shape; they
+    vary, so that no result comes from a cache.
     """
     start = time.perf_counter()
     jax.block_until_ready(function(*states[0]))
@@ -43,9 +43,9 @@ def one_step(function: Callable, states: Sequence[tuple], *, calls: int = 5000, 
 def medians_in_turns(
     programs: Mapping[str, Callable[..., Any]], arguments: tuple, *, repetitions: int, warm_up: int = 2
 ) -> dict[str, float]:
-    """Median wall-clock seconds of each compiled program on the same arguments, results waited for.
+    """Median wall-clock seconds of compiled programs on the same arguments, until their results are ready.
 
-    They take turns, so that a slow spell of the machine meets all of them.
+    The programs take turns, so that a slow period of the machine affects all of them.
     """
     seconds = {name: np.empty(repetitions) for name in programs}
     for repetition in range(-warm_up, repetitions):

@@ -1,11 +1,11 @@
-"""How long a model stays right on motions whose coordinates were measured: starts are fitted to their first samples.
+"""Horizon of predictions on motions with measured coordinates: initial states are fitted to the first samples.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold, counted from the end of the fitted samples
     lambda = ln |dx(T) / dx(0)| / T, the growth of the smallest changes of a start along the predicted motion
     drift = largest |E(t) - E(0) - (work of tau - work lost to friction)| over the largest kinetic energy
 
-Whatever perturbs a start by e has grown to e exp(lambda t). 1 / lambda, the Lyapunov time, is what predictions of
-chaotic motions are measured in: accuracy adds its logarithm only.
+A perturbation e of the initial state grows to e exp(lambda t). Predictions of chaotic motions are measured in Lyapunov
+times, 1 / lambda: a more accurate model extends them only by the logarithm of its accuracy.
 """
 
 import functools
@@ -30,22 +30,22 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError
 
 START_STEPS = 2 * starts.STEPS
-"""Steps of Gauss-Newton to the start of a prediction."""
+"""Gauss-Newton steps to the initial state of a prediction."""
 
 
 class Predictions(NamedTuple):
-    """Of W stretches of T samples each."""
+    """Predictions of W segments of T samples."""
 
     q: Float[np.ndarray, "W T d"]
     qd: Float[np.ndarray, "W T d"]
     growth: Float[np.ndarray, " W"]
     """lambda, 1/s."""
     drift: Float[np.ndarray, " W"]
-    """Relative to the largest kinetic energy; NaN for a model without energies."""
+    """Energy drift relative to the largest kinetic energy; NaN for a model without energies."""
 
 
 def cut_stretches(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
-    """Stretches of so many samples to predict, which begin at every so manyth sample of each trajectory.
+    """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
 
     Raises:
         InputError: no trajectory is that long.
@@ -62,11 +62,11 @@ def cut_stretches(data: Trajectories, samples: int, *, every: int) -> MeasuredWi
 
 
 def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> MeasuredWindows:
-    """Whole recordings of free motions to predict: gaps are filled with times of weight 0, where nothing was measured.
+    """Cuts whole recordings of free motions to predict: gaps are filled with unmeasured times of weight 0.
 
-    A start is fitted to `fitted` consecutive samples without a gap. Each recording is predicted from the first such
-    place, for `samples` median time steps or until it ends, and from further places half as far apart for as long as
-    it has `samples` steps left. Shorter stretches repeat their last time, with weight 0.
+    An initial state is fitted to `fitted` consecutive samples without a gap. A recording is predicted from the first
+    such place, for `samples` median time steps or until it ends. Further predictions start at intervals of half that
+    length, as long as `samples` steps remain. Shorter segments repeat their last time, with weight 0.
 
     Raises:
         InputError: no recording has more than `fitted` samples in a row and one to predict.
@@ -91,10 +91,10 @@ def cut_recordings(data: Trajectories, samples: int, *, fitted: int) -> Measured
 
 
 def grid_places(t: Float[np.ndarray, " N"], *, gap: float = GAP) -> Int[np.ndarray, " N"]:
-    """Place of each sample on a grid whose steps are those of the samples, and within a gap at most the median step."""
+    """Indices of samples on a grid with the steps of the samples, and within a gap steps of at most the median."""
     steps = np.diff(t)
     median = np.median(steps) if len(steps) else 1.0
-    # Rounding of the times must not add a step to a gap of a whole number of them.
+    # Rounding of the times must not add a step to a gap of a whole number of steps.
     counts = np.where(steps > gap * median, np.ceil(steps / median - 1e-6), 1).astype(int)
     return np.concatenate([[0], np.cumsum(counts)])
 
@@ -109,7 +109,7 @@ def on_grid(t: Float[np.ndarray, " N"], q: Float[np.ndarray, "N d"], qd: Float[n
 
 
 def padded(motions: list[MeasuredWindows]) -> MeasuredWindows:
-    """Motions as windows of one length: the shorter ones repeat their last time, with weight 0."""
+    """Pads motions to windows of one length: shorter ones repeat their last time, with weight 0."""
     longest = max(len(motion.t) for motion in motions)
 
     def extended(array: np.ndarray, mode: Literal["edge", "constant"]) -> np.ndarray:
@@ -135,16 +135,16 @@ def predict_measured(
     substeps: int = 1,
     momenta: bool = False,
 ) -> Predictions:
-    """Motions of a model whose starts come closest to the first `fitted` samples of q, at least 2; weight 0 is none.
+    """Predicts motions from initial states fitted to the first `fitted` samples of q; weight 0 means unmeasured.
 
     Args:
         model: of any energies, or of accelerations.
         parameters: its parameters.
-        stretches: to predict.
-        fitted: samples that a start is fitted to.
+        stretches: segments to predict.
+        fitted: number of samples that fit the initial state, at least 2.
         torque: between samples.
-        substeps: of RK4 between two samples.
-        momenta: the model is a flow of (q, p), without torques, whose p is about qd; the answer's qd is its p then.
+        substeps: RK4 steps between two samples.
+        momenta: whether the model is a flow of (q, p), without torques, with p close to qd; its p is returned as qd.
 
     Raises:
         InputError: `fitted` is out of range.
@@ -167,7 +167,7 @@ def valid_times(
     variance: Float[np.ndarray, " d"],
     threshold: float = 1e-2,
 ) -> Float[np.ndarray, " W"]:
-    """Valid prediction time of each stretch in s, from the last of the fitted samples on, at measured samples."""
+    """Valid prediction times of the segments in s, from the last fitted sample on, at measured samples."""
     measured = (stretches.weight > 0) & (np.arange(stretches.t.shape[1]) >= fitted - 1)
     return np.array(
         [
@@ -177,7 +177,7 @@ def valid_times(
     )
 
 
-# Compiled once for each model and shape, whatever the parameters.
+# Compiled once per model and shape, for all parameters.
 @functools.partial(jax.jit, static_argnames=("model", "scale", "fitted", "torque", "substeps", "momenta"))
 def _predict(
     model: Model, parameters, t, q, qd, tau, weight, *, scale, fitted: int, torque: Torque, substeps: int, momenta
@@ -211,7 +211,7 @@ def _predict(
 
 
 def _drift(system: Dynamics, states, t, tau, torque: Torque, substeps: int):
-    """Of the energy, against the work along the predicted motion."""
+    """Drift of the energy relative to the work along the predicted motion."""
     d = states.shape[1] // 2
 
     def rate(state, tau):
@@ -234,10 +234,10 @@ def prediction_metrics(
     variance: Float[np.ndarray, " d"],
     threshold: float = 1e-2,
 ) -> dict[str, float]:
-    """Means over the stretches, and the median of the valid prediction times, beside what bounds them.
+    """Means over the segments, the median valid prediction time, and the bounds on these times.
 
-    `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, where
-    motions part) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
+    `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, if
+    motions diverge) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
     """
     times = valid_times(stretches, predicted, fitted=fitted, variance=variance, threshold=threshold)
     growth = float(np.mean(predicted.growth))

@@ -1,11 +1,11 @@
-"""Whether the torques that a model leaves over are those of a force that it lacks and that velocity drives.
+"""Tests whether the torque residuals of a model show a missing force that depends on velocity.
 
-Without friction tau(q, qd, qdd) = M qdd + c + g is even in time, and friction odd. What a model without friction leaves
-over, r = tau - tau_hat, is then b qd (viscous) and does work on average:
+Without friction tau(q, qd, qdd) = M qdd + c + g is even in time; friction is odd. The residual of a model without
+friction, r = tau - tau_hat, is then b qd (viscous) and does work on average:
 
     P_j = qd_j r_j > 0,   b_j = sum(qd_j r_j) / sum(qd_j²),   share_j = b_j² sum(qd_j²) / sum(r_j²)
 
-Residuals that are noise do none: the mean of P over its standard error is then a standard normal variable.
+Residuals that are noise do no work: the mean of P over its standard error is then a standard normal variable.
 """
 
 from typing import NamedTuple
@@ -16,24 +16,24 @@ from jaxtyping import Float
 from dln_jax.types import InputError
 
 LEAST_SIGNIFICANCE = 5.0
-"""Standard errors from zero at which the mean power counts."""
+"""Standard errors from zero at which the mean power is significant."""
 LEAST_SHARE = 0.01
-"""Of the residual's mean square that velocity must explain."""
+"""Share of the residual's mean square that velocity must explain."""
 
 
 class Misfit(NamedTuple):
-    """What residuals say of a force that is missing, for each joint [d]."""
+    """Evidence for a missing force in the residuals of the joints [d]."""
 
     residual_rms: Float[np.ndarray, " d"]
     """In N m or N."""
     coefficient: Float[np.ndarray, " d"]
     """Viscous coefficient b that explains most of the residual; N m s or N s/m, negative for a driving force."""
     explained_share: Float[np.ndarray, " d"]
-    """Of the residual's mean square, by b qd."""
+    """Share of the residual's mean square that b qd explains."""
     power: Float[np.ndarray, " d"]
-    """Mean power qd r in W, what friction would dissipate."""
+    """Mean power qd r in W, which missing friction would dissipate."""
     significance: Float[np.ndarray, " d"]
-    """Mean power in standard errors, over trajectories where there are ten or more, else over samples."""
+    """Mean power in standard errors, over trajectories if there are ten or more, otherwise over samples."""
     missing: np.ndarray
     """Whether a velocity-dependent force is missing: significant, and more than a trace of the residual."""
 
@@ -43,15 +43,15 @@ def velocity_misfit(
     residual: Float[np.ndarray, "N d"],
     trajectory: np.ndarray | None = None,
 ) -> Misfit:
-    """Looks for friction that a model lacks in its torque residuals tau - tau_hat [N, d].
+    """Looks for missing friction in the torque residuals tau - tau_hat [N, d] of a model.
 
-    A potential that is missing does work too, along motions that do not return; it explains little of its residual
-    by velocity, which is what `LEAST_SHARE` is for.
+    A missing potential also does work along motions that do not return. But velocity explains little of its residual,
+    which `LEAST_SHARE` tests.
 
     Args:
         qd: velocities.
         residual: tau - tau_hat.
-        trajectory: index of each sample's trajectory, whose samples count as one; `None` for independent samples.
+        trajectory: index of the samples' trajectories, whose samples count as one; `None` for independent samples.
 
     Raises:
         InputError: fewer than three samples, or shapes that differ.

@@ -1,8 +1,8 @@
-"""Whether a model of motions may be used: good, doubtful or refused, judged by the test motions that it predicts.
+"""Verdict on a model of motions: good, doubtful or refused, by its predictions of test motions.
 
 A predicted motion escapes if a state is not finite, or a momentum or a position is further from zero than `RANGE` times
 the farthest measured one; angles may grow, as a pendulum turns over. The error of a motion is the mean square of its
-first `EARLY` samples over the variance of the data, because chaotic motions part from any model later on.
+first `EARLY` samples over the variance of the data, because chaotic motions diverge from any model later on.
 
     refused    a motion escapes, or the median error exceeds FAILED (an rms error of half the spread)
     doubtful   it exceeds UNEXPLAINED; NOISE times the share of noise in the variance is added to both
@@ -17,10 +17,10 @@ from dln_jax.metrics.phase_space import Motions
 from dln_jax.metrics.verdict import FAILED, UNEXPLAINED, Verdict
 
 EARLY = 30
-"""Samples."""
+"""Number of samples of the error."""
 RANGE = 10.0
 NOISE = 4.0
-"""The noise of the measured start moves a motion as far as the noise that it is compared with, and may grow."""
+"""Noise in the measured initial state moves a motion as far as the noise that it is compared with, and may grow."""
 REMEDY = "state the plant's --needs, try another --model, or record more motions"
 
 
@@ -32,14 +32,14 @@ def judge_motions(
     bounded: Bool[np.ndarray, " two_d"],
     noise: Float[np.ndarray, " two_d"] | None = None,
 ) -> Verdict:
-    """The verdict of predicted test motions.
+    """Returns the verdict on predicted test motions.
 
     Args:
         predicted: motions of the model.
-        truth: as measured, or exact, at the same times.
+        truth: measured or exact motions at the same times.
         size: standard deviation of q and p in the data.
-        bounded: which of q and p cannot grow without end: all but angles.
-        noise: standard deviation of q and p as measured, where it is known.
+        bounded: mask of q and p that cannot grow without limit: all but angles.
+        noise: standard deviation of the measurements of q and p, if known.
     """
     errors, escaped, total = [], 0, 0
     for theirs, ours in zip(truth, predicted, strict=True):

@@ -1,12 +1,12 @@
-"""Errors of a model of a phase space: of its field at test states, and of the motions that it predicts.
+"""Errors of a model of a phase space: of its field at test states, and of its predicted motions.
 
     test loss        mean over samples and components of (rates - measured rates)², as published
-    clean field      the same against the exact field at the same, noisy, states: what tells models apart
+    clean field      the same against the exact field at the same, noisy, states, which distinguishes models
     energy           mean over starts and times of (H(x_hat(t)) - H(x(t)))², H the true one
     rollout          mean over starts, times and components of (x_hat(t) - x(t))²
 
-Standard errors are over starts. Means are dominated by single motions where these are chaotic, so that medians over
-starts stand beside them. A motion that is not finite, or needs more than `MOST_STEPS`, has infinite errors.
+Standard errors are over starts. Single chaotic motions dominate means, so medians over starts are reported too. A
+motion that is not finite, or needs more than `MOST_STEPS`, has infinite errors.
 """
 
 import functools
@@ -26,7 +26,7 @@ from dln_jax.scenes.datasets.phase_samples import Part
 from dln_jax.types import Hamiltonian
 
 MOST_STEPS = 5_000
-"""Of a predicted motion."""
+"""Largest number of integrator steps of a predicted motion."""
 
 
 class Motions(NamedTuple):
@@ -40,7 +40,7 @@ class Motions(NamedTuple):
 def field_rates(
     model: Model, parameters: Parameters, q: Float[np.ndarray, "N d"], p: Float[np.ndarray, "N d"]
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N d"]]:
-    """(qd, pd) of states."""
+    """Rates (qd, pd) of states."""
     qd, pd = _rates(model, parameters, jnp.asarray(q), jnp.asarray(p))
     return np.asarray(qd), np.asarray(pd)
 
@@ -66,7 +66,7 @@ def predict(
     *,
     tolerance: float = 1e-9,
 ) -> Motions:
-    """The motions of a model from the states at t[0], integrated adaptively to the tolerance per step."""
+    """Predicts motions from the states at t[0], integrated adaptively to the tolerance per step."""
     states, successful = _motions(model, parameters, jnp.asarray(q), jnp.asarray(p), jnp.asarray(t), tolerance)
     finished = np.asarray(successful)[:, None, None]
     q_hat, p_hat = (np.where(finished, np.asarray(state), np.inf) for state in states)
@@ -74,30 +74,30 @@ def predict(
 
 
 def energies(H: Hamiltonian, motions: Motions) -> Float[np.ndarray, "K T"]:
-    """H along motions; infinite where a state is not finite."""
+    """H along motions; infinite if a state is not finite."""
     return finite_or_infinite(np.asarray(_along(H, jnp.asarray(motions.q), jnp.asarray(motions.p))))
 
 
 def finite_or_infinite(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The values, infinite where they are not finite: an error that is not a number is no small one."""
+    """Replaces values that are not finite by infinity, so that a NaN never counts as a small error."""
     return np.where(np.isfinite(values), values, np.inf)
 
 
 def energy_errors(H: Hamiltonian, predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
-    """Mean over time of (H(x_hat) - H(x))² for each motion; infinite for one that is not finite."""
+    """Mean over time of (H(x_hat) - H(x))² of the motions; infinite for motions that are not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return finite_or_infinite(np.mean((energies(H, predicted) - energies(H, truth)) ** 2, axis=1))
 
 
 def state_errors(predicted: Motions, truth: Motions) -> Float[np.ndarray, " K"]:
-    """Mean over time and components of (x_hat - x)² for each motion; infinite for one that is not finite."""
+    """Mean over time and components of (x_hat - x)² of the motions; infinite for motions that are not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.concatenate([predicted.q - truth.q, predicted.p - truth.p], axis=2) ** 2
         return finite_or_infinite(np.mean(errors, axis=(1, 2)))
 
 
 def summary(name: str, errors: Float[np.ndarray, " K"]) -> dict[str, float]:
-    """Mean, its standard error (NaN of one), and median, under `name`, `name_standard_error` and `name_median`."""
+    """Mean, its standard error (NaN for one error), and median: `name`, `name_standard_error` and `name_median`."""
     count = len(errors)
     finite = bool(np.isfinite(errors).all())
     spread = float(np.std(errors, ddof=1) / np.sqrt(count)) if finite and count > 1 else float("nan")
@@ -111,9 +111,9 @@ def motion_errors(
     *,
     published_energy: Hamiltonian | None = None,
 ) -> dict[str, float]:
-    """`rollout_mse`, and where they are known `energy_mse` and, where it is another one, `published_energy_mse`.
+    """Returns `rollout_mse`, `energy_mse` if H is known, and `published_energy_mse` if that energy differs from H.
 
-    Each as by `summary`, over all motions of all entries, whose times may differ.
+    All are reported by `summary`, over all motions of all entries, whose times may differ.
     """
 
     def over_all(name: str, errors: Callable[[Motions, Motions], np.ndarray]) -> dict[str, float]:
@@ -125,7 +125,7 @@ def motion_errors(
     return found | over_all("rollout_mse", state_errors)
 
 
-# Compiled once for each model, whatever its parameters.
+# Compiled once per model, for all parameters.
 @functools.partial(jax.jit, static_argnames=("model",))
 def _rates(model: Model, parameters, q, p):
     return jax.vmap(flow(model.energies(parameters)).rates)(q, p)

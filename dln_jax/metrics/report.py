@@ -1,4 +1,4 @@
-"""Reports: one number per row, with what it is compared to and the conditions it was measured under."""
+"""Reports: one number per row, with its reference or bound, and the conditions of the measurement."""
 
 import datetime
 import importlib.metadata
@@ -19,9 +19,9 @@ from dln_jax.files import write_json
 REPORT = "report.json"
 PACKAGES = ("dln-jax", "jax", "jaxlib", "dm-haiku", "optax", "numpy", "diffrax")
 WIDTH, NARROWEST = 200, 132
-"""Of a table in a file or a pipe, which has none to keep to, and of one in a terminal."""
+"""Width of a table in a file or a pipe, and its smallest width in a terminal."""
 UNITS = {"seconds": "s", "us": "us", "j": "J"}
-"""What a word in the name of a quantity says of its unit, wherever it is measured."""
+"""SI units by the words in a quantity's name."""
 
 
 class Row(NamedTuple):
@@ -34,15 +34,15 @@ class Row(NamedTuple):
     reference: float | None = None
     """Published or closed-form value."""
     bound: float | None = None
-    """Figure to reach."""
+    """Bound to meet."""
     at_least: bool = False
     """Whether the bound is a lower one."""
     expected: str = ""
-    """The expectation in words, with where the bound comes from."""
+    """The expectation in words, with the origin of the bound."""
 
     @property
     def passed(self) -> bool | None:
-        """Whether the bound is met, which NaN does not; `None` without one."""
+        """Whether the bound is met (NaN does not meet it); `None` without a bound."""
         if self.bound is None:
             return None
         return bool(self.value >= self.bound if self.at_least else self.value <= self.bound)
@@ -59,7 +59,7 @@ def expect(
     at_least: bool = False,
     reference: float | None = None,
 ) -> Row:
-    """The row of a number of which theory says what it may be: `expected`, and the `bound` that follows."""
+    """Returns the row of a number with an expectation from theory: `expected`, and the resulting `bound`."""
     return Row(case, quantity, float(value), unit, reference, float(bound), at_least, expected)
 
 
@@ -74,7 +74,7 @@ def unit_of(quantity: str, units: Mapping[str, str] = UNITS) -> str:
 
 
 def conditions(**given: Any) -> dict[str, Any]:
-    """Machine, versions, threads, command and date, and whatever else is given (dtype, seeds, ...)."""
+    """Machine, versions, threads, command and date, and all keywords (dtype, seeds, ...)."""
     return {
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}",
         "device": str(jax.devices()[0]),
@@ -89,7 +89,7 @@ def conditions(**given: Any) -> dict[str, Any]:
 def write_report(path: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
     """Writes `{"conditions": ..., "rows": [...]}` as JSON; a value that is not finite becomes null.
 
-    What is expected of rows in words is part of the conditions.
+    The expectations of rows in words are part of the conditions.
     """
     listed = [{**dict(zip(Row._fields[:6], row, strict=False)), "pass": row.passed} for row in rows]
     words = {f"{row.case} {row.quantity}": row.expected for row in rows if row.expected}
@@ -104,7 +104,7 @@ def publish(
     shown: Sequence[Row] | None = None,
     tables: Sequence[Table | str] = (),
 ) -> None:
-    """Writes report.json into a folder; prints the table of its rows, or of those `shown`, other tables, what fails."""
+    """Writes report.json into a folder; prints a table of its rows (or of `shown`), other tables, and failing rows."""
     write_report(folder / REPORT, rows, facts)
     print_report(rows if shown is None else shown, facts, *tables)
     bound = [row for row in rows if row.passed is not None]
@@ -115,16 +115,16 @@ def publish(
 
 
 def print_report(rows: Sequence[Row], facts: Mapping[str, Any], *others: Table | str) -> None:
-    """Prints the table of some rows, and others below it."""
+    """Prints the table of some rows, followed by other tables."""
     console = Console(highlight=False, soft_wrap=True)
-    # Numbers that are cut off say nothing: a narrow terminal gets long lines.
+    # Truncated numbers are useless, so that a narrow terminal gets long lines.
     console.width = max(console.width, NARROWEST) if sys.stdout.isatty() else WIDTH
     for table in (report_table(rows, facts), *others):
         print(table) if isinstance(table, str) else console.print(table)
 
 
 def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
-    """One line per row, without the columns that would be empty; the caption states the conditions."""
+    """Returns a table with one line per row, without empty columns; the caption states the conditions."""
     passed = {True: "yes", False: "[bold red]no[/]", None: ""}
     to_reach = ["" if row.bound is None else f"{'≥' if row.at_least else '≤'} {row.bound:.3g}" for row in rows]
     columns = {
@@ -144,7 +144,7 @@ def report_table(rows: Sequence[Row], facts: Mapping[str, Any]) -> Table:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """A table with a line per case and a column per quantity, in the order in which they come."""
+    """Returns a table with a line per case and a column per quantity, in order of appearance."""
     cases = list(dict.fromkeys(row.case for row in rows))
     columns = list(dict.fromkeys((row.quantity, row.unit) for row in rows))
     values = {(row.case, row.quantity, row.unit): f"{row.value:.3g}" for row in rows}
@@ -154,7 +154,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def markdown_table(titles: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Cells as Markdown."""
+    """Formats cells as Markdown."""
     return "".join(f"| {' | '.join(line)} |\n" for line in [titles, ["---"] * len(titles), *lines])
 
 

@@ -1,11 +1,12 @@
-"""Long predictions: a system driven by recorded torques from a recorded state, and how long it stays right.
+"""Long predictions: a system driven by recorded torques from a recorded state, and the time until it fails.
 
     VPT = first t with sum_j (q_j - q_hat_j)² / var(q_j) >= threshold        (valid prediction time)
     E(t) - E(0) = work of tau - work lost to friction                        (energy balance)
 
 Protocol: Lutter and Peters, "Combining physics and deep learning to learn continuous-time dynamics models" (2021),
-integrates by RK4 at a twentieth of the samples' spacing, with the torque held over each sample. A recorded torque is
-a sample of a smooth function, so that even the true plant leaves such a reference; interpolating is closer to it.
+integrates by RK4 at a twentieth of the samples' spacing, with the torque held over each sample. But a recorded torque
+is a sample of a smooth function, so that even the true plant deviates under held torques; interpolation is more
+accurate.
 """
 
 import functools
@@ -24,26 +25,26 @@ from dln_jax.mechanics.dynamics import Dynamics, PlainDynamics
 from dln_jax.types import InputError, Vector, require_positive
 
 TORQUES: tuple[Torque, ...] = ("held", "interpolated")
-"""What a torque does between two samples; all kinds are compared."""
+"""Torques between two samples; all kinds are compared."""
 
 
 class Motion(NamedTuple):
-    """A predicted motion at the times of the recorded one; with a leading axis [K] for several."""
+    """A predicted motion at the times of the recorded one; several add a leading axis [K]."""
 
     q: Float[Array | np.ndarray, "*K T d"]
     qd: Float[Array | np.ndarray, "*K T d"]
     work: Float[Array | np.ndarray, "*K T"]
-    """Energy supplied by tau less that lost to friction since the start, in J."""
+    """Energy supplied by tau minus the loss to friction since the start, in J."""
 
 
 class Records(NamedTuple):
-    """What was recorded of K trajectories, padded to one length T by repeating their last samples."""
+    """Records of K trajectories, padded to one length T by repeating their last samples."""
 
     q0: Float[Array, "K d"]
     qd0: Float[Array, "K d"]
     tau: Float[Array, "K T d"]
     t: Float[Array, "K T"]
-    """Since the start of each, in s."""
+    """Time since the start of the trajectory, in s."""
 
 
 def follow(
@@ -56,10 +57,11 @@ def follow(
     substeps: int = 20,
     torque: Torque = "held",
 ) -> Motion:
-    """The motion from (q0, qd0) under the torques tau at the times t, by RK4; one trajectory, `vmap` it over more.
+    """Integrates the motion from (q0, qd0) under the torques tau at the times t, by RK4; `vmap` it over trajectories.
 
     Times are in s, with any spacing; a repeated time repeats the state. There are `substeps` of RK4 per sample. The
     torque "held" keeps tau[k] until t[k + 1], as published; "interpolated" is linear in between.
+
     Raises InputError for no substeps, or a `torque` of another name.
     """
     require_positive(substeps=substeps)
@@ -74,9 +76,10 @@ def recorded_motions(
     substeps: int = 20,
     dtype: DTypeLike | None = None,
 ) -> dict[Torque, list[Motion]]:
-    """`follow` along every trajectory of the data, each from its first state: float64 arrays, as long as the data's.
+    """Returns `follow` along all trajectories of the data, from their first states, as float64 arrays of their lengths.
 
-    All kinds of torque run in one program, in `dtype` (JAX's default if not given).
+    All kinds of torque run in one program, in `dtype` (JAX's default if omitted).
+
     Raises InputError for a trajectory of a single sample, no substeps, or a torque of another name.
     """
     require_positive(substeps=substeps)
@@ -113,23 +116,23 @@ def motion_program(
 
 
 def records_of(data: Trajectories, dtype: DTypeLike | None) -> Records:
-    """Returns the records that a `motion_program` takes, in `dtype` (JAX's default if `None`).
+    """Returns the records for a `motion_program`, in `dtype` (JAX's default if `None`).
 
     Raises:
         InputError: a trajectory of a single sample.
     """
     groups = _samples(data)
     longest = max(map(len, groups))
-    # Padded to one length by repeating the last sample: time stands still there, and so does the state.
+    # Padded to one length by repeating the last sample: with time steps of zero, the state stays there.
     padded = np.stack([np.pad(group, (0, longest - len(group)), mode="edge") for group in groups])
     first = padded[:, 0]
-    # Times count from the start of each trajectory before they are rounded to `dtype`.
+    # Times are counted from the start of a trajectory before they are rounded to `dtype`.
     t = data.t[padded] - data.t[first][:, None]
     return Records(*(jnp.asarray(array, dtype) for array in (data.q[first], data.qd[first], data.tau[padded], t)))
 
 
 def by_trajectory(motions: Motion, data: Trajectories, torques: Sequence[Torque]) -> dict[Torque, list[Motion]]:
-    """Returns the motions of a `motion_program` as `recorded_motions` does."""
+    """Returns the motions of a `motion_program` in the form of `recorded_motions`."""
     groups, arrays = _samples(data), [np.asarray(leaf, np.float64) for leaf in motions]
     return {
         torque: [Motion(*(leaf[kind, k, : len(group)] for leaf in arrays)) for k, group in enumerate(groups)]
@@ -149,7 +152,7 @@ def valid_prediction_time(
 
     The whole duration if there is none. A prediction that is not finite has failed at that sample.
     """
-    # A prediction that diverges may overflow on its way; inf is over the threshold, and NaN is not below it.
+    # A diverging prediction may overflow; infinity exceeds the threshold, and NaN is not below it.
     with np.errstate(over="ignore", invalid="ignore"):
         failed = ~(np.sum((q - q_hat) ** 2 / variance, axis=1) < threshold)
     last = int(np.argmax(failed)) if failed.any() else len(t) - 1
@@ -159,7 +162,7 @@ def valid_prediction_time(
 def valid_prediction_times(
     data: Trajectories, motions: list[Motion], *, threshold: float = 1e-2
 ) -> Float[np.ndarray, " K"]:
-    """Valid prediction time of each trajectory in s; the variance of q_j is over all samples of the data.
+    """Valid prediction times of the trajectories in s; the variance of q_j is over all samples of the data.
 
     Raises InputError for a coordinate that is the same in all samples, or a threshold that is not positive.
     """
@@ -193,8 +196,8 @@ def energy_error(
 ) -> float:
     """Mean over all samples of |E(t) - E(0) - work(t)| in J, for the predicting system's own energy(q, qd).
 
-    It shows what integrating costs, and whether the forward model follows from that energy; it says nothing of
-    whether the energy is right. Infinite when a prediction is not finite.
+    It shows the error of the integration, and whether the forward model is consistent with that energy, but not whether
+    the energy is right. Infinite if a prediction is not finite.
     """
     states = (np.concatenate([getattr(motion, key) for motion in motions]) for key in ("q", "qd"))
     energies = np.asarray(jax.jit(jax.vmap(energy))(*(jnp.asarray(array, dtype) for array in states)), np.float64)
@@ -215,11 +218,12 @@ def rollout_metrics(
     threshold: float = 1e-2,
     dtype: DTypeLike | None = None,
 ) -> dict[str, float]:
-    """Means over the trajectories of how well a system predicts them from their first states and torques.
+    """Means over the trajectories of a system's predictions from their first states and torques.
 
-    `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds`, `rollout_seconds` (the duration, which bounds
-    them), and of the interpolated motions, which are the more accurate, `normalised_state_error` and, of a system that
-    has an energy, `energy_error_j`. The true plant's figures are the ceiling that belongs beside a model's.
+    `vpt_seconds` (torque held, as published), `vpt_interpolated_seconds` and `rollout_seconds` (the duration, which
+    bounds them). For the interpolated motions, which are more accurate, also `normalised_state_error` and, if the
+    system has an energy, `energy_error_j`. Compare a model's figures with those of the true plant, which bound them.
+
     Raises InputError for a trajectory of a single sample, a coordinate that never changes, or a number not positive.
     """
     require_positive(substeps=substeps)
@@ -249,11 +253,11 @@ def metrics_of_motions(
 
 
 def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, substeps: int) -> Motion:
-    """The motion through intervals with torque tau[k] + slopes[k] s; the work done is a third state."""
+    """Integrates through intervals with torque tau[k] + slopes[k] s; the work done is a third state."""
 
     def rate(state, tau):
         q, qd, _ = state
-        # The work's rate is that of the energy: friction counts.
+        # The work changes at the rate of the energy, which includes friction.
         at_work = tau - dynamics.friction(q, qd) if isinstance(dynamics, Dynamics) else tau
         return qd, dynamics.forward_dynamics(q, qd, tau), qd @ at_work
 
@@ -262,7 +266,7 @@ def _drive(dynamics: Dynamics | PlainDynamics, q0, qd0, tau, slopes, durations, 
 
 
 def _samples(data: Trajectories) -> list[np.ndarray]:
-    """Indices of each trajectory's samples."""
+    """Indices of the trajectories' samples."""
     groups = [np.flatnonzero(data.trajectory == index) for index in np.unique(data.trajectory)]
     if not groups:
         raise InputError("there are no trajectories; a rollout needs at least one")

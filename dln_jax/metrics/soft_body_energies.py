@@ -1,4 +1,4 @@
-"""Where the energy of a soft body in motion is: kinetic, and term by term."""
+"""Energies of a soft body in motion: kinetic, and term by term."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from dln_jax.softbody.scene import Params, SoftScene, element_energies, prepare
 from dln_jax.solvers.elements.energies import value
 
 KINETIC, TOTAL = "kinetic", "total"
-# So many moments at a time.
+# Number of moments evaluated at a time.
 _BATCH = 32
 
 
@@ -20,7 +20,7 @@ def motion_energies(
     v: Float[Array, "T n dim"],
     control: Float[Array, "T k"] | None = None,
 ) -> dict[str, Float[np.ndarray, " T"]]:
-    """Kinetic energy, that of each term by its name, and their total, in J, at each moment of a motion.
+    """Kinetic energy, the energies of the terms by name, and their total, in J, at the moments of a motion.
 
     The potential of gravity is zero at the origin. Friction stores nothing.
     """

@@ -1,13 +1,13 @@
-"""Whether a fitted robot may be used: good, doubtful or refused, judged by its torques on held-out motions.
+"""Verdict on a fitted robot: good, doubtful or refused, by its torques on held-out motions.
 
-Each joint's mean squared error e is compared with four numbers from the same samples: the variance v of its torque (the
-error of a guess of the mean), its mean square z (a guess of zero), the variance n of its noise, and the error of the
-robot's own file. A joint is
+The mean squared error e of a joint is compared with four numbers from the same samples: the variance v of its torque
+(the error of predicting the mean), its mean square z (the error of predicting zero), the variance n of its noise, and
+the error of the robot's own file. A joint is
 
     explained     e <= UNEXPLAINED v + NOISE n
     unexplained   e >= v: a constant would have done as well
     doubtful      in between; if the mean of e / v over all joints is beyond FAILED, the fit is refused
-    unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: nothing is said of it
+    unseen        its torque does not rise above its noise (n >= v / 2) and e <= NOISE n: no conclusion
 
 A torque that does not vary, such as that of a passive joint, is judged in units of the mean square of all torques.
 """
@@ -22,27 +22,27 @@ from dln_jax.types import InputError
 
 Level = Literal["good", "doubtful", "refused"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "refused")
-"""In the order of the numbers that metrics.json holds: 0, 1 and 2."""
+"""Levels in the order of their numbers in metrics.json: 0, 1 and 2."""
 UNEXPLAINED, FAILED = 0.05, 0.25
-"""Share of a torque's variance that a good model may leave unexplained in each joint (an rms error of 22 %), and mean
-share of all joints from which it is refused (50 %)."""
+"""Share of a torque's variance that a good model may leave unexplained in any joint (an rms error of 22 %), and mean
+share over all joints at which it is refused (50 %)."""
 NOISE = 2.0
-"""Errors up to this multiple of the noise's variance count as noise, which is itself an estimate."""
+"""Errors up to this multiple of the noise's variance count as noise, because that variance is itself an estimate."""
 WORSE, MUCH_WORSE = 0.01, 2.0
-"""A fit is worse than the robot's file if its mean nMSE is larger by the first; it is refused if it is larger by this
-factor as well."""
+"""A fit is worse than the robot's file if its mean nMSE is larger by the first number; it is refused if it is also
+larger by the second as a factor."""
 CONSTANT = 1e-12
-"""A torque whose variance is a smaller share of the mean square of all torques does not vary."""
+"""A torque is constant if its variance is below this share of the mean square of all torques."""
 
 
 class Verdict(NamedTuple):
-    """What to think of a fit, in words."""
+    """Verdict on a fit, in words."""
 
     level: Level
     reason: str
-    """The numbers that it rests on."""
+    """The numbers behind it."""
     remedy: str = ""
-    """What to do; empty if the fit is good."""
+    """Recommended action; empty if the fit is good."""
 
     @property
     def number(self) -> int:
@@ -51,32 +51,32 @@ class Verdict(NamedTuple):
 
     @property
     def line(self) -> str:
-        """One line for the user."""
+        """The verdict in one line for the user."""
         return f"verdict: {self.level}: {self.reason}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 class HeldOut(NamedTuple):
-    """Mean squares of each joint [d] over held-out samples, (N m)² or N²."""
+    """Mean squares of the joints [d] over held-out samples, (N m)² or N²."""
 
     error: Float[np.ndarray, " d"]
-    """Of the model's torques."""
+    """Error of the model's torques."""
     mean: Float[np.ndarray, " d"]
-    """Of a guess of the mean: the torque's variance."""
+    """Error of predicting the mean: the torque's variance."""
     zero: Float[np.ndarray, " d"]
-    """Of a guess of zero."""
+    """Error of predicting zero."""
     noise: Float[np.ndarray, " d"] | None = None
-    """Variance of the measured torque's noise, where an estimate is at hand."""
+    """Variance of the measured torque's noise, if it was estimated."""
     file: Float[np.ndarray, " d"] | None = None
-    """Of the torques of the robot's own file, where there is one."""
+    """Error of the torques of the robot's own file, if there is one."""
 
     @property
     def unit(self) -> Float[np.ndarray, " d"]:
-        """What errors are divided by: the variance, or for a torque that does not vary the mean square of all."""
+        """Scale of the errors: the variance, or for a torque that does not vary the mean square of all."""
         return np.where(self.mean > CONSTANT * self.zero.mean(), self.mean, self.zero.mean())
 
 
 class FitRefused(Exception):
-    """A fit that must not be used. Its run folder is complete but for files for a robot; commands end with status 1."""
+    """A fit that must not be used. Its run folder is complete except files for a robot; commands end with status 1."""
 
     def __init__(self, verdict: Verdict):
         super().__init__(f"the fit is refused: {verdict.reason}; {verdict.remedy}")
@@ -90,13 +90,13 @@ def held_out(
     noise: Float[np.ndarray, " d"] | None = None,
     file: Float[np.ndarray, "N d"] | None = None,
 ) -> HeldOut:
-    """The numbers that a verdict rests on.
+    """Computes the numbers for a verdict.
 
     Args:
         predicted: torques of the model.
         measured: torques of motions that the model has not seen.
-        noise: standard deviation of each measured torque, such as `data.encoders.noise.noise_of`; not finite where it
-            is not known.
+        noise: standard deviations of the measured torques, for example from `data.encoders.noise.noise_of`; not finite
+            if unknown.
         file: torques of the robot's own file.
 
     Raises:
@@ -115,7 +115,7 @@ def held_out(
 
 
 def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
-    """The verdict of held-out torques.
+    """Returns the verdict on held-out torques.
 
     Args:
         found: the numbers.
@@ -157,7 +157,7 @@ def judge(found: HeldOut, names: Sequence[str] | None = None) -> Verdict:
 
 
 def worst(first: Verdict, *others: Verdict) -> Verdict:
-    """The gravest of several verdicts; of equal ones that are not good, all reasons and remedies."""
+    """The most severe of several verdicts; of equal ones that are not good, all reasons and remedies."""
     every = [first, *others]
     level = LEVELS[max(each.number for each in every)]
     if level == "good":
@@ -168,14 +168,14 @@ def worst(first: Verdict, *others: Verdict) -> Verdict:
 
 
 def verdict_metrics(found: HeldOut, verdict: Verdict) -> dict[str, float | int]:
-    """Entries of metrics.json: the verdict as a number, and mean nMSE of what the model was compared with."""
+    """Entries of metrics.json: the verdict as a number, and the mean nMSE of the comparisons."""
     compared = {"zero": found.zero, "noise": found.noise, "file": found.file}
     means = {f"{name}_nmse": float(np.mean(each / found.unit)) for name, each in compared.items() if each is not None}
     return {"verdict": verdict.number, **means}
 
 
 def _numbers(found: HeldOut, share: np.ndarray, noise: np.ndarray, names: Sequence[str]) -> str:
-    """All of the numbers as a phrase."""
+    """Formats all of the numbers as a phrase."""
     worst = int(np.argmax(share))
     compared = [f"a guess of zero {np.mean(found.zero / found.unit):.3g}"]
     compared += [] if found.file is None else [f"the robot's file {np.mean(found.file / found.unit):.3g}"]

@@ -1,4 +1,4 @@
-"""Energies made of networks, built from what a scene needs."""
+"""Models: energies built from networks and bases for the needs of a scene."""
 
 from dln_jax.models.baselines import make_feed_forward, make_phase_network
 from dln_jax.models.dissipative import make_dissipative

@@ -1,13 +1,11 @@
-"""Networks that know no physics, for inverse and forward dynamics or for the rates of a phase space: the baselines.
+"""Baselines without physics: networks for inverse and forward dynamics, or for the rates of a phase space.
 
     tau = tau_scale network([features(q), qd / rate_scale, qdd / acceleration_scale])
     qdd = acceleration_scale network([features(q), qd / rate_scale, tau / tau_scale])
-
     (qd, pd) = rate_scale network([features(q), p / momentum_scale])
 
-The first two are separate, so that one need not invert the other. The last is what Greydanus, Dzamba and Yosinski
-(2019) compare with. There is no energy and no mass matrix, and forces are not told apart, so that an absent one leaves
-nothing out.
+The first two are separate networks, so one need not invert the other. The last is the baseline of Greydanus, Dzamba and
+Yosinski (2019). There is no energy, no mass matrix and no decomposition of forces, so an absent force saves nothing.
 """
 
 from functools import partial
@@ -36,13 +34,13 @@ def make_feed_forward(
     tau_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of the networks for tau and qdd.
+    """Returns the (init, energies) pair of the networks for tau and qdd.
 
     Args:
         rate_scale: typical size of qd.
         acceleration_scale: typical size of qdd.
         tau_scale: typical size of tau.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)
@@ -71,12 +69,12 @@ def make_phase_network(
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of the network for the rates.
+    """Returns the (init, energies) pair of the network for the rates.
 
     Args:
         momentum_scale: typical size of p.
         rate_scale: typical size of qd and pd.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)

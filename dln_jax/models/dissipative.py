@@ -1,4 +1,4 @@
-"""Hamiltonian models that lose energy.
+"""Hamiltonian models with dissipation.
 
 D = ½ sum_j c_j(q) qd_j²,   c = softplus(network(features(q))) > 0,   dH/dt = -2 D <= 0
 """
@@ -28,13 +28,13 @@ def make_dissipative(
     initial_friction: float = 0.05,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """A Hamiltonian `Model` that loses energy by a friction that depends on q, for any parameters.
+    """Adds friction that depends on q to a Hamiltonian `Model`, so that it loses energy for any parameters.
 
     Args:
-        model: conserves its energy: made for needs without friction.
-        needs: what the scene needs; without friction nothing is added.
-        initial_friction: c to start from, about, in N m s or N s/m.
-        width, depth, activation, dtype: of the network for c; as for all, in `models.model`.
+        model: conservative, built for needs without friction.
+        needs: of the scene; without friction nothing is added.
+        initial_friction: approximate initial value of c, in N m s or N s/m.
+        width, depth, activation, dtype: of the network for c, as described in `models.model`.
 
     Raises:
         InputError: a width, depth or friction that is not positive.

@@ -2,15 +2,15 @@
 
     structured:  H = ½ |L(q)ᵀ p|² + V(q),  M⁻¹ = L Lᵀ,  diag L = softplus(x + shift) + floor
     black-box:   H = network([features(q), p / momentum_scale])
-    separable:   H = T(p / momentum_scale) + V(features(q)), a network each
+    separable:   H = T(p / momentum_scale) + V(features(q)), with two networks
 
-The black-box one is of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks"; the structured one as in
-Lutter and Peters 2021, who let a network give the inverse mass matrix; the separable one as in Chen et al. 2020,
-"Symplectic recurrent neural networks". No product of q and p can be learned by the separable one, so that explicit
-symplectic steps (`mechanics.integrators.stormer_verlet`) apply to it; it fits systems with a constant mass matrix,
-whatever the kinetic energy.
+The black-box model is that of Greydanus, Dzamba and Yosinski 2019, "Hamiltonian Neural Networks". The structured one
+follows Lutter and Peters 2021, whose network gives the inverse mass matrix, and the separable one Chen et al. 2020,
+"Symplectic recurrent neural networks". The separable model cannot express products of q and p, so that explicit
+symplectic steps (`mechanics.integrators.stormer_verlet`) apply to it. It fits systems with a constant mass matrix and
+any kinetic energy of p.
 
-`mechanics.equations.flow` turns all into Hamilton's equations, and `dynamics` into those in velocities.
+`mechanics.equations.flow` turns all of them into Hamilton's equations, and `dynamics` into equations in velocities.
 """
 
 from functools import partial
@@ -39,12 +39,12 @@ def make_structured_hamiltonian(
     diagonal_floor: float = 0.1,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of a structured Hamiltonian network.
+    """Returns the (init, energies) pair of a structured Hamiltonian network.
 
     Args:
-        diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
+        diagonal_shift: added to the pre-activation of L's diagonal; it sets the initial diagonal.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M⁻¹.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)
@@ -65,17 +65,17 @@ def make_black_box_hamiltonian(
     initial_guess: Guess | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of a black-box Hamiltonian network.
+    """Returns the (init, energies) pair of a black-box Hamiltonian network.
 
-    Hamilton's equations need no momentum solve and hold for any parameters. The functions of (q, qd) need one, which
-    an untrained network may not have, and an activation with curvature in p, since M⁻¹ is that curvature. Absent
-    gravity leaves nothing out.
+    Hamilton's equations need no solution for the momentum and hold for any parameters. Functions of (q, qd) need one,
+    which may not exist for an untrained network. They also need an activation with curvature in p, since M⁻¹ is the
+    second derivative in p. Absent gravity saves nothing.
 
     Args:
-        momentum_scale: typical size of p, which enters the network divided by it.
+        momentum_scale: typical size of p, by which the network's input is divided.
         iterations: Newton steps to p(q, qd), as in `mechanics.hamiltonian.conjugate`.
-        initial_guess: (q, qd) -> p [d] where they start; zero by default.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        initial_guess: (q, qd) -> initial p [d] of these steps; zero by default.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     require_positive(iterations=iterations)
@@ -97,15 +97,15 @@ def make_separable_hamiltonian(
     initial_guess: Guess | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of T(p) + V(q).
+    """Returns the (init, energies) pair of T(p) + V(q).
 
     Without gravity there is no V. Momenta and activation are as for `make_black_box_hamiltonian`.
 
     Args:
-        momentum_scale: typical size of p, which enters the network divided by it.
+        momentum_scale: typical size of p, by which the network's input is divided.
         iterations: Newton steps to p(qd), as in `mechanics.hamiltonian.conjugate`.
-        initial_guess: (q, qd) -> p [d] where they start; zero by default.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        initial_guess: (q, qd) -> initial p [d] of these steps; zero by default.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)

@@ -1,11 +1,11 @@
-"""A field of a phase space by its Helmholtz decomposition: a part that conserves an energy, and one that descends.
+"""Helmholtz decomposition of a field in phase space: a part that conserves an energy, and a gradient.
 
     (qd, pd) = J grad H + grad F,   J grad H = (dH/dp, -dH/dq),   grad F = (dF/dq, dF/dp)
 
 The solenoidal part J grad H has no divergence, the conservative part grad F no rotation. H and F are networks.
-Friction is learned in F where no Rayleigh function of (q, qd) is wanted: that of a damped spring is F = -½ c p². Fields
-that are both, those of harmonic functions, may be in either part. Published with Hamiltonian networks (Greydanus,
-Dzamba and Yosinski 2019), with the same canonical J and the same names.
+F can represent friction without a Rayleigh function of (q, qd): that of a damped spring is F = -½ c p². Fields of
+harmonic functions have neither divergence nor rotation and may be in either part. Published with Hamiltonian networks
+(Greydanus, Dzamba and Yosinski 2019), with the same canonical J and the same names.
 """
 
 from functools import partial
@@ -33,12 +33,12 @@ def make_helmholtz(
     momentum_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of a field of rates; where it has a solenoidal part, H is the energy of its flow.
+    """Returns the (init, energies) pair of a field of rates; H of a solenoidal part is the energy of its flow.
 
     Args:
-        field: which parts there are: "solenoidal" is a Hamiltonian network, "conservative" a gradient.
-        momentum_scale: typical size of p, which enters the networks divided by it.
-        needs, width, depth, activation, dtype: as for all, in `models.model`; friction in the needs decides nothing.
+        field: parts of the field: "solenoidal" is a Hamiltonian network, "conservative" a gradient, or "both".
+        momentum_scale: typical size of p, by which the networks' input is divided.
+        needs, width, depth, activation, dtype: as described in `models.model`; friction in the needs has no effect.
 
     Raises:
         InputError: an unknown field, or numbers that are not positive.

@@ -1,14 +1,14 @@
-"""Any model of the zoo with friction in its joints, of the laws that the needs name.
+"""Adds joint friction to any model, with the laws that the needs name.
 
-How its numbers are parametrised is decided here, for every model. Where all is trained by descent, from parameters x,
+This module decides the parametrisation for all models. Models trained by descent have parameters x with
 
     coefficients = softplus(x) > 0, offsets = x, sigmoid's shift = x, share of load = 1 / (1 + exp(-x)) in (0, 1)
-    Stribeck's velocity and the sigmoid's slope = default exp(x) > 0, and the velocity scale is held,
+    Stribeck's velocity and the sigmoid's slope = default exp(x) > 0
 
-since what an integrator can step over is for the user to say. Where the model is linear in its parameters, coefficients
-are parameters themselves, so that one least-squares problem finds them; then nothing keeps them from being negative
-(which says that the data do not show the law), shapes are held at their defaults (`learning.friction` finds them), and
-load, which multiplies what the energies give, is refused.
+The velocity scale is fixed, since only the user knows which steps the integrator takes. In models that are linear in
+their parameters, the coefficients are parameters themselves, fitted by one least-squares problem. They may become
+negative, which shows that the data do not identify the law. Shapes keep their defaults there (`learning.friction` fits
+them), and load, which multiplies the forces of the energies, is refused.
 """
 
 from typing import Any, NamedTuple
@@ -33,17 +33,17 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, Needs
 
 START = -3.0
-"""Of x where the coefficient is positive: softplus gives 0.05 N m or N m s, as for viscous friction of networks."""
+"""Initial x of positive coefficients: softplus gives 0.05 N m or N m s, as for viscous friction of networks."""
 HELD = "velocity_scale"
 
 
 class FrictionParameters(NamedTuple):
-    """Of the joints; the linear ones apart from the others, and by names, of those that the laws take."""
+    """Parameters of joint friction by name, for the laws in use; linear coefficients apart from the others."""
 
     coefficients: dict[str, Any]
-    """[d] each, as `FrictionCoefficients`, before the parametrisation above."""
+    """Arrays [d] named as in `FrictionCoefficients`, before the parametrisation above."""
     shape: dict[str, Any]
-    """[d] each, of `FrictionShape` and "load"; empty where the model is linear."""
+    """Arrays [d] named as in `FrictionShape`, and "load"; empty for linear models."""
 
 
 def with_joint_friction(
@@ -54,18 +54,19 @@ def with_joint_friction(
     shape: FrictionShape | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The model with friction in its joints; its parameters are {"model": its own, "friction": `FrictionParameters`}.
+    """Returns the model with joint friction, with parameters {"model": its own, "friction": `FrictionParameters`}.
 
     Args:
-        model: of coordinates, of a phase space, or without an energy; made for needs without joint friction.
-        needs: whose `joint_friction` names the laws; `joint_map` leads from coordinates to joints, and
-            `velocity_scale` is that of dry friction. Without laws the model is returned as it is.
-        linear: the model's parameters enter linearly, and shall go on to.
-        shape: where learned shapes start, and what the others are; the velocity scale is that of the needs by default.
+        model: of coordinates, of a phase space, or without an energy; built for needs without joint friction.
+        needs: `joint_friction` names the laws, `joint_map` maps coordinates to joints, and `velocity_scale` is that of
+            dry friction. Without laws the model is returned unchanged.
+        linear: keeps a model linear in its parameters.
+        shape: initial values of learned shapes and fixed values of the others; by default with the velocity scale of
+            the needs.
         dtype: of the parameters of friction.
 
     Raises:
-        InputError: an unknown law, two that are the same friction, load in a linear model, or a shape that is not
+        InputError: an unknown law, two laws for the same friction, load in a linear model, or a shape that is not
             positive.
     """
     laws = needs.joint_friction
@@ -105,7 +106,7 @@ def with_joint_friction(
 def friction_of(
     parameters: FrictionParameters, start: FrictionShape, *, linear: bool = False
 ) -> tuple[FrictionCoefficients, FrictionShape]:
-    """The coefficients and shapes that parameters stand for; arguments as of `with_joint_friction`."""
+    """Returns the coefficients and shapes that parameters stand for; arguments as for `with_joint_friction`."""
     coefficients = {
         name: x if linear or name == "offset" else jax.nn.softplus(x) for name, x in parameters.coefficients.items()
     }

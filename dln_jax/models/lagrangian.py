@@ -3,13 +3,13 @@
     structured:  L = ½ qdᵀ M(q) qd - V(q),  M = L(q) L(q)ᵀ,  diag L = softplus(x + shift) + floor
     black-box:   L = network([features(q), qd / rate_scale])
 
-The structured one (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks") has a network for the Cholesky factor
-of the mass matrix and another for the potential. What the scene lacks is not built: no potential network without
+The structured model (Lutter, Ritter and Peters 2019, "Deep Lagrangian Networks") has a network for the Cholesky factor
+of the mass matrix and another for the potential. Terms that the scene lacks are not built: no potential network without
 gravity, no dissipation without friction, no cos and sin for prismatic joints.
 
-The black-box one (Lutter and Peters 2021, "Combining physics and deep learning to learn continuous-time dynamics
-models", section on black-box models) has no structure. Its mass matrix d²L/dqd² is symmetric and nothing more:
-`metrics.definiteness` reports where it is indefinite.
+The black-box model (Lutter and Peters 2021, "Combining physics and deep learning to learn continuous-time dynamics
+models", section on black-box models) has no structure. Its mass matrix d²L/dqd² is symmetric but may be indefinite:
+`metrics.definiteness` reports where it is.
 """
 
 from collections.abc import Callable
@@ -43,14 +43,14 @@ def make_delan(
     shared_trunk: bool = False,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of a structured DeLaN.
+    """Returns the (init, energies) pair of a structured DeLaN.
 
     Args:
-        diagonal_shift: added to the pre-activation of L's diagonal; where the diagonal starts.
+        diagonal_shift: added to the pre-activation of L's diagonal; it sets the initial diagonal.
         diagonal_floor: smallest diagonal element of L, in the square root of the unit of M; bounds M's eigenvalues
             away from zero.
         shared_trunk: whether factor and potential are outputs of one network instead of two.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)
@@ -69,13 +69,13 @@ def make_black_box_lagrangian(
     rate_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of a black-box Lagrangian; one network, so that absent gravity leaves nothing out.
+    """Returns the (init, energies) pair of a black-box Lagrangian: one network, so absent gravity saves nothing.
 
     The activation needs curvature in qd, since M is the second derivative.
 
     Args:
-        rate_scale: typical size of qd, which enters the network divided by it.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        rate_scale: typical size of qd, by which the network's input is divided.
+        needs, width, depth, activation, dtype: as described in `models.model`.
     """
     require_network(width=width, depth=depth)
     activation = activation_of(activation)
@@ -85,7 +85,7 @@ def make_black_box_lagrangian(
 
 
 def cholesky_factor(entries: Float[Array, "entries"], d: int, *, shift: float, floor: float) -> Matrix:
-    """Lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the rest of the entries below it."""
+    """Lower triangular L [d, d]: diagonal softplus(entries[:d] + shift) + floor, the other entries below it."""
     diagonal = jax.nn.softplus(entries[:d] + shift) + floor
     return jnp.diag(diagonal).at[np.tril_indices(d, -1)].set(entries[d:])
 
@@ -101,7 +101,7 @@ def structured_networks(
     shared_trunk: bool = False,
     factor: str = "cholesky",
 ) -> dict[str, Callable[..., Any] | None]:
-    """By the name of the factor, L(q); and potential and dissipation."""
+    """Returns L(q) under the name of the factor, and the potential and dissipation."""
     d = needs.degrees_of_freedom
     entries = d * (d + 1) // 2
     shared = shared_trunk and needs.gravity
@@ -129,7 +129,7 @@ def structured_networks(
 def one_network(
     needs: Needs, name: str, width: int, depth: int, activation: Activation, sizes: tuple[float, ...]
 ) -> dict[str, Callable[[Vector, Vector], Scalar] | None]:
-    """By `name`, the energy network([features(q), x / sizes]) -> scalar; and the dissipation."""
+    """Returns the energy network([features(q), x / sizes]) -> scalar under `name`, and the dissipation."""
 
     def energy(q: Vector, x: Vector) -> Scalar:
         inputs = jnp.concatenate([joint_features(needs, q), x / jnp.asarray(sizes, x.dtype)])

@@ -1,18 +1,18 @@
-"""Phase-space models behind an autoencoder, which find coordinates in pictures (Greydanus, Dzamba and Yosinski 2019,
+"""Phase-space models behind an autoencoder, which learn coordinates from images (Greydanus, Dzamba and Yosinski 2019,
 "Hamiltonian Neural Networks", section on pixels).
 
     published:  (z_q, z_p) = encoder(x_1, x_2),                    (x_1, x_2)_hat = decoder(z_q, z_p)
     framewise:  z_q = encoder(x_1),  z_p = encoder(x_2) - z_q,     x_1_hat = decoder(z_q),  x_2_hat = decoder(z_q + z_p)
     both:       d(z_q, z_p) / d frame = rates(z_q, z_p)
 
-x_1, x_2 [n / 2] are two frames after each other, of which the second tells the velocity. Framewise, the momentum is the
-change of the coordinate per frame for any parameters, which the published autoencoder has to learn. Both networks have
-four layers, the hidden ones residual:
+x_1, x_2 [n / 2] are consecutive frames; the second one determines the velocity. In the framewise autoencoder the
+momentum is the change of the coordinate per frame for any parameters; the published one has to learn this. Both
+networks have four layers, the hidden ones residual:
 
     h = g(W_1 x + b_1),   h <- h + g(W_k h + b_k) for k = 2, 3,   output = W_4 h + b_4
 
-The rates are those of an energy of one coordinate, or a network's: any `Model`. Latent time is
-counted in frames. Pictures enter and leave as differences from their mean, by their typical size.
+The rates come from an energy of one coordinate, or from a network: any `Model`. The unit of latent time is a frame.
+The networks see images as differences from the mean image, divided by their typical size.
 """
 
 import functools
@@ -41,19 +41,19 @@ from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, require_positive
 
 NEEDS = Needs(joints=("prismatic",))
-"""Of the latent plane: z_q is a number, not an angle, and nothing is applied to it or lost."""
+"""Needs of the latent plane: z_q is a number, not an angle, without applied forces or friction."""
 LAYERS = 4
 Field = Literal["black-box-hnn", "phase-network"]
-"""What moves in the latent plane: by an energy, or by a network for the rates."""
+"""Dynamics of the latent plane: from an energy, or from a network for the rates."""
 
 Latent = Float[Array, "1"]
 
 
 class LatentPhase(NamedTuple):
-    """Pictures, the latent plane, and what moves in it; functions of one sample, which `vmap` takes over many."""
+    """Autoencoder and dynamics of the latent plane, as functions of one sample; use `vmap` for batches."""
 
     encode: Callable[[Array], tuple[Array, Array]]
-    """Two frames [n] -> (z_q, z_p), each [1]."""
+    """Two frames [n] -> (z_q, z_p), both [1]."""
     decode: Callable[[Array, Array], Array]
     """(z_q, z_p) -> two frames [n]."""
     field: Flow | PlainFlow
@@ -61,14 +61,14 @@ class LatentPhase(NamedTuple):
 
 
 class LatentModel(NamedTuple):
-    """Pictures and their latent plane with parameters, as an (init, apply) pair."""
+    """Autoencoder and latent dynamics with parameters, as an (init, apply) pair."""
 
     init: Callable[[Array], Parameters]
     """Random key -> parameters: a dictionary of "encoder", "decoder" and "field"."""
     apply: Callable[[Parameters], LatentPhase]
     """Parameters -> functions."""
     field: Model
-    """What moves in the latent plane; `parameters["field"]` are its parameters."""
+    """Model of the latent dynamics; its parameters are `parameters["field"]`."""
 
 
 def latent_field(
@@ -80,12 +80,12 @@ def latent_field(
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """A black-box energy, or a network for the rates, of one coordinate.
+    """Returns a model of one coordinate: a black-box energy, or a network for the rates.
 
     Args:
         name: black-box-hnn or phase-network.
-        momentum_scale: typical size of z_p where z_q has one of 1: 0.2 where motions take 30 frames a turn.
-        width, depth, activation, dtype: as for all, in `models.model`.
+        momentum_scale: typical size of z_p if that of z_q is 1: 0.2 for motions of 30 frames per period.
+        width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
         InputError: another name, or a size that is not positive.
@@ -93,7 +93,7 @@ def latent_field(
     if name not in get_args(Field):
         raise InputError(f"field is '{name}'; expected one of {', '.join(get_args(Field))}")
     size: dict[str, Any] = {"width": width, "depth": depth, "activation": activation, "dtype": dtype}
-    # Written out, so that no change of their defaults changes a stored model.
+    # Explicit, so that a change of their defaults does not change stored models.
     size["momentum_scale"] = 1.0
     if name == "black-box-hnn":
         model, slowed = make_black_box_hamiltonian(NEEDS, **size), _slowed_energy
@@ -102,7 +102,7 @@ def latent_field(
     return Model(model.init, lambda parameters: slowed(model.energies(parameters), momentum_scale))
 
 
-# The models' states and rates are about one, and their motions take 1 / rate frames for what takes them one. With
+# The models' states and rates are of order 1. Their motions take 1 / rate frames per unit of the models' time. With
 # P = p / rate: (q, p)' = (rate Q'(q, P), rate² P'(q, P)), and of an energy H0(q, P) H = rate² H0.
 
 
@@ -129,18 +129,18 @@ def make_latent_phase(
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
 ) -> LatentModel:
-    """The (init, apply) pair of an autoencoder with a phase model of one coordinate in its latent plane.
+    """Returns the (init, apply) pair of an autoencoder with a phase model of one coordinate in its latent plane.
 
     Args:
-        field: of the latent plane, as by `latent_field`.
+        field: model of the latent plane, from `latent_field`.
         mean: of the two frames, over the training data.
-        framewise: each frame by itself, in place of the published two at once.
+        framewise: encode the frames one by one; the published autoencoder encodes both at once.
         scale: typical difference of a pixel from its mean.
         width: hidden units per layer of both networks.
-        momentum_scale: typical size of z_p where z_q has one of 1; framewise it follows from z_q.
+        momentum_scale: typical size of z_p if that of z_q is 1; framewise it follows from z_q.
 
     Raises:
-        InputError: a width or scale that is not positive, or no two frames.
+        InputError: a width or scale that is not positive, or a mean that is not of two frames.
     """
     require_positive(scale=scale, momentum_scale=momentum_scale)
     require_network(width=width, depth=2)
@@ -148,7 +148,7 @@ def make_latent_phase(
     n = len(mean)
     if n % 2 or n == 0:
         raise InputError(f"mean has {n} pixels; expected those of two frames")
-    # The networks see rows: two of one frame each, or one of both.
+    # The networks see rows: two with a frame each, or one with both frames.
     rows = 2 if framewise else 1
     if framewise:
         mean = (mean[: n // 2] + mean[n // 2 :]) / 2
@@ -189,7 +189,7 @@ def make_latent_phase(
 
 
 def through_components(model: LatentModel, components: Components) -> LatentModel:
-    """A model of pictures, with the same parameters, from one of their coefficients."""
+    """Turns a model of principal components into a model of images with the same parameters."""
 
     def apply(parameters: Parameters) -> LatentPhase:
         inner = model.apply(parameters)

@@ -1,9 +1,9 @@
-"""What every model of the zoo is: parameters, and the energies that they give.
+"""The type of all models: parameters, and the energies that they define.
 
-The keywords that factories share: `width` hidden units in each of `depth` hidden layers, of every network of the model;
-their `activation`, which must be smooth where forces are derivatives of an energy; `dtype` of the parameters. `needs`
-is what the scene needs, and decides features and terms. A width, depth or scale that is not positive is refused, and
-scales that are not one number or one for each coordinate (InputError).
+Factories share these keywords: `width` hidden units in all of the `depth` hidden layers of the model's networks; their
+`activation`, which must be smooth if forces are derivatives of an energy; `dtype` of the parameters. `needs` describes
+the scene and decides features and terms. Factories raise InputError for a width, depth or scale that is not positive,
+and for scales that are neither one number nor one per coordinate.
 """
 
 import inspect
@@ -25,7 +25,7 @@ Parameters = Any
 class Model(NamedTuple):
     """Energies with parameters, as a pair of pure functions.
 
-    `energies` closes the parameters over, so that a trained model and a textbook system are the same type and run
+    `energies` closes over the parameters, so that a trained model and a textbook system are the same type and run
     through the same mechanics: `mechanics.equations.dynamics(model.energies(parameters))`.
     """
 
@@ -38,12 +38,12 @@ class Model(NamedTuple):
 def model_of(
     record: Callable[..., Any], terms: Callable[[], Mapping[str, Callable[..., Any] | None]], d: int, dtype: Any
 ) -> Model:
-    """The model whose energies are `record(**terms)`.
+    """Returns the model whose energies are `record(**terms)`.
 
     Args:
-        record: of functions of one state; what the scene lacks is not handed to it.
-        terms: builds Haiku modules, and gives by name the functions that use them; `None` for what is absent.
-        d: degrees of freedom. Where the parameters are made every argument is (0, 1, ..), where no two bodies meet.
+        record: takes functions of one state as keywords; absent terms are not passed.
+        terms: builds Haiku modules and returns functions that use them, by name; `None` for absent terms.
+        d: degrees of freedom. The parameters are initialised at the arguments (0, 1, ..), where no two bodies coincide.
         dtype: of the parameters.
     """
 

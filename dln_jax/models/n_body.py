@@ -1,16 +1,17 @@
-"""Bodies that act on each other in pairs, by an energy of their distance.
+"""Bodies that interact in pairs, with an energy of their distance.
 
     H = sum_i |p_i|² / (2 m_i) + sum over pairs of U(r_ij),    U(r) = w·f(r / scale) + network(f(r / scale))
 
 q and p hold one body after the other, [bodies * dimension], or with `order="axes"` one axis after the other (x1, x2,
-.., y1, y2, ..), as many published files do. Distances alone enter: translation, rotation and reflection change nothing,
-so that total momentum and angular momentum are conserved for any parameters; nor does
-exchanging bodies that are alike.
+.., y1, y2, ..), as many published files do. H depends on distances only. It is invariant under translation, rotation
+and reflection, so that total momentum and angular momentum are conserved for any parameters; it is also invariant under
+exchange of identical bodies.
 
 The features f are r, 1/r and log r by default: the powers of r of a constant force, of Newton's and Coulomb's law in
-space, and in the plane. Their linear term w·f holds these laws exactly and does not saturate as bodies approach, where
-a bounded activation does; the network learns the rest. To assume none of these laws, leave their features out.
-At r = 0 the energy (with 1/r or log r) and its slope are not finite: nothing is softened.
+space, and in the plane. Their linear term w·f holds these laws exactly and does not saturate as bodies approach, unlike
+a bounded activation; the network learns the rest. To assume none of these laws, leave their features out.
+
+At r = 0 the energy (with 1/r or log r) and its derivative are not finite: there is no softening.
 """
 
 import haiku as hk
@@ -28,7 +29,7 @@ from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Matrix, Scalar, Vector, require_positive
 
 FEATURES = {"distance": lambda r: r, "inverse": lambda r: 1 / r, "logarithm": jnp.log}
-"""Functions of the distance that a pair energy may see."""
+"""Functions of the distance that a pair energy may depend on."""
 
 
 def make_pairwise_hamiltonian(
@@ -44,16 +45,16 @@ def make_pairwise_hamiltonian(
     activation: Activation | str = tanh,
     dtype: DTypeLike = jnp.float32,
 ) -> Model:
-    """The (init, energies) pair of bodies with learned masses and pair energies.
+    """Returns the (init, energies) pair of bodies with learned masses and pair energies.
 
     Args:
         bodies: at least two.
-        dimension: coordinates of each.
+        dimension: coordinates per body.
         order: of the coordinates, body by body (x1, y1, x2, y2) or axis by axis (x1, x2, y1, y2).
-        alike: whether all bodies share one mass and all pairs one energy; otherwise each has its own.
+        alike: whether all bodies share one mass and all pairs one energy; otherwise they have their own.
         features: names from `FEATURES`.
         distance_scale: typical distance in m, by which distances are divided.
-        width, depth, activation, dtype: as for all, in `models.model`.
+        width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
         InputError: fewer than two bodies, numbers that are not positive, an unknown order, or unknown, repeated or no

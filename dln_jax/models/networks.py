@@ -1,4 +1,4 @@
-"""What models are made of: features of the coordinates, networks, typical sizes of what enters them, and friction."""
+"""Parts of models: features of the coordinates, networks, scales of their inputs, and friction."""
 
 import haiku as hk
 import jax
@@ -10,13 +10,13 @@ from dln_jax.nn.activations import Activation
 from dln_jax.types import InputError, Needs, Scalar, Vector, require_positive
 
 Scale = float | tuple[float, ...]
-"""Typical size of a quantity, in its unit: one number, or one for each coordinate."""
+"""Typical size of a quantity, in its unit: one number, or one per coordinate."""
 
 
 def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
-    """cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints as they are.
+    """cos and sin of revolute joints, so that a full turn changes nothing; prismatic joints enter directly.
 
-    A kind of joint that the scene lacks contributes no operation.
+    A kind of joint that the scene lacks adds no operation.
     """
     revolute = np.array([joint == "revolute" for joint in needs.joints])
     angles = q[np.flatnonzero(revolute)]
@@ -27,7 +27,7 @@ def joint_features(needs: Needs, q: Vector) -> Float[Array, " features"]:
 
 
 def unsaturated(x: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
-    """x itself, and NaN for an infinity, which a network that saturates would answer with a plausible number."""
+    """Returns x, with NaN in place of infinities, for which a saturated network would return a plausible number."""
     return x + 0 * x
 
 
@@ -43,7 +43,7 @@ def viscous_dissipation(q: Vector, qd: Vector) -> Scalar:
 
 
 def per_coordinate(needs: Needs, name: str, scale: Scale) -> tuple[float, ...]:
-    """One positive size for each coordinate; InputError otherwise."""
+    """Returns one positive size per coordinate; raises InputError otherwise."""
     d = needs.degrees_of_freedom
     sizes = scale if isinstance(scale, tuple) else (scale,) * d
     if len(sizes) != d:

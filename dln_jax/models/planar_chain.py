@@ -1,15 +1,15 @@
-"""Links that turn in one plane, one behind the other, whose lengths, masses and inertias are unknown.
+"""Chain of links in one plane, with unknown lengths, masses and inertias.
 
-With absolute angles phi, each link's own, measured from where it hangs,
+With the links' absolute angles phi, measured from hanging straight down,
 
     T = ½ sum_ij (A_ij cos(phi_i - phi_j) + B_ij sin(phi_i - phi_j)) phid_i phid_j + ½ sum_i a_i w_i²
     V = -sum_i (g_i cos phi_i + h_i sin phi_i)
     D = sum_i ½ b_i w_i² + c_i v log cosh(w_i / v),   w_i = phid_i - phid_{i-1}, the joint's rate
 
-A is symmetric and B skew. B and h are zero where each centre of mass is on the line to the next joint and the zero of
-the angles is right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
-(`learning.linear.fit_linear`), and are what motions can tell ("base parameters"): g_2 / A_12 of a double pendulum is
-the acceleration of gravity over the first link's length. Friction is that of joints, whatever the coordinates.
+A is symmetric and B skew. B and h vanish if the centres of mass lie on the lines between joints and the zeros of the
+angles are right; the first motor's armature a_1 is part of A_11. All parameters enter linearly
+(`learning.linear.fit_linear`) and are identifiable from motions ("base parameters"): g_2 / A_12 of a double pendulum is
+the acceleration of gravity over the first link's length. Friction acts in the joints, for any coordinates.
 """
 
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from dln_jax.types import InputError, Matrix, Needs, Scalar, Vector, require_pos
 
 
 class PlanarChainParameters(NamedTuple):
-    """Of d links; `None` for what is left out."""
+    """Parameters of d links; `None` for terms that are left out."""
 
     moments: Any
     """A: its lower triangle, row by row [d (d + 1) / 2], kg m²."""
@@ -54,11 +54,11 @@ def make_planar_chain(
     velocity_scale: float = 0.05,
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
-    """The (init, energies) pair of a planar chain; `init` starts without chance: M_ii = 1, and nothing else.
+    """Returns the (init, energies) pair of a planar chain; `init` ignores its key: M_ii = 1, all else is zero.
 
     Args:
-        needs: revolute joints only; with friction each joint has viscous and dry friction.
-        coordinates: q_i is the angle of link i to the one before ("relative") or to the vertical ("absolute").
+        needs: revolute joints only; friction adds viscous and dry friction in all joints.
+        coordinates: q_i is the angle of link i relative to the one before ("relative") or to the vertical ("absolute").
         symmetric: leave out B and h.
         armature: of the motors, or gears, of joints 2, .., d.
         velocity_scale: of dry friction, rad/s, as for `mechanics.friction.joint_dissipation`; it is not fitted.

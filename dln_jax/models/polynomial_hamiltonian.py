@@ -2,10 +2,10 @@
 
     H(q, p) = sum_k c_k phi_k(q, p)
 
-The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacement of each prismatic
-joint, and of cos(n q_j) and sin(n q_j), of degree n, for each revolute joint; without the constant, which no motion
-shows. Hamilton's equations are linear in c, so that rates of states identify it by linear least squares
-(`learning.rates.match_linear`). The count of terms grows with the degree to the power of the coordinates.
+The phi_k are all products, up to a total degree, of powers of p_j, of powers of the displacements of prismatic joints,
+and of cos(n q_j) and sin(n q_j), of degree n, for revolute joints. The constant is left out, because no motion shows
+it. Hamilton's equations are linear in c, so that linear least squares identifies it from rates of states
+(`learning.rates.match_linear`). The number of terms grows with the degree to the power of the number of coordinates.
 """
 
 import itertools
@@ -22,14 +22,14 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, Needs, Scalar, Vector
 
 MOST_TERMS = 5_000
-"""Of the energy; the fit's cost grows with their square."""
+"""Largest number of terms of the energy; the fit's cost grows with its square."""
 
 
 def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLike = jnp.float32) -> Model:
-    """The (init, energies) pair; parameters are the vector c, and start at zero.
+    """Returns the (init, energies) pair; the parameters are the vector c, initially zero.
 
     Args:
-        needs: what the scene needs; the kinds of its joints. Friction would not be linear beside H.
+        needs: of the scene, with the kinds of its joints. Friction is refused, because it would not be linear beside H.
         degree: the largest total degree of a term.
 
     Raises:
@@ -42,7 +42,7 @@ def make_polynomial_hamiltonian(needs: Needs, *, degree: int = 2, dtype: DTypeLi
     if degree < 2:
         raise InputError(f"degree is {degree}; expected at least 2, since kinetic energy is quadratic in p")
     d = needs.degrees_of_freedom
-    # Degrees of the functions of one variable, in the order of its table: 1, then x^n, or cos nx and sin nx.
+    # Degrees of the functions of one variable, in the order of their table: 1, then x^n, or cos nx and sin nx.
     powers = list(range(degree + 1))
     harmonics = [(place + 1) // 2 for place in range(2 * degree + 1)]
     choices = [harmonics if joint == "revolute" else powers for joint in needs.joints] + [powers] * d

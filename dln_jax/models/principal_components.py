@@ -1,4 +1,4 @@
-"""Pictures by their principal components: fewer numbers, with the same distances as far as they keep the variance.
+"""Principal components of images: fewer numbers with nearly the same distances, up to the variance that is lost.
 
 c = B (x - mean),   x_hat = mean + Bᵀ c,   rows of B [C, n]: the eigenvectors of the covariance, largest first
 """
@@ -12,18 +12,18 @@ from dln_jax.types import InputError
 
 
 class Components(NamedTuple):
-    """An orthonormal basis of pictures."""
+    """An orthonormal basis of images."""
 
     mean: Float[np.ndarray, " n"]
     basis: Float[np.ndarray, "C n"]
     scale: float
     """Root mean square of a coefficient."""
     lost: float
-    """Share of the variance that the basis does not keep."""
+    """Share of the variance outside the basis."""
 
 
 def principal_components(pictures: Float[np.ndarray, "*samples n"], count: int) -> Components:
-    """The components with the largest variance.
+    """Returns the components with the largest variance.
 
     Raises:
         InputError: a count outside 1..n.
@@ -39,5 +39,5 @@ def principal_components(pictures: Float[np.ndarray, "*samples n"], count: int) 
 
 
 def compress(components: Components, pictures: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
-    """Coefficients of pictures, float32 where the pictures are."""
+    """Coefficients of images, in the dtype of the images."""
     return ((pictures - components.mean) @ components.basis.T).astype(pictures.dtype)

@@ -1,9 +1,9 @@
-"""A rigid tree and a small network for what it leaves unexplained.
+"""A rigid tree and a small network for the torque that the tree does not explain.
 
     V = Σ_j s_j v_j(q),   D = Σ_j s_j r_j d_j(q, qd),   L = diag(√(s / a)) (lower triangle)(q)
 
-with v, d, L outputs of networks, s_j, r_j, a_j typical sizes of the unexplained torque, of rates and of accelerations.
-The networks start small, so that training starts at the tree.
+v, d, L are outputs of networks; s_j, r_j, a_j are typical sizes of the unexplained torque, of rates and of
+accelerations. The networks' outputs are small initially, so that training starts at the tree.
 """
 
 from collections.abc import Callable
@@ -26,18 +26,18 @@ from dln_jax.types import InputError, Matrix, Needs, ResidualTerm, Scalar, Vecto
 
 TERMS: tuple[ResidualTerm, ...] = get_args(ResidualTerm)
 START = 0.1
-"""Of the last layer's weights, in units of what is usual."""
+"""Initial size of the last layer's weights, relative to the usual one."""
 
 
 class ResidualParameters(NamedTuple):
-    """Of a rigid tree, and of what is added."""
+    """Parameters of a rigid tree and of its residual."""
 
     rigid: Any
     residual: Parameters
 
 
 def make_with_residual(rigid: Model, residual: Model) -> Model:
-    """The sum of a `make_rigid_tree` and a `make_residual`."""
+    """Returns the sum of a `make_rigid_tree` and a `make_residual`."""
 
     def init(key: Array) -> ResidualParameters:
         return ResidualParameters(rigid.init(key), residual.init(key))
@@ -61,13 +61,13 @@ def make_residual(
     acceleration_scale: Scale = 1.0,
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
-    """The networks alone; `energies` gives a `Residual`.
+    """Returns the networks alone; `energies` gives a `Residual`.
 
     Args:
-        terms: those there are, of potential, dissipation and inertia.
-        velocity_scale: 1/s or m/s, to which networks of the dissipation resolve rates near rest.
+        terms: some of potential, dissipation and inertia.
+        velocity_scale: 1/s or m/s, resolution of the dissipation's networks for rates near rest.
         torque_scale, rate_scale, acceleration_scale: s, r and a above, in their units.
-        needs, width, depth, activation, dtype: as for all, in `models.model`.
+        needs, width, depth, activation, dtype: as described in `models.model`.
 
     Raises:
         InputError: no term, an unknown one, or a size that is not positive.
@@ -108,7 +108,7 @@ def make_residual(
 
 
 def frozen(model: Model, rigid: Any) -> Model:
-    """A `make_with_residual` whose rigid part stays: its parameters are those of the residual alone."""
+    """Fixes the rigid part of a `make_with_residual`: the parameters are those of the residual alone."""
     rigid = jax.tree.map(jnp.asarray, rigid)
     return Model(
         lambda key: model.init(key).residual, lambda parameters: model.energies(ResidualParameters(rigid, parameters))

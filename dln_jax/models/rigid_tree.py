@@ -1,11 +1,11 @@
-"""A tree of rigid bodies with known frames, whose inertias, armature and friction are the parameters.
+"""Tree of rigid bodies with known frames; its inertias, armature and friction are the parameters.
 
 Forces are linear in them, so that `learning.linear.fit_linear(..., negligible=1e-12)` identifies all at once.
-Data determine combinations of the eleven numbers a joint only ("base parameters"); a fit gives the shortest solution
-that predicts the same forces, which need not be bodies that exist.
+Data determine only combinations of the eleven numbers per joint ("base parameters"). A fit returns the shortest
+solution that predicts the same forces, which need not be physically consistent.
 
-What friction is not linear in, its shape and what load takes, is given where the model is made:
-`learning.friction.fit_friction` finds it.
+Forces are not linear in the shape of friction and the share of load. They are fixed when the model is built;
+`learning.friction.fit_friction` fits them.
 """
 
 from typing import Any, NamedTuple
@@ -31,20 +31,20 @@ from dln_jax.models.model import Model
 from dln_jax.types import FrictionLaw, InputError
 
 USUAL: tuple[FrictionLaw, ...] = ("viscous", "coulomb", "offset")
-"""What `friction=True` stands for."""
+"""Friction laws of `friction=True`."""
 Number = float | tuple[float, ...]
-"""One for all joints, or one for each."""
+"""One number for all joints, or one per joint."""
 
 
 class RigidTreeParameters(NamedTuple):
-    """Of a tree of d joints: all that forces are linear in. Friction is `None` where there is none."""
+    """All parameters of a tree of d joints that forces are linear in. Absent friction is `None`."""
 
     inertias: Any
     """[d, 10], as `mechanics.trees.PARAMETERS`."""
     armature: Any
     """[d], kg m² or kg."""
     viscous: Any = None
-    """[d], and so on, as in `FrictionCoefficients`."""
+    """[d], like the coefficients below, as in `FrictionCoefficients`."""
     coulomb: Any = None
     offset: Any = None
     stribeck: Any = None
@@ -56,7 +56,7 @@ class RigidTreeParameters(NamedTuple):
 
     @property
     def friction(self) -> FrictionCoefficients:
-        """Those of the joints."""
+        """Friction coefficients of the joints."""
         return FrictionCoefficients(**{name: getattr(self, name) for name in FrictionCoefficients._fields})
 
 
@@ -71,17 +71,17 @@ def make_rigid_tree(
     load: Number = 0.0,
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
-    """A model with the frames of a tree.
+    """Returns a model with the frames of a tree.
 
     Args:
-        tree: whose inertias and armature are where the parameters start; friction starts at zero.
-        friction: laws whose coefficients are parameters too, as in `mechanics.friction.laws`; True: `USUAL`.
+        tree: its inertias and armature are the initial parameters; friction is initially zero.
+        friction: laws whose coefficients are also parameters, as in `mechanics.friction.laws`; True: `USUAL`.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`; they are not fitted.
-        load: share of the load law, 0 <= μ < 1; not fitted, and the forces are not linear in the parameters with it.
+        load: share of the load law, 0 <= μ < 1; not fitted. With it, forces are not linear in the parameters.
         dtype: of the parameters.
 
     Raises:
-        InputError: an unknown law, two that are the same friction, a velocity or slope that is not positive, or a share
+        InputError: an unknown law, two laws for the same friction, a velocity or slope that is not positive, or a share
             outside [0, 1), or without its law.
     """
     laws = USUAL if friction is True else friction or ()

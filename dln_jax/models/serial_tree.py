@@ -1,14 +1,14 @@
-"""An arm whose kinematics is not known: joint frames, inertias, armature and friction are the parameters.
+"""Arm with unknown kinematics: joint frames, inertias, armature and friction are the parameters.
 
-Links hang on each other in a stated order, by default one after the other. Torques do not show all of the six numbers
-of each frame. Without effect on them ("gauges") are
+Links form a tree in a stated order, a serial chain by default. Torques do not identify all six numbers of a frame.
+The directions without effect ("gauges") are
 
-- turning a link's frame about its joint's axis, and sliding it along, with the link's inertia and the next frames taken
-  along: an axis in space is four numbers, the direction of a prismatic joint two;
-- where the base stands and how it is turned about the vertical: of the first axis only its angle with gravity counts;
-- the mirror image of the whole arm, axes as pseudo-vectors: torques cannot tell left hands from right hands.
+- rotating a link's frame about its joint's axis, or sliding it along the axis, together with the link's inertia and the
+  next frames: an axis in space has four numbers, the direction of a prismatic joint two;
+- the position of the base and its angle about the vertical: only the first axis' angle with gravity counts;
+- mirroring the whole arm, with axes as pseudo-vectors: torques cannot distinguish left-handed from right-handed arms.
 
-`learning.kinematics.fit_tree` finds the parameters.
+`learning.kinematics.fit_tree` fits the parameters.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ from dln_jax.types import InputError, Needs, require_positive
 
 
 class SerialTreeParameters(NamedTuple):
-    """Of an arm of d joints; friction is `None` where there is none."""
+    """Parameters of an arm of d joints; absent friction is `None`."""
 
     turns: Any
-    """[d, 3], rotation vectors of the links' frames at q = 0 in those that they hang on, rad."""
+    """[d, 3], rotation vectors of the links' frames relative to the parent link at q = 0, rad."""
     positions: Any
     """[d, 3], m."""
     inertias: Any
-    """[d, 10], as `mechanics.trees.PARAMETERS`; combinations of them that forces show, no bodies that need exist."""
+    """[d, 10], as `mechanics.trees.PARAMETERS`; identifiable combinations, which need not be physically consistent."""
     armature: Any
     """[d], kg m² or kg."""
     viscous: Any
@@ -56,18 +56,18 @@ def make_serial_tree(
     velocity_scale: float = 0.01,
     dtype: DTypeLike = jnp.float64,
 ) -> Model:
-    """A tree of the joints that are needed, in frames that are to be found.
+    """Returns a tree of the needed joints whose frames are parameters.
 
     Args:
-        needs: kinds of joints, gravity and friction (viscous, dry and an offset of each joint).
-        parents: link that each hangs on, -1 for the ground; by default the one before.
+        needs: kinds of joints, gravity and friction (viscous, dry and an offset in every joint).
+        parents: parent link of every link, -1 for the ground; by default the one before.
         acceleration: of gravity, m/s².
         velocity_scale: of dry friction, as for `mechanics.friction.joint_dissipation`; it is not fitted.
         dtype: of the parameters.
 
     Raises:
-        InputError: parents that are not links before, an acceleration or scale that is not positive, or actuation by
-            fewer motors than joints.
+        InputError: parents that are not earlier links, an acceleration or scale that is not positive, or needs with an
+            actuation matrix, a joint map or joint friction laws.
     """
     require_positive(acceleration=acceleration, velocity_scale=velocity_scale)
     if needs.actuation is not None:
@@ -108,7 +108,7 @@ def tree_of(
     parents: Sequence[int] | None = None,
     acceleration: float = 9.81,
 ) -> Tree:
-    """The tree of these parameters, as one of known frames; other arguments as for `make_serial_tree`."""
+    """Returns the tree of these parameters, as one with known frames; other arguments as for `make_serial_tree`."""
     d = needs.degrees_of_freedom
     return Tree(
         parents=tuple(range(-1, d - 1)) if parents is None else tuple(parents),
@@ -136,7 +136,7 @@ def rotation(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def rotation_vector(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """The shortest turn whose `rotation` a matrix is, by its quaternion, which is accurate at half turns too."""
+    """Returns the shortest rotation vector of a `rotation`, by its quaternion, which is accurate at half turns too."""
     trace = np.trace(matrix)
     places = np.array([trace, *np.diag(matrix)])
     largest = int(np.argmax(places))

@@ -1,12 +1,11 @@
-"""Covariances of the torques that the energies of `models.trigonometric_kernel` take, between states.
+"""Covariances between states of the torques from the energies of `models.trigonometric_kernel`.
 
 With v the velocity of a body, a random linear function of the rates, and T = vᵀ A v, A random and symmetric,
 
     tau_i = 2 (P_iᵀ A dv/dt + Q_iᵀ A v),   P_i = dv/dqd_i,   Q_i = d/dt P_i - dv/dq_i
 
-so that covariances of torques are products of two inner products each, <P_i, P_j'> <dv/dt, dv'/dt> and seven more.
-One pass along the joints gives all of them, since each of P, Q, v and dv/dt of a body is linear in those of the one
-before.
+A covariance of torques is a sum of products of two inner products, <P_i, P_j'> <dv/dt, dv'/dt> and seven more. One pass
+along the joints gives all of them, since P, Q, v and dv/dt of a body are linear in those of the body before.
 """
 
 from collections.abc import Callable
@@ -22,11 +21,11 @@ from dln_jax.models.trigonometric_kernel import KernelScales, lift_factor, turn_
 from dln_jax.types import JointKind
 
 PAIRS = 500
-"""Of states that are worked on at a time, in cache."""
+"""Number of pairs of states per block, which fit into cache."""
 
 
 class States(NamedTuple):
-    """[N, d] each; or with axes of pairs after the joints'."""
+    """States, as arrays [N, d]; or with axes of pairs after that of the joints."""
 
     q: Any
     qd: Any
@@ -34,7 +33,7 @@ class States(NamedTuple):
 
 
 class Products(NamedTuple):
-    """Inner products of (P_1 .. P_d, v) and (Q_1 .. Q_d, dv/dt), [d + 1, d + 1, R, M] each; primes are second."""
+    """Inner products of (P_1 .. P_d, v) and (Q_1 .. Q_d, dv/dt), as arrays [d + 1, d + 1, R, M]; primes are second."""
 
     first: Array
     """<P, P'>."""
@@ -49,7 +48,7 @@ class Products(NamedTuple):
 def torque_covariance(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, states: States, others: States
 ) -> Float[Array, "Nd Md"]:
-    """cov(tau(state), tau(other)) of N and M states, the joints of a state next to each other; (N m)²."""
+    """cov(tau(state), tau(other)) of N and M states, with the joints of a state adjacent; (N m)²."""
     N, d = np.shape(states.q)
     states, others = _on_device(states), _on_device(others)
     columns = _joints_first(States(*(each[None] for each in others)))
@@ -65,7 +64,7 @@ def own_covariance(
 ) -> Float[Array, "Nd Nd"]:
     """The `torque_covariance` of states among each other, at half the work.
 
-    Each state is paired with the N/2 that follow it, the first ones after the last; other pairs are these, exchanged.
+    Every state is paired with the N/2 that follow it, cyclically; the other pairs are transposes of these.
     """
     N, d = np.shape(states.q)
     states = _on_device(states)
@@ -93,9 +92,9 @@ def _joints_first(states: States) -> States:
 
 
 def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array, "N K d d"]:
-    """Pairs of N states with `width` others each, from a function of the indices of some rows.
+    """Pairs of N states with `width` others, from a function of the indices of some rows.
 
-    Derivatives compute again what blocks of rows went through, which is more than fits into caches.
+    Derivatives recompute the blocks, because their intermediate values do not fit into caches.
     """
     rows = max(1, min(N, PAIRS // width))
     places = np.arange(-(-N // rows) * rows) % N
@@ -106,14 +105,14 @@ def _by_rows(block: Callable[[Array], Array], N: int, width: int) -> Float[Array
 def _block(
     joints: tuple[JointKind, ...], serial: bool, scales: KernelScales, x: States, y: States
 ) -> Float[Array, "d d R K"]:
-    """Of states x [d, R, 1] with y [d, 1, K] or [d, R, K]; pairs are the last axes, so that loops are long."""
+    """Covariance of states x [d, R, 1] with y [d, 1, K] or [d, R, K]; pairs are the last axes, for long inner loops."""
     d = len(joints)
     pairs = jnp.zeros(np.broadcast_shapes(x.q.shape[1:], y.q.shape[1:]), x.q.dtype)
     turns = _factors(turn_factor, joints, scales.turns, x.q, y.q)
     has_potential = scales.weight is not None and scales.lifts is not None
     lifts = _factors(lift_factor, joints, scales.lifts, x.q, y.q) if has_potential else None
     unit = jnp.eye(d + 1, dtype=pairs.dtype)[:d]
-    # Only the last body has an energy where all rates enter before the first joint.
+    # Without the order of a chain only the last body has an energy, and all rates enter before the first joint.
     of_body = (lambda each: each) if serial else (lambda each: jnp.zeros(d, each.dtype).at[-1].set(each[0]))
 
     def entered(products: Products, joint: Any, rate: Array) -> Products:
@@ -153,12 +152,12 @@ def _block(
 
 def _factors(factor: Any, joints: tuple[JointKind, ...], pairs: Any, x: Array, y: Array) -> Any:
     each = [factor(kind, pairs[joint], x[joint], y[joint]) for joint, kind in enumerate(joints)]
-    # Slopes of a prismatic joint do not vary along both axes.
+    # Derivatives for a prismatic joint do not vary along both axes.
     return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves, x[0] + y[0])[:-1]), *each)
 
 
 def _turned(products: Products, c: Any, joint: Any) -> Products:
-    """Through a joint: v becomes C v, and with it P; Q becomes C Q + dC/dq (qd P - e vᵀ), e the joint's place."""
+    """Passes a joint: v becomes C v, like P; Q becomes C Q + dC/dq (qd P - e vᵀ), with e the joint's unit vector."""
     at, (_, u, _), (_, w, _) = joint
     e = at[:, None, None]
 
@@ -182,7 +181,7 @@ def _kinetic(products: Products) -> Array:
     """cov(tau_i, tau_j') of one body with unit inertia, [d, d, R, M]."""
     PP, PQ, QP, QQ = products
     inner, column, row, corner = _parts(PP), _parts(PQ), _parts(QP), _parts(QQ)
-    # Each product of blocks has its counterpart with v and dv/dt exchanged.
+    # Every product of blocks has its counterpart with v and dv/dt exchanged.
     return 2 * (
         inner.block * corner.end + column.right * row.below
         + column.block * row.end + inner.right * corner.below
@@ -203,7 +202,7 @@ def _parts(X: Array) -> _Parts:
 
 
 def _lifted(heights: Array, h: Any, at: Array) -> Array:
-    """Inner products of (dz/dq_1 .. dz/dq_d, z), z a product of functions of the joints so far."""
+    """Inner products of (dz/dq_1 .. dz/dq_d, z), where z is the product of functions of the joints so far."""
     e = at[:, None, None]
     return (
         h.value * heights

@@ -1,4 +1,4 @@
-"""Lagrangian whose parameters enter linearly: trigonometric polynomials of the joint angles.
+"""Lagrangian that is linear in its parameters: trigonometric polynomials of the joint angles.
 
     L = ½ qdᵀ M(q) qd - V(q),   M_ij(q) = sum_l m_ijl b_l(q),   V(q) = sum_l v_l b_l(q)
 
@@ -9,7 +9,8 @@ The basis b is the product over joints of {1, cos q, .., cos nq, sin q, .., sin 
 
 is linear in all parameters, so that a linear least-squares problem identifies them (`learning.linear`), as Atkeson,
 An and Hollerbach (1986, "Estimation of inertial parameters of manipulator loads and links") did for rigid bodies.
-Rigid links on revolute joints are within the basis: V has degree 1 in each angle, and M degree 1 if the chain is
+
+The basis contains rigid links on revolute joints: V has degree 1 in every angle, and M degree 1 if the chain is
 planar, 2 if not. M is definite only where the data make it so; a singular M gives non-finite accelerations.
 """
 
@@ -27,9 +28,9 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 MOST_COEFFICIENTS = 20_000
-"""Of the mass matrix; the basis grows exponentially with the joints, and the fit with its square."""
+"""Limit on the coefficients of the mass matrix; they grow exponentially with the joints, the fit with their square."""
 SPRING_DEGREE = 2
-"""Least degree of the potential in a prismatic displacement, so that it holds a linear spring."""
+"""Lower bound on the degree of the potential in a prismatic displacement, so that it holds a linear spring."""
 
 
 class TrigonometricParameters(NamedTuple):
@@ -38,7 +39,7 @@ class TrigonometricParameters(NamedTuple):
     mass: Array
     """m: lower triangle of M, row by row, times the basis, [d (d + 1) / 2, B]; kg m², kg m or kg."""
     potential: Array | None
-    """v [B_V - 1], in J: without the constant, which no motion shows."""
+    """v [B_V - 1], in J, without the constant, which no motion shows."""
     friction: Array | None
     """Viscous friction [d], in N m s or N s/m."""
 
@@ -53,18 +54,17 @@ class Basis(NamedTuple):
 
 
 def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype: DTypeLike = jnp.float64) -> Model:
-    """The (init, energies) pair of a trigonometric Lagrangian.
+    """Returns the (init, energies) pair of a trigonometric Lagrangian.
 
-    `init` takes a key as every model does, and starts without chance: M = 1, V = 0, no friction. The number of
-    parameters grows as (2 degree + 1)^d d²/2.
+    `init` ignores its key: M = 1, V = 0, no friction. The number of parameters grows as (2 degree + 1)^d d²/2.
 
     Args:
-        degree: of the basis in each joint, or one for all; >= 0. In a prismatic displacement the potential has at
+        degree: of the basis in every joint, or one for all; >= 0. In a prismatic displacement the potential has at
             least degree 2 (a linear spring).
 
     Raises:
-        InputError: a degree that is no whole number >= 0, another number of degrees than of joints, or a basis that is
-            too large to fit.
+        InputError: a degree that is not a whole number >= 0, a wrong number of degrees, or a basis that is too large to
+            fit.
     """
     d = needs.degrees_of_freedom
     degrees = (degree,) * d if isinstance(degree, int) else tuple(degree)
@@ -99,12 +99,12 @@ def make_trigonometric(needs: Needs, *, degree: int | tuple[int, ...] = 1, dtype
 
 
 def potential_degrees(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> tuple[int, ...]:
-    """Degrees of the potential's basis, which holds a linear spring in each prismatic displacement."""
+    """Degrees of the potential's basis, which holds a linear spring in every prismatic displacement."""
     return tuple(max(n, SPRING_DEGREE) if joint == "prismatic" else n for joint, n in zip(joints, degrees, strict=True))
 
 
 def basis(joints: tuple[JointKind, ...], degrees: tuple[int, ...], q: Vector) -> Basis:
-    """Products over joints of the functions of each, and their partial derivatives."""
+    """Products over joints of the joints' functions, and their partial derivatives."""
     factors = [_joint_basis(*joint) for joint in zip(joints, degrees, q, strict=True)]
     values = [factor.values for factor in factors]
     slopes = [
@@ -131,7 +131,7 @@ def _products(factors: list[Array]) -> Float[Array, " B"]:
 
 
 def _size(joints: tuple[JointKind, ...], degrees: tuple[int, ...]) -> int:
-    """B."""
+    """Returns B."""
     sizes = (2 * n + 1 if joint == "revolute" else n + 1 for joint, n in zip(joints, degrees, strict=True))
     return int(np.prod([*sizes]))
 

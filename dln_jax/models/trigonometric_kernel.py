@@ -1,25 +1,25 @@
-"""Lagrangian of a Gaussian process over trigonometric energies: as many numbers as equations, whatever the joints.
+"""Lagrangian of a Gaussian process over trigonometric energies: as many numbers as equations, for any number of joints.
 
 The basis of `models.trigonometric` has 5^d functions for an arm of d joints that is not planar. Here they are never
-formed. T and V are Gaussian processes, independent of one another, and the model is their mean given torques:
+formed. T and V are independent Gaussian processes, and the model is their mean conditioned on torques:
 
     L(q, qd) = sum over samples n, joints i of weights[n, i] cov(L(q, qd), tau_i(q_n, qd_n, qdd_n))
 
-Covariances are those of a chain of bodies whose frames and inertias are drawn at random. The velocity of body l comes
-from that of the one before, through joint l, and T_l is quadratic in it:
+Covariances are those of a chain of bodies with random frames and inertias. The velocity of body l has the covariance
+k_l,
 
     k_l(x, x') = c_l(q_l, q_l') k_(l-1)(x, x') + rates_l qd_l qd_l',   cov(T, T') = sum over l of inertia_l k_l²
     cov(V, V') = sum over l of weight_l h_1(q_1, q_1') .. h_l(q_l, q_l')
 
-with c_l(q, q') = a_l + b_l cos(q - q') for a revolute joint and a_l + b_l q q' for a prismatic one, h_l alike (squared
-for a prismatic one, so that it holds springs). V is thus of degree 1 in the cosine and sine of each angle and T of
-degree 2, and neither more nor less depends on a joint than in a chain of rigid bodies: T not on the first. Where
-bodies do not follow one another (`serial=False`), all rates enter before the first joint, and there is one body, the
-last: every entry of M is then any function of that degree in every joint.
+with c_l(q, q') = a_l + b_l cos(q - q') for a revolute joint and a_l + b_l q q' for a prismatic one. h_l has the same
+form (squared for a prismatic joint, so that it holds springs). V thus has degree 1 in the cosine and sine of every
+angle and T degree 2. Both depend on the same joints as in a chain of rigid bodies: T not on the first. If the order of
+the bodies is unknown (`serial=False`), all rates enter before the first joint and only the last body has an energy:
+every entry of M is then any function of that degree in every joint.
 
 Torques of a Lagrangian process as a linear problem of N d equations: Giacomuzzo, Carli, Romeres and Dalla Libera, T-RO
 2024 (arXiv 2310.06585), whose kernel is a sum over links of products in all joints up to the link.
-`learning.kernel.fit_kernel` finds the parameters.
+`learning.kernel.fit_kernel` fits the parameters.
 """
 
 import functools
@@ -38,42 +38,42 @@ from dln_jax.models.model import Model
 from dln_jax.types import InputError, JointKind, Needs, Scalar, Vector
 
 CHUNK = 24
-"""Samples that are worked on at a time: so few that C for seven joints keeps to its stack."""
+"""Samples per chunk: so few that C code for seven joints keeps to its stack."""
 
 
 class KernelScales(NamedTuple):
-    """What the covariances of d joints depend on, all positive; K is d, or 1 where bodies do not follow one another."""
+    """Scales of the covariances of d joints, all positive; K is d, or 1 if the bodies are not a serial chain."""
 
     rates: Any
-    """Of a joint's rate in the velocities of bodies [d]; the unit is shared with `inertia`."""
+    """Scales of the joints' rates in the velocities of bodies [d]; the unit is shared with `inertia`."""
     inertia: Any
-    """Of the kinetic energy of each body [K]."""
+    """Scales of the bodies' kinetic energy [K]."""
     turns: Any
     """a and b of c [d, 2]; b is per m² for a prismatic joint."""
     weight: Any
-    """Of the potential of each body [K], in J²; `None` without gravity."""
+    """Scales of the bodies' potential [K], in J²; `None` without gravity."""
     lifts: Any
     """a and b of h [d, 2]."""
 
 
 class KernelParameters(NamedTuple):
-    """Of n samples and d joints."""
+    """Parameters of a model from n samples of d joints."""
 
     q: Any
-    """[n, d], of the samples."""
+    """[n, d], positions of the samples."""
     qd: Any
     """[n, d]."""
     qdd: Any
     """[n, d]."""
     weights: Any
-    """[n, d], of their torques; 1/(N m) or 1/N."""
+    """[n, d], weights of their torques; 1/(N m) or 1/N."""
     scales: KernelScales
     friction: Any
-    """Viscous friction of each coordinate [d], in N m s or N s/m."""
+    """Viscous friction of the coordinates [d], in N m s or N s/m."""
 
 
 class Factor(NamedTuple):
-    """c(x, y), and its slopes; arrays that broadcast."""
+    """c(x, y) and its derivatives, as arrays that broadcast."""
 
     value: Array
     by_x: Array
@@ -82,7 +82,7 @@ class Factor(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """Inner products with the velocity of a body, [n] each: what it has in common with those of the samples."""
+    """Inner products [n] of the velocity of a body with quantities of the samples."""
 
     velocity: Array
     """With the sample's velocity v."""
@@ -97,14 +97,14 @@ class Shared(NamedTuple):
 def make_trigonometric_kernel(
     needs: Needs, *, samples: int = 600, serial: bool = True, dtype: DTypeLike = jnp.float64
 ) -> Model:
-    """The (init, energies) pair; `init` draws samples and weights at random, which is no model of anything.
+    """Returns the (init, energies) pair; `init` draws random samples and weights, which only have the right shapes.
 
-    One inverse model takes some n d operations, and one mass matrix n d³.
+    One inverse model takes about n d operations, and one mass matrix n d³.
 
     Args:
-        needs: kinds of joints, gravity, and viscous friction of each coordinate.
-        samples: n, of the data, whose torques make the energy; the fit takes n³ d³ operations.
-        serial: each joint carries the next, as in an arm without branches; otherwise nothing is assumed of the order.
+        needs: kinds of joints, gravity, and viscous friction of the coordinates.
+        samples: n, number of samples whose torques define the energy; the fit takes n³ d³ operations.
+        serial: whether joints form a serial chain; otherwise nothing is assumed about their order.
         dtype: of the parameters; weights have either sign and cancel, so that f32 costs accuracy.
 
     Raises:
@@ -173,7 +173,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
     potential = _potential(parameters, joints, serial)
     return RecursiveSystem(
         mass_matrix=mass_matrix,
-        # Without M, which would take d times as long.
+        # By derivatives of T rather than by M, which would take d times as long.
         forces=functools.partial(
             lagrangian.inverse_dynamics, lambda q, qd: minus_potential(kinetic(q, qd), potential, q)
         ),
@@ -184,7 +184,7 @@ def _system(parameters: KernelParameters, joints: tuple[JointKind, ...], serial:
 
 
 def _shared(parameters: KernelParameters, joints: tuple[JointKind, ...], serial: bool, q: Vector, qd: Vector) -> Shared:
-    """Of each of K bodies with an inertia, [K, n] each; linear in qd."""
+    """Inner products for all K bodies with an inertia, as arrays [K, n]; linear in qd."""
     scales = parameters.scales
     moved, accelerated, weights = (each.T for each in (parameters.qd, parameters.qdd, parameters.weights))
     rates = (scales.rates * qd)[:, None]
@@ -234,12 +234,12 @@ def _potential(
 
 
 def _summed(function: Callable[[KernelParameters], Array], parameters: KernelParameters) -> Array:
-    """A sum over samples, of so many at a time that a batch of states fits into memory with its derivatives."""
+    """Sums over chunks of samples, small enough that a batch of states and its derivatives fit into memory."""
     samples = (parameters.q, parameters.qd, parameters.qdd, parameters.weights)
     n, d = parameters.q.shape
     if n <= CHUNK:
         return function(parameters)
-    # What fills up the last chunk has no weight.
+    # The padding of the last chunk has weight zero.
     pieces = [jnp.pad(each, ((0, -n % CHUNK), (0, 0))).reshape(-1, CHUNK, d) for each in samples]
 
     def of(q: Array, qd: Array, qdd: Array, weights: Array) -> Array:

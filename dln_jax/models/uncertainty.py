@@ -1,13 +1,13 @@
-"""What a fitted model does not know: a standard deviation of its torque at any state, and whether a state is outside.
+"""Uncertainty of a fitted model: the standard deviation of its torque at any state, and a test of the distribution.
 
-Parameters theta that were fitted are uncertain by Cov(theta) = F Fᵀ, and to first order (exactly, where forces are
-linear in them) the torque of joint i at a state is uncertain by
+Fitted parameters theta have the covariance Cov(theta) = F Fᵀ. To first order (exactly, if forces are linear in them)
+the torque of joint i at a state has the standard deviation
 
     sd_i² = noise_i² + inflation_i |phi_i F|²,   phi_i = d tau_i / d theta
 
 (MacKay 1992, "A practical Bayesian framework for backpropagation networks"; Immer et al. 2021, "Improving predictions
-of Bayesian neural nets via local linearization"). `learning.uncertainty` finds all of it from data. Everything is for
-one state.
+of Bayesian neural nets via local linearization"). `learning.uncertainty` estimates all of it from data. All functions
+are for one state.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,50 +25,51 @@ from dln_jax.models.model import Model, Parameters
 from dln_jax.types import Vector
 
 UNDETERMINED = 1e-3
-"""Share of |phi|, in scaled parameters, in directions that data never showed, above which a state is outside."""
+"""Largest share of |phi|, in scaled parameters, in directions that the data never showed; a state above it is out of
+distribution."""
 
 
 class Domain(NamedTuple):
-    """Where the data were; d joints."""
+    """Range of the data; d joints."""
 
     limit: Any
-    """[d], |phi F| that the data stay below, N m or N."""
+    """[d], bound on |phi F| over the data, N m or N."""
     scale: Any
-    """[P], size of each column of Phi over the data; 1 for one that they never showed."""
+    """[P], sizes of the columns of Phi over the data; 1 for columns that are zero there."""
     undetermined: Any
-    """[P, P - rank], orthonormal directions of scaled parameters that the data leave undetermined; there are none of a
-    network, whose prior determines them."""
+    """[P, P - rank], orthonormal directions of scaled parameters that the data leave undetermined; empty for networks,
+    whose prior determines them."""
     centre: Any
     """[3 d], middle of the range of (q, qd, qdd)."""
     reach: Any
-    """[3 d], how far from the middle the data come."""
+    """[3 d], distances from the middle that the data reach."""
     harmless: Any
-    """[d], |phi F| below which it does not matter that a state leaves the range of the data, N m or N. Zeros for
-    networks, whose covariance alone cannot be trusted there."""
+    """[d], |phi F| in N m or N below which a state may leave the range of the data. Zeros for networks, whose
+    covariance alone cannot be trusted there."""
 
 
 class Uncertainty(NamedTuple):
-    """All that is stored of what a model does not know."""
+    """Stored uncertainty of a model."""
 
     factor: Any
     """F [P, K]."""
     noise: Any
-    """[d], standard deviation of what no parameters explain, N m or N."""
+    """[d], standard deviation that no parameters explain, N m or N."""
     inflation: Any
-    """[d], of the parameters' share; 1 where errors are independent."""
+    """[d], factor on the variance due to parameters; 1 if errors are independent."""
     domain: Domain
 
 
 class Scores(NamedTuple):
-    """How far outside a state is, each 1 at its threshold."""
+    """Scores of a state; a state with a score above 1 is out of distribution."""
 
     parameters: Array
-    """[], standard deviation by the parameters, over the data's; the joint's where that is largest."""
+    """[], standard deviation due to parameters, relative to that on the data; the maximum over joints."""
     undetermined: Array
-    """[], share of Phi in directions that the data leave undetermined, over `UNDETERMINED`."""
+    """[], share of Phi in directions that the data leave undetermined, relative to `UNDETERMINED`."""
     distance: Array
-    """[], from the middle of the range of (q, qd, qdd), over its reach; the coordinate's where that is largest. 0 where
-    every joint's deviation by the parameters is below `Domain.harmless`."""
+    """[], distance from the middle of the range of (q, qd, qdd), relative to its reach; the maximum over coordinates. 0
+    if the deviation due to parameters is below `Domain.harmless` in all joints."""
 
 
 def predictive(
@@ -77,11 +78,11 @@ def predictive(
     """(q, qd, qdd) -> standard deviation of the torque [d] at one state, N m or N.
 
     Args:
-        model: that was fitted.
-        parameters: as they were found.
+        model: the fitted model.
+        parameters: fitted parameters.
         factor: F [P, K] of their covariance, in the order of `ravel_pytree(parameters)`.
         noise: standard deviation of one measurement [d]; zero for that of the model's own torque.
-        inflation: of the parameters' share, [d].
+        inflation: factor on the variance due to parameters, [d].
     """
 
     d = np.size(noise) if np.ndim(noise) else None
@@ -104,7 +105,7 @@ def _deviation(rows: Float[Array, "d P"], factor: Any, noise: Any, inflation: An
 
 
 def scores(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Scores]:
-    """(q, qd, qdd) -> how far outside the data a state is, in three ways, each 1 at its threshold."""
+    """(q, qd, qdd) -> the three scores of a state, 1 at their thresholds."""
 
     def of_state(q: Any, qd: Any, qdd: Any) -> Scores:
         state = vectors(len(uncertainty.noise), q=q, qd=qd, qdd=qdd)
@@ -135,7 +136,7 @@ def highest(of_state: Scores) -> Array:
 
 
 def outside(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> Callable[[Any, Any, Any], Array]:
-    """(q, qd, qdd) -> whether a state is outside the data: one of its `scores` is above 1, or not a number."""
+    """(q, qd, qdd) -> whether a state is out of distribution: one of its `scores` is above 1, or NaN."""
     of_state = scores(model, parameters, uncertainty)
 
     def is_outside(q: Any, qd: Any, qdd: Any) -> Array:
@@ -145,12 +146,12 @@ def outside(model: Model, parameters: Parameters, uncertainty: Uncertainty) -> C
 
 
 def parameter_variance(rows: Float[Array, "d P"], factor: Any) -> Vector:
-    """|phi F|² of each joint [d], (N m)² or N²."""
+    """|phi F|² of the joints [d], (N m)² or N²."""
     return jnp.sum((rows @ jnp.asarray(factor, rows.dtype)) ** 2, axis=1)
 
 
 def undetermined_share(rows: Float[Array, "d P"], domain: Domain) -> Vector:
-    """Of |phi|² of each joint, in scaled parameters, what is in undetermined directions [d], 0 to 1."""
+    """Share of the joints' |phi|², in scaled parameters, in undetermined directions [d], 0 to 1."""
     directions = jnp.asarray(domain.undetermined, rows.dtype)
     if directions.shape[1] == 0:
         return jnp.zeros(rows.shape[0], rows.dtype)

@@ -1,4 +1,4 @@
-"""Networks: functions of x that know no physics."""
+"""Networks: functions of x without physics."""
 
 from dln_jax.nn import differential_mlp, ensembles, haiku_layers
 from dln_jax.nn.activations import Activation, activation

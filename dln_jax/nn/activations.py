@@ -1,12 +1,12 @@
-"""Activations g with their derivatives g' and g'', each written from its formula.
+"""Activations g with their derivatives g' and g'', all written from their formulas.
 
 Differentiating a formula for g twice loses digits: tanh'' near 0 and every derivative in saturation are differences
 of nearly equal numbers. The formulas here keep relative accuracy in float32 and float64 from 1e-12 to 1e4: no
-difference of nearly equal numbers, no overflow on the way, no branch that is NaN where it is not taken. Where a
-derivative itself falls below the smallest normal number, it is 0.
+difference of nearly equal numbers, no intermediate overflow, no NaN in a branch that is not taken. A derivative below
+the smallest normal number is 0.
 
 Plain autodiff uses the same formulas: the derivative of `value` is `first`, that of `first` is `second`, and that of
-`second` is a formula too, so that a loss on Hessians trains. All functions are elementwise, keep shape and dtype, and
+`second` is also a formula, so that a loss on Hessians trains. All functions are elementwise, keep shape and dtype, and
 work under jit, vmap, and forward and reverse differentiation.
 """
 
@@ -38,7 +38,7 @@ class Activation(NamedTuple):
 
 
 def _differentiates_to(function: Elementwise, derivative: Elementwise) -> Elementwise:
-    """`function`, with autodiff told to use the formula `derivative`."""
+    """Returns `function` with the formula `derivative` for autodiff."""
     wrapped = jax.custom_jvp(function)
     wrapped.defjvp(lambda primals, tangents: (wrapped(*primals), derivative(*primals) * tangents[0]))
     return wrapped
@@ -97,7 +97,7 @@ def _step(x: Array) -> Array:
 
 
 relu = _make("relu", lambda x: jnp.maximum(x, 0), _step, jnp.zeros_like, jnp.zeros_like)
-"""max(x, 0). Its second derivative is 0 wherever it exists, and given as 0 at the kink."""
+"""max(x, 0). Its second derivative is 0 wherever it exists, and defined as 0 at the kink."""
 softplus = _make(
     "softplus",
     lambda x: jnp.maximum(x, 0) + jnp.log1p(jnp.exp(-jnp.abs(x))),
@@ -124,7 +124,7 @@ gelu = _make(
     lambda x: _normal_density(x) * (2 - x * x),
     lambda x: x * (_normal_density(x) * (x * x - 4)),
 )
-"""x P(X <= x) for a standard normal X, by erf and not by its tanh approximation."""
+"""x P(X <= x) for a standard normal X, by erf rather than its tanh approximation."""
 linear = _make("linear", lambda x: x, jnp.ones_like, jnp.zeros_like, jnp.zeros_like)
 quadratic = _make("quadratic", lambda x: x * x, lambda x: 2 * x, lambda x: jnp.full_like(x, 2), jnp.zeros_like)
 cubic = _make("cubic", lambda x: x * x * x, lambda x: 3 * x * x, lambda x: 6 * x, lambda x: jnp.full_like(x, 6))
@@ -132,11 +132,11 @@ cubic = _make("cubic", lambda x: x * x * x, lambda x: 3 * x * x, lambda x: 6 * x
 ALL: dict[str, Activation] = {
     each.name: each for each in (relu, softplus, tanh, cos, sin, silu, gelu, linear, quadratic, cubic)
 }
-"""Every activation by name."""
+"""All activations by name."""
 
 
 def activation(name: str | Activation) -> Activation:
-    """The activation of that name, for names that come from a command line or a file; or the activation itself.
+    """Returns the activation of that name, for example from a command line or a file; or the activation itself.
 
     Raises InputError for an unknown name.
     """

@@ -13,11 +13,11 @@ and the derivatives with respect to x follow from g' and g'' of the activation:
 - or second derivatives go forward for all outputs at once, S_l = d²a_l/dx²: S_1 = 0 and
   S_(l+1) = (g''(a_l) J_l J_l + g'(a_l) S_l) W_(l+1), for the n (n + 1) / 2 different pairs of inputs.
 
-Backward costs one pass per output, forward one per input or pair of inputs: `cheaper_jacobian` and `cheaper_hessian`
-count floating point operations, and the shapes decide before anything is compiled.
+A backward sweep costs one pass per output, a forward sweep one per input or pair of inputs. `cheaper_jacobian` and
+`cheaper_hessian` count floating point operations, and the shapes decide before anything is compiled.
 
-One state, no batch axis: `jax.vmap` over x. In the code n inputs come first in J [n, width], so that a batch of
-Jacobians meets a weight in one matrix product.
+One state, no batch axis: `jax.vmap` over x. In the code the n inputs are the first axis of J [n, width], so that a
+batch of Jacobians and a weight form one matrix product.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from dln_jax.nn.activations import Activation
 from dln_jax.types import InputError
 
 Layers = tuple[tuple[Array, Array], ...]
-"""(weight [in, out], bias [out]) of each layer, hidden ones first and the linear output layer last."""
+"""(weight [in, out], bias [out]) of the layers, hidden ones first and the linear output layer last."""
 Sweep = Literal["backward", "forward"]
 
 GLOROT: Initializer = glorot_uniform()
@@ -49,10 +49,11 @@ def init(
     bias: Initializer = zeros,
     dtype: jax.typing.DTypeLike = float,
 ) -> Layers:
-    """Random parameters of a network with `sizes` (n, width, ..., m).
+    """Returns random parameters of a network with `sizes` (n, width, ..., m).
 
     `weight` and `bias` are schemes (key, shape, dtype) -> array, as in `jax.nn.initializers`: Glorot's uniform scheme
     (Glorot and Bengio 2010) and zeros by default. `dtype` defaults to JAX's default float.
+
     Raises InputError if `sizes` are not at least two positive numbers.
     """
     shapes = layer_shapes(sizes)
@@ -64,7 +65,7 @@ def init(
 
 
 def layer_shapes(sizes: Sequence[int]) -> list[tuple[int, int]]:
-    """(in, out) of each weight of a network with `sizes` (n, width, ..., m); InputError if they make no network."""
+    """(in, out) of the weights of a network with `sizes` (n, width, ..., m); raises InputError for invalid sizes."""
     if len(sizes) < 2 or min(sizes) < 1:
         raise InputError(f"sizes are {tuple(sizes)}; expected (inputs, hidden widths ..., outputs), all positive")
     return list(pairwise(sizes))
@@ -90,7 +91,7 @@ def value_and_jacobian(
 def value_and_pull_back(
     layers: Layers, x: Array, *, activation: Activation
 ) -> tuple[Float[Array, "m"], Callable[[Array], Float[Array, "n"]]]:
-    """y [m] at x [n], and w [m] -> (dy/dx)ᵀ w [n], which goes backward once for all outputs. Errors as of `value`."""
+    """y [m] at x [n], and w [m] -> (dy/dx)ᵀ w [n] by one backward sweep for all outputs. Raises as `value`."""
     _, preactivations, y = _forward(layers, x, activation)
     return y, lambda w: _gradient(layers, preactivations, layers[-1][0] @ w, activation)
 
@@ -106,7 +107,7 @@ def value_jacobian_and_hessian(
 
 
 def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
-    """Which sweep takes fewer operations to the Jacobian of a network with `sizes` (n, width, ..., m)."""
+    """Sweep with the fewer operations for the Jacobian of a network with `sizes` (n, width, ..., m)."""
     inputs, *widths, outputs = sizes
     if not widths:
         return "forward"
@@ -117,10 +118,10 @@ def cheaper_jacobian(sizes: Sequence[int]) -> Sweep:
 
 
 def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
-    """Which sweep takes fewer operations to Jacobian and Hessian, the J_l that both need left out.
+    """Sweep with the fewer operations for Jacobian and Hessian, without the J_l that both sweeps need.
 
-    Multiply-adds. Backward, per output: the adjoint, then n columns to scale and n² products of a width, per layer.
-    Forward, per pair of inputs: the weights after the first, then three operations per hidden unit.
+    Counted in multiply-adds. Backward, per output: the adjoint, then per layer n columns to scale and n² products of a
+    width. Forward, per pair of inputs: the weights after the first, then three operations per hidden unit.
     """
     inputs, *widths, outputs = sizes
     if not widths:
@@ -133,7 +134,7 @@ def cheaper_hessian(sizes: Sequence[int]) -> Sweep:
 
 
 def _check(layers: Layers, x: Array) -> tuple[int, ...]:
-    """Sizes (n, width, ..., m); InputError if the layers do not chain or x is not one state of n numbers."""
+    """Returns sizes (n, width, ..., m); InputError if the layers do not chain or x is not one state of n numbers."""
     shapes = [(weight.shape, bias.shape) for weight, bias in layers]
     chained = bool(shapes) and all(len(weight) == 2 and bias == weight[1:] for weight, bias in shapes)
     if not chained or any(left[1] != right[0] for (left, _), (right, _) in pairwise(shapes)):
@@ -148,7 +149,7 @@ def _check(layers: Layers, x: Array) -> tuple[int, ...]:
 
 
 def _forward(layers: Layers, x: Array, activation: Activation) -> tuple[tuple[int, ...], list[Array], Array]:
-    """Sizes, preactivations a_l of the hidden layers, and y."""
+    """Returns sizes, preactivations a_l of the hidden layers, and y."""
     sizes = _check(layers, x)
     preactivations, hidden = [], x
     for weight, bias in layers[:-1]:
@@ -159,7 +160,7 @@ def _forward(layers: Layers, x: Array, activation: Activation) -> tuple[tuple[in
 
 
 def _input_jacobians(layers: Layers, preactivations: list[Array], activation: Activation) -> list[Array]:
-    """J_l [n, width] for as many layers as given, hidden ones and then the output."""
+    """J_l [n, width] for the layers of these preactivations, hidden ones and then the output."""
     jacobians = [layers[0][0]]
     for preactivation, (weight, _) in zip(preactivations, layers[1:], strict=False):
         jacobians.append((activation.first(preactivation) * jacobians[-1]) @ weight)
@@ -167,8 +168,8 @@ def _input_jacobians(layers: Layers, preactivations: list[Array], activation: Ac
 
 
 def _each_output(function, weight: Array):
-    """function(weight[:, k]) for each output k, stacked. One output goes without the axis: XLA's sums are slow over
-    an axis of length 1."""
+    """function(weight[:, k]) for all outputs k, stacked. A single output is computed without the axis, because XLA's
+    sums over an axis of length 1 are slow."""
     if weight.shape[1] == 1:
         return jax.tree.map(lambda leaf: leaf[None], function(weight[:, 0]))
     return jax.vmap(function, in_axes=1)(weight)
@@ -190,7 +191,7 @@ def _congruence(jacobian: Float[Array, "n width"], curvature: Float[Array, "widt
 @_congruence.defjvp
 def _congruence_jvp(primals, tangents):
     """d(J c Jᵀ) = M + Mᵀ with M = (dJ c + J dc / 2) Jᵀ: one small product per state, and one in reverse, where the
-    rules for the factors would make two. A sixth of a training step (batch 512, width 128)."""
+    rules for the factors take two. This saves a sixth of a training step (batch 512, width 128)."""
     jacobian, curvature = primals
     jacobian_dot, curvature_dot = tangents
     half = (jacobian_dot * curvature + jacobian * (curvature_dot / 2)) @ jacobian.T
@@ -200,7 +201,7 @@ def _congruence_jvp(primals, tangents):
 def _derivatives_by_two_sweeps(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, backward for each output."""
+    """Jacobian and Hessian, by a backward sweep per output."""
     jacobians = _input_jacobians(layers[:-1], preactivations, activation)
     inputs, width = jacobians[0].shape
     # J_1 = W_1 is the same for all states of a batch: with its products formed first, the term is one matrix product.
@@ -223,7 +224,7 @@ def _derivatives_by_two_sweeps(
 def _derivatives_by_forward_sweep(
     layers: Layers, preactivations: list[Array], activation: Activation
 ) -> tuple[Float[Array, "m n"], Float[Array, "m n n"]]:
-    """Jacobian and Hessian, forward for all outputs."""
+    """Jacobian and Hessian, by one forward sweep for all outputs."""
     jacobians = _input_jacobians(layers, preactivations, activation)
     inputs = jacobians[0].shape[0]
     rows, columns = np.triu_indices(inputs)

@@ -1,4 +1,4 @@
-"""Ensembles of networks: one set of layers with a leading axis of members, and no loop over them."""
+"""Ensembles of networks: layers with a leading axis of members, without a loop over them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,17 +15,19 @@ from dln_jax.types import InputError
 
 
 def init(key: PRNGKeyArray | Array, sizes, *, members: int, **schemes) -> Layers:
-    """`differential_mlp.init` for each of K = `members` keys: weights [K, in, out], biases [K, out]."""
+    """`differential_mlp.init` for K = `members` keys: weights [K, in, out], biases [K, out]."""
     return jax.vmap(partial(differential_mlp.init, sizes=sizes, **schemes))(jax.random.split(key, members))
 
 
 def mean_and_spread(network: Callable[[Layers, Array], Any], layers: Layers, x: Array) -> tuple[Any, Any]:
-    """Mean and spread over K members at x [n] of all that `network(layers, x)` returns.
+    """Mean and spread over K members at x [n] of all outputs of `network(layers, x)`.
 
     The spread is the sample standard deviation (the sum of squares over K - 1).
+
     `network` is a function of one member, for instance
-    `partial(differential_mlp.value_jacobian_and_hessian, activation=tanh)`, which gives the statistics of value,
-    Jacobian and Hessian. `layers` has the members on the leading axis of each array, as from `init`.
+    `partial(differential_mlp.value_jacobian_and_hessian, activation=tanh)` for the statistics of value, Jacobian and
+    Hessian. The arrays of `layers` have a leading axis of members, as from `init`.
+
     Raises InputError for fewer than two members, which have no spread.
     """
     members = layers[0][0].shape[0]

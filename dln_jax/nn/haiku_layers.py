@@ -18,15 +18,16 @@ def layers(
     bias: Initializer = zeros,
     dtype: jax.typing.DTypeLike = float,
 ) -> Layers:
-    """The layers of a network with `sizes` (n, width, ..., m), created or fetched by `hk.get_parameter`.
+    """Creates or fetches, by `hk.get_parameter`, the layers of a network with `sizes` (n, width, ..., m).
 
     Inside a transformed function: `value_and_jacobian(layers((2, 64, 1), name="potential"), x, activation=tanh)`.
-    Parameters are called `name/layer_0`, `name/layer_1`, ..., each with `w` [in, out] and `b` [out], like `hk.Linear`.
+    Parameters are called `name/layer_0`, `name/layer_1`, ..., with `w` [in, out] and `b` [out], like `hk.Linear`.
     A second call with the same name makes a second network (`name_1`), as Haiku modules do: to use one network
     twice, call once and keep the result. Schemes and dtype are those of `differential_mlp.init`.
-    Raises InputError if `sizes` make no network, and ValueError (Haiku's) outside `hk.transform`.
+
+    Raises InputError for invalid `sizes`, and ValueError (Haiku's) outside `hk.transform`.
     """
-    dtype = jnp.zeros((), dtype).dtype  # Haiku's own default is float32 whatever JAX's default float is.
+    dtype = jnp.zeros((), dtype).dtype  # Haiku's own default is float32, whatever JAX's default float is.
 
     def parameter(kind: str, shape: tuple[int, ...], scheme: Initializer) -> jax.Array:
         return hk.get_parameter(kind, shape, dtype, init=lambda *wanted: scheme(hk.next_rng_key(), *wanted))

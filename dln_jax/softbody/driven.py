@@ -1,7 +1,7 @@
-"""Motions that are driven from outside: actuation of muscles, and held vertices that are led along a path.
+"""Driven motions: actuated muscles, and held vertices that follow a path.
 
-A path is followed exactly: in each step a held vertex has the velocity (p(t + dt) - p(t)) / dt. With the one of p at t,
-a rotation would spiral outwards.
+A path is followed exactly: in every step a held vertex has the velocity (p(t + dt) - p(t)) / dt. With the path's
+velocity at t, a rotation would spiral outwards.
 """
 
 import functools
@@ -18,42 +18,43 @@ from dln_jax.softbody.verdict import Info
 
 
 class Example(NamedTuple):
-    """A scene, how it begins, and what drives it."""
+    """A scene with its initial velocities and its drive."""
 
     scene: SoftScene
     dt: float
-    """Time step that suits it, in s."""
+    """Suitable time step, in s."""
     seconds: float
-    """Length of a motion that shows it, in s."""
+    """Duration of an illustrative motion, in s."""
     v: Any = 0.0
-    """Velocities at the start in m/s, [n, dim] or one for all; positions are the rest shape's."""
+    """Initial velocities in m/s, [n, dim] or one for all; initial positions are the rest shape's."""
     ground: float | None = None
-    """Rise of the ground over its run; it passes through the origin. `None` where there is none."""
+    """Slope of the ground, rise over run; it passes through the origin. `None` without ground."""
     control: Callable[[np.ndarray], np.ndarray] | None = None
     """Times [T] in s -> actuation [T, k]."""
     held_path: Callable[[np.ndarray], np.ndarray] | None = None
-    """Times [T] in s -> where held vertices are [T, k, dim]; without it they stay."""
+    """Times [T] in s -> positions of the held vertices [T, k, dim]; by default they stay."""
     muscles: np.ndarray | None = None
-    """Pairs of vertices [k, 2], for pictures."""
+    """Pairs of vertices [k, 2], for images."""
     moments: tuple[float, ...] = (0.0,)
-    """Times in s worth a picture."""
+    """Times in s for images."""
 
 
 class Drive(NamedTuple):
-    """What drives one step; leading axis for several."""
+    """Inputs of one step; several steps add a leading axis."""
 
     t: Float[Array, "*steps"]
-    """At the end of the step, in s."""
+    """Time at the end of the step, in s."""
     control: Float[Array, "*steps k"] | None
-    """Actuation there."""
+    """Actuation at the end of the step."""
     held_velocity: Float[Array, "*steps k dim"] | None
-    """In m/s."""
+    """Velocities of the held vertices, in m/s."""
 
 
 def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
-    """What drives so many steps of dt in s, from step number `first` on.
+    """Returns the inputs of a number of steps of dt in s, from step number `first` on.
 
-    Held vertices get the velocities that take them from each point of their path to the next: they stay on it exactly.
+    Held vertices get the velocities that take them from one point of their path to the next, so that they stay on it
+    exactly.
     """
     t = dt * np.arange(first, first + steps + 1)
     dtype = example.scene.params.rest.dtype
@@ -63,7 +64,7 @@ def drive(example: Example, dt: float, steps: int, *, first: int = 0) -> Drive:
 
 
 def driven_step(example: Example, dt: float, integrator: Integrator = BACKWARD_EULER) -> Stepper:
-    """(init, step) of an example: init() is its start, and step(params, state, Drive) -> (state, Info)."""
+    """(init, step) of an example: init() is its initial state, and step(params, state, Drive) -> (state, Info)."""
     init, step = make_step(example.scene, dt, integrator)
 
     def advance(params: Params, state: State, driven: Drive) -> tuple[State, Info]:

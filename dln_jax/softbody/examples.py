@@ -1,6 +1,6 @@
-"""Examples: bodies and what is done to them, ready to be stepped.
+"""Examples: bodies with their loads, ready to be stepped.
 
-| scene | body | what happens |
+| scene | body | motion |
 |---|---|---|
 | beam | cantilever of 4 m, in the plane or in space | falls under its weight and swings |
 | twist | bar of 8 m in space | its ends are turned against each other, twice or more |
@@ -40,17 +40,17 @@ DENSITY = 1000.0
 SLOPE = 0.5
 """Rise of the slope over its run."""
 DROP_SPEED = 2.0
-"""Of the falling body, to the right, in m/s."""
+"""Initial velocity of the falling body to the right, in m/s."""
 TURNING = 4.0
-"""Seconds in which the bar's ends are turned."""
+"""Time in s in which the bar's ends are turned."""
 WAVE_PERIOD = 0.33
-"""Of the creature's muscles, in s."""
+"""Period of the creature's muscles, in s."""
 WAVE_LENGTH = 2.0
-"""In body lengths."""
+"""Length of the muscle wave, in body lengths."""
 WAVE_DELAY = math.pi / 4
-"""Of the back behind the rest of the skin, in rad."""
+"""Phase delay of the back relative to the rest of the skin, in rad."""
 SHORTEST, LONGEST = 0.3, 1.0
-"""Actuation of the creature's muscles."""
+"""Range of the actuation of the creature's muscles."""
 
 
 def beam(
@@ -63,9 +63,9 @@ def beam(
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
 ) -> Example:
-    """A beam of 4 m x 1 m (x 1 m) with so many cells across, or a mesh of one's own, held on the left.
+    """A beam of 4 m x 1 m (x 1 m) with `cells` cells across, or a custom mesh, held on the left.
 
-    Held are the vertices given, or those of least x.
+    Without `held`, the vertices of smallest x are held.
     """
     if mesh is None:
         _require_dimension(dimension)
@@ -113,7 +113,7 @@ def slope(
     poisson_ratio: float = 0.3,
     strain_energy: StrainEnergy = stable_neo_hookean,
 ) -> Example:
-    """A block of 1 m x 0.5 m that lies on a plane of tan 0.5 which rises to the right: it slides if friction < 0.5."""
+    """A block of 1 m x 0.5 m on a plane of tan 0.5 that rises to the right: it slides if friction < 0.5."""
     mesh = beam_mesh(1.0, 0.5, 2 * cells, cells)
     along = np.array([1.0, SLOPE]) / math.hypot(1.0, SLOPE)
     normal = np.array([-along[1], along[0]])
@@ -134,10 +134,10 @@ def drop(
     strain_energy: StrainEnergy = stable_neo_hookean,
     seed: int = 0,
 ) -> Example:
-    """A body that falls from its own height with 2 m/s to the right, turning by a rate the seed decides (±1 rad/s).
+    """A body that falls from its own height with 2 m/s to the right and a random rate of rotation (±1 rad/s).
 
-    A disc of radius 0.5 m with so many rings, a box of 1 m in space, which the seed also tilts, or one's own mesh,
-    lifted or lowered to that height as it is.
+    The body is a disc of radius 0.5 m with `cells` rings, a box of 1 m in space with a random tilt, or a custom mesh,
+    lifted or lowered to that height. The seed decides rate and tilt.
     """
     random = np.random.default_rng(seed)
     if mesh is None:
@@ -158,12 +158,12 @@ def drop(
 
 
 def creature_scene(creature: Creature) -> SoftScene:
-    """A creature of the preset above its ground."""
+    """Returns the scene of a creature of the preset above its ground."""
     return make_scene(creature.mesh, creature_terms(creature.mesh, creature.muscles), masses=MASS)
 
 
 def creature() -> Example:
-    """The crawler, whose muscles shorten in a wave from its head to its tail, which pushes it forwards."""
+    """The crawler, whose muscles shorten in a wave from head to tail, which pushes it forwards."""
     body = crawler()
     scene = creature_scene(body)
     x, y = body.mesh.vertices[body.muscles].mean(axis=1).T
@@ -178,24 +178,24 @@ def creature() -> Example:
 
 
 EXAMPLES: dict[str, Callable[..., Example]] = {each.__name__: each for each in (beam, twist, slope, drop, creature)}
-"""By name; their keyword arguments are what can be chosen."""
+"""Examples by name; their keyword arguments are their options."""
 
 
 def _solid(mesh: Mesh, law: tuple[StrainEnergy, float, float], *others: Term, held: ArrayLike = ()) -> SoftScene:
-    """An elastic body, by its density of strain energy, E and nu, and what else acts on it."""
+    """Returns the scene of an elastic body from its strain energy, E and nu, and its other terms."""
     material = elastic(mesh, law[0], youngs_modulus=law[1], poisson_ratio=law[2])
     return make_scene(mesh, [material, *others], density=DENSITY, held=held)
 
 
 def _ground(mesh: Mesh, friction: float, *, height: float, normal: np.ndarray) -> Term:
-    """A plane so stiff that a single vertex that carries the whole body sinks a thousandth of its height."""
+    """A plane so stiff that a single vertex with the whole body's weight sinks by a thousandth of the body's height."""
     stiffness = 1e3 * (GRAVITY * float(lumped_masses(mesh, DENSITY).sum())) / height
     every = np.arange(len(mesh.vertices))
     return plane_contact(every, normal=normal, stiffness=stiffness, width=1e-3 * height, friction=friction)
 
 
 def _tilted(mesh: Mesh, random: np.random.Generator) -> Mesh:
-    """Turned by a random rotation of at most about half a radian."""
+    """Rotates a mesh at random by at most about half a radian."""
     axis = 0.25 * random.normal(size=3)
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     # Cayley's transform of a skew matrix is a rotation.

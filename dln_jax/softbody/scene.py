@@ -1,6 +1,6 @@
-"""A soft body and what acts on it: a mesh, the energy terms it needs, the vertices that are held, and their parameters.
+"""Scene of a soft body: a mesh, its energy terms, the held vertices, and all parameters.
 
-What a scene does not list is never traced. Everything in `Params` is differentiable and can be mapped over.
+Terms that a scene does not list are never traced. Everything in `Params` is differentiable and can be mapped over.
 """
 
 import reprlib
@@ -19,36 +19,36 @@ from dln_jax.types import InputError
 
 
 class Params(NamedTuple):
-    """What a motion depends on besides its state and its controls."""
+    """Parameters of a motion, apart from its state and its controls."""
 
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
     masses: Float[Array, " n"]
     """In kg."""
     terms: dict[str, Any]
-    """Parameters of each term, by its name."""
+    """Parameters of the terms, by name."""
 
 
 class SoftScene(NamedTuple):
-    """A soft body and what acts on it."""
+    """A soft body with its energy terms, held vertices and default parameters."""
 
     mesh: Mesh
     terms: tuple[Term, ...]
     held: Int[np.ndarray, " k"]
     """Vertices that are not solved for: they move with their own velocity in `State.v`."""
     params: Params
-    """Defaults."""
+    """Default parameters."""
 
     @property
     def free(self) -> Bool[np.ndarray, "n dim"]:
-        """Which coordinates are solved for."""
+        """Mask of the coordinates that are solved for."""
         free = np.ones(self.mesh.vertices.shape, bool)
         free[self.held] = False
         return free
 
 
 class Previous(NamedTuple):
-    """The state before, for methods of two steps."""
+    """The previous state, for methods of two steps."""
 
     x: Float[Array, "n dim"]
     v: Float[Array, "n dim"]
@@ -62,25 +62,25 @@ class State(NamedTuple):
     x: Float[Array, "n dim"]
     """In m."""
     v: Float[Array, "n dim"]
-    """In m/s; of held vertices, the velocity they are moved with."""
+    """In m/s; for held vertices the prescribed velocity."""
     previous: Previous | None = None
-    """For methods of two steps."""
+    """Previous state, for methods of two steps."""
 
 
 def make_scene(
     mesh: Mesh, terms: Sequence[Term], *, density: float = 1000.0, masses: Any = None, held: Any = ()
 ) -> SoftScene:
-    """A scene with its default parameters.
+    """Builds a scene with its default parameters.
 
     Args:
-        mesh: whose vertices are the rest shape.
-        terms: what acts on the body.
-        density: in kg/m³ (kg/m² in the plane), from which vertices get their masses.
+        mesh: its vertices are the rest shape.
+        terms: energy terms of the body.
+        density: in kg/m³ (kg/m² in the plane), for the masses of the vertices.
         masses: of the vertices in kg, one for all or [n], instead of a density.
         held: indices of vertices that are not solved for.
 
     Raises:
-        InputError: two terms of one name, an index or a mass out of range, or no vertex that is free.
+        InputError: two terms of one name, an index or a mass out of range, or no free vertex.
     """
     n = len(mesh.vertices)
     terms = tuple(terms)
@@ -104,11 +104,11 @@ def make_scene(
 
 
 def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
-    """The parameters with some of some terms replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
+    """Returns the parameters with some replaced: `with_parameters(params, elastic={"youngs_modulus": 2e5})`.
 
     Args:
         params: of a scene.
-        terms: for the name of a term, new values by the names of its parameters; numbers or arrays, traced or not.
+        terms: new values by the name of the term and of its parameter; numbers or arrays, traced or not.
 
     Raises:
         InputError: a term or a parameter that the scene does not have.
@@ -130,7 +130,7 @@ def with_parameters(params: Params, **terms: Mapping[str, Any]) -> Params:
 
 
 def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any:
-    """New values of a parameter, in the precision of the scene."""
+    """Converts new values of a parameter to the precision of the scene."""
     if not isinstance(before, Array | np.ndarray | float | int):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.rest.dtype), value)
     what = f"term '{name}': {field}"
@@ -139,25 +139,25 @@ def _like(name: str, field: str, value: Any, before: Any, params: Params) -> Any
     except (TypeError, ValueError):
         raise InputError(f"{what} is {reprlib.repr(value)}; expected numbers") from None
     shape, elements = np.shape(before), np.shape(array)
-    # A number may become one for each element, and values for each become one for all; vectors keep their length.
+    # A number may become one per element, and the reverse; vectors keep their length.
     if elements != shape and not (() in (shape, elements) and len(shape) + len(elements) == 1):
         raise InputError(f"{what} has shape {elements}; expected {shape}")
     return array
 
 
 def element_energies(scene: SoftScene) -> tuple[ElementEnergy, ...]:
-    """The terms as the solver takes them."""
+    """Returns the terms in the form of the solver."""
     return tuple(ElementEnergy(term.energy, term.indices, unrolled=True) for term in scene.terms)
 
 
 def prepare(
     scene: SoftScene, params: Params, x: Float[Array, "n dim"], *, dt: Any = jnp.inf, control: Array | None = None
 ) -> tuple[Any, ...]:
-    """Data of the elements of every term for a step of dt in s that starts at x, or, by default, for bodies at rest."""
+    """Returns the data of all terms' elements for a step of dt in s that starts at x; by default for bodies at rest."""
     context = Context(params.rest, params.masses, x, jnp.asarray(dt, x.dtype), control)
     return tuple(term.prepare(params.terms[term.name], context) for term in scene.terms)
 
 
 def potential(scene: SoftScene, x: Float[Array, "n dim"], params: Params, control: Array | None = None) -> Array:
-    """V(x) in J: what the scene stores, for energy plots; a term that dissipates counts as it would from rest at x."""
+    """V(x) in J, the stored energy, for energy plots; dissipative terms are evaluated as from rest at x."""
     return value(element_energies(scene), x, prepare(scene, params, x, control=control))

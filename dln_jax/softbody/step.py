@@ -9,7 +9,7 @@
 | midpoint | dt/2 | x_n + h v_n | x is half way: x_{n+1} = 2 x - x_n, v_{n+1} = 2 (x - x_n) / h - v_n |
 
 Backward Euler is of first order and damps; bdf2 is of second order and damps little; the midpoint rule is of second
-order and does not damp, so that it is for smooth motions.
+order and does not damp: use it for smooth motions.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ Step = Callable[[Params, State, Any], tuple[State, Info]]
 
 
 class Integrator(NamedTuple):
-    """A line of the table."""
+    """An integrator: one line of the table."""
 
     span: float
     """Time from the state to the minimum, in units of dt."""
@@ -45,7 +45,7 @@ class Integrator(NamedTuple):
     finish: Callable[[State, Array, Any], tuple[Array, Array]]
     """(state, x of the minimum, dt) -> x_{n+1}, v_{n+1}."""
     two_steps: bool = False
-    """Whether it needs the state before."""
+    """Whether it needs the previous state."""
 
 
 def _previous(state: State) -> Previous:
@@ -80,18 +80,18 @@ MIDPOINT = Integrator(
     finish=lambda state, x, dt: (2 * x - state.x, 4 / dt * (x - state.x) - state.v),
 )
 INTEGRATORS = {"backward-euler": BACKWARD_EULER, "bdf2": BDF2, "midpoint": MIDPOINT}
-"""By the names that command lines and tables call them."""
+"""Integrators by the names in command lines and tables."""
 
 TOLERANCE = 1e-6
-"""Default largest force that is left over, per mass, in m/s²; Newton's last step usually takes it far below."""
+"""Default largest residual force per mass, in m/s²; Newton's last step usually reduces it far below."""
 
 
 class Stepper(NamedTuple):
-    """A time step, and the states that fit it."""
+    """A time step, and its initial state."""
 
     init: Callable[..., State]
-    """init(x=None, v=None): the rest shape at rest, or the positions in m and velocities in m/s given, [n, dim] or one
-    [dim] for all vertices. `InputError` for a known value that is not finite."""
+    """init(x=None, v=None): the rest shape at rest, or positions in m and velocities in m/s, [n, dim] or one [dim]
+    for all vertices. `InputError` for a known value that is not finite."""
     step: Step
     """step(params, state, control=None) -> (state after dt, Info): differentiable in all of its arguments."""
 
@@ -106,17 +106,18 @@ def make_step(
     linear_solver: LinearSolverFactory | None = None,
     definite: bool = False,
 ) -> Stepper:
-    """(init, step) of a scene.
+    """Returns (init, step) of a scene.
 
     Args:
-        scene: the body; its terms are compiled, no others.
-        dt: in s; a traced value, whose sign is not checked, serves several steps by one program.
-        integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or one's own.
-        tolerance: largest force left over per mass, in m/s², that counts as balanced; rounding always does.
-        iterations: Newton steps after which a time step gives up, which `Info.converged` reports.
-        linear_solver: how linear systems are solved; by default the way of least work for the stiffness in
-            `scene.params` and this time step (`by_size` where either is traced, or a term needs a control to be
-            prepared). Other parameters given to the step later do not change the choice.
+        scene: the body; only its own terms are compiled.
+        dt: in s; a traced value, whose sign is not checked, serves several steps with one program.
+        integrator: `BACKWARD_EULER`, `BDF2`, `MIDPOINT`, or a custom one.
+        tolerance: largest residual force per mass, in m/s², of a converged step; rounding errors always count as
+            converged.
+        iterations: largest number of Newton steps per time step; `Info.converged` reports whether they sufficed.
+        linear_solver: solver of the linear systems; by default the one with the least work for the stiffness in
+            `scene.params` and this time step (`by_size` if either is traced, or the preparation of a term needs a
+            control). Other parameters passed to the step later do not change the choice.
         definite: also report `Info.definite`, at the cost of another Hessian, factorisation and solve in every step.
 
     Raises:
@@ -153,7 +154,7 @@ def make_step(
         weights = params.masses / jnp.asarray(h, state.x.dtype) ** 2
         data = ((weights, target), *prepare(scene, params, state.x, dt=span, control=control))
         carried = state.x + span * state.v
-        # The better of two starts: where the body is, or where it would be without forces.
+        # The better of two starts: the present positions, or those of motion without forces.
         stay, coast = jnp.where(free, state.x, carried), jnp.where(free, target, carried)
         start = jnp.where(value(energies, coast, data) < value(energies, stay, data), coast, stay)
         balanced, found = solve(energies, start, data, scale=params.masses, at=at)
@@ -180,7 +181,7 @@ def make_step(
 
 
 def positions_and_convergence(state: State, info: Info) -> tuple[Array, Array]:
-    """What of a motion most want to see, for `rollout`: x [n, dim] and whether the step converged."""
+    """Returns x [n, dim] and whether the step converged, for `rollout`."""
     return state.x, info.converged
 
 
@@ -198,11 +199,11 @@ def static_solve(
     """Positions [n, dim] of an equilibrium: a minimum of the potential alone, near the start x (default: rest shape).
 
     Args:
-        scene: the body; without held vertices or springs to the world there is no single minimum.
+        scene: the body; without held vertices or springs to the world there is no unique minimum.
         params: of the scene.
         control: actuation, for scenes that have one.
-        x: where the search starts; held vertices stay there.
-        tolerance, iterations, linear_solver, definite: as of `make_step`.
+        x: initial positions; held vertices stay there.
+        tolerance, iterations, linear_solver, definite: as for `make_step`.
     """
     x = params.rest if x is None else x
     data = prepare(scene, params, x, control=control)
@@ -218,7 +219,7 @@ def static_solve(
 
 
 def _known(values: Any, data: Callable[[], Any]) -> Any | None:
-    """Data of the elements, or `None` where a value is traced or a control is missing."""
+    """Data of the elements, or `None` if a value is traced or a control is missing."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
         return None
     try:
@@ -231,7 +232,7 @@ def _known(values: Any, data: Callable[[], Any]) -> Any | None:
 def _linear_solver(
     given: LinearSolverFactory | None, energies: Sequence[ElementEnergy], at: Pattern, x: Array, data: Any | None
 ) -> LinearSolverFactory:
-    """The linear solver given, or else the one of least work, found once."""
+    """Returns the requested linear solver, or the one with the least work, chosen once."""
     if given is not None:
         return given
     solver = by_size(energies, at) if data is None else by_stiffness(energies, at, x=x, data=data)
@@ -241,7 +242,7 @@ def _linear_solver(
 def _of_positions(
     scene: SoftScene, params: Params, x: Array, found: SolverInfo, overlaps: Callable[[Array], Array] | None
 ) -> Info:
-    """The solver's verdict, and that of the positions: no element is inverted."""
+    """Combines the solver's verdict with that on the positions: no element is inverted."""
     least = least_J(scene, params, x)
     upright = True if least is None else least > 0
     pairs = None if overlaps is None else overlaps(x)

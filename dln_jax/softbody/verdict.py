@@ -1,7 +1,7 @@
-"""Whether a time step can be trusted: balanced forces are not enough.
+"""Reliability of a time step: balanced forces are not sufficient.
 
-A long step of a rule that does not damp can create energy without bound, and an impact can turn elements inside out,
-while the forces of every step are balanced. Over one step,
+A long step of a rule that does not damp can create energy without bound, and an impact can invert elements, while the
+forces of every step are balanced. Over one step,
 
     growth = (T + V)' - (T + V) - W,    at hand = T + max(V - V', 0) + |W|
 
@@ -25,32 +25,31 @@ from dln_jax.solvers.newton import Info as SolverInfo
 
 LARGEST_GROWTH = 0.1
 """Share of the energy at hand. The example scenes stay below 0.01 with backward Euler and BDF2, and smooth motions
-below 1e-4 with the midpoint rule; contact that the midpoint rule does not resolve gives 0.1 to 5 before it explodes."""
+below 1e-4 with the midpoint rule; contact that the midpoint rule does not resolve reaches 0.1 to 5 before it
+diverges."""
 
 
 class Info(NamedTuple):
-    """How a time step or a static solve ended."""
+    """Outcome of a time step or a static solve."""
 
     residual: Float[Array, ""]
-    """Largest force left over per mass, in m/s²."""
+    """Largest residual force per mass, in m/s²."""
     iterations: Int[Array, ""]
     """Newton iterations."""
     converged: Bool[Array, ""]
     """Whether the result can be trusted: forces are balanced, the step has not diverged (`energy_growth` is at most
     `LARGEST_GROWTH` of `energy_at_hand`), and no element is inverted (`least_J` > 0). Otherwise derivatives are NaN."""
     definite: Bool[Array, ""] | None = None
-    """Whether the Hessian at the minimum is positive definite; `None` unless asked for."""
+    """Whether the Hessian at the minimum is positive definite; `None` unless requested."""
     energy_growth: Float[Array, ""] | None = None
-    """Energy created by the step, in J; negative where it damps. `None` for a static solve."""
+    """Energy created by the step, in J; negative for damping. `None` for a static solve."""
     energy_at_hand: Float[Array, ""] | None = None
-    """Energy that the step could use, in J, including what rounding and the tolerance hide. `None` for a static
-    solve."""
+    """Energy available to the step, in J, with the effect of rounding and tolerance. `None` for a static solve."""
     least_J: Float[Array, ""] | None = None
-    """Least ratio of an element's volume to its volume at rest, over the elements that resist deformation; `None` where
-    there are none."""
+    """Smallest ratio of an element's volume to its rest volume, over elements that resist deformation, if any."""
     overlaps: Int[Array, ""] | None = None
-    """Pairs of components of the mesh that overlap: there is no contact between bodies, and they pass through
-    each other. `None` for a mesh of one component. Does not count against `converged`."""
+    """Number of pairs of overlapping mesh components: bodies have no contact with each other and pass through. `None`
+    for a mesh of one component. It does not affect `converged`."""
 
 
 class Motion(NamedTuple):
@@ -72,18 +71,18 @@ def energy_balance(
     """(growth, energy at hand) of a step, in J.
 
     Args:
-        scene: whose held vertices do work.
+        scene: its held vertices do work.
         energies, data: its terms and the data of their elements in this step.
         masses: in kg.
         motion: of the step.
-        found: how the search for the minimum ended.
+        found: outcome of the minimisation.
     """
     free = jnp.asarray(scene.free)
     kinetic, after = (0.5 * jnp.sum(jnp.where(free, masses[:, None] * v**2, 0)) for v in motion.v)
     stored, stored_after = (value(energies, x, data) for x in motion.x)
     moved = motion.x[1] - motion.x[0]
     work = _work(scene.held, energies, data, motion.balanced, moved) if len(scene.held) else jnp.zeros_like(kinetic)
-    # Forces left over do work, and rounding hides some of the energy.
+    # Residual forces do work, and rounding hides some of the energy.
     noise = 0.0 if found.energy_noise is None else found.energy_noise
     unclear = noise + found.residual * jnp.sum(masses[:, None] * jnp.abs(moved))
     growth = after - kinetic + (stored_after - stored) - work
@@ -93,7 +92,7 @@ def energy_balance(
 def _work(
     held: Int[np.ndarray, " k"], energies: Sequence[ElementEnergy], data: Sequence[Any], x: Array, moved: Array
 ) -> Float[Array, ""]:
-    """Work of held vertices against the forces at x, from the elements that they are corners of."""
+    """Work of held vertices against the forces at x, from the elements at these vertices."""
     near, their_data = [], []
     for energy, of in zip(energies, data, strict=True):
         touched = np.flatnonzero(np.isin(energy.indices, held).any(axis=1))
@@ -105,7 +104,7 @@ def _work(
 
 
 def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float[Array, ""] | None:
-    """Least ratio of an element's volume to its volume at rest; `None` where no term acts on the mesh's elements."""
+    """Smallest ratio of an element's volume to its rest volume; `None` if no term acts on the mesh's elements."""
     elements = scene.mesh.elements
     if not len(elements) or not any(np.array_equal(term.indices, elements) for term in scene.terms):
         return None
@@ -114,7 +113,7 @@ def least_J(scene: SoftScene, params: Params, x: Float[Array, "n dim"]) -> Float
 
 @jax.custom_jvp
 def trusted(values: Any, converged: Bool[Array, ""]) -> Any:
-    """The values; their derivatives are NaN unless converged."""
+    """Returns the values; their derivatives are NaN unless converged."""
     return values
 
 

@@ -1,4 +1,4 @@
-"""Optimal feedback by value functions: the cost to go as a network, and the control that descends it best."""
+"""Optimal feedback from value functions: a network for the cost to go, and its greedy control."""
 
 from dln_jax.control.optimal import action_costs
 from dln_jax.control.optimal.action_costs import ActionCost

@@ -2,9 +2,9 @@
 
     g*(w) = max_u wᵀu - g(u),   attained at u = grad g*(w)
 
-so that a + B u with the cost q + g is controlled best by u = grad g*(-Bᵀ dV/dx) where V is the cost to go. A cost that
-is infinite beyond limits keeps the control within them. The seven costs are those of
-the paper's table 1; three rules make others of them.
+With the cost to go V, dynamics a + B u and cost q + g, the optimal control is u = grad g*(-Bᵀ dV/dx). A cost that is
+infinite beyond limits keeps the control within them. The seven costs are those of the paper's table 1; three rules
+derive others from them.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 class ActionCost(NamedTuple):
-    """g and what follows from it; functions of one control or one w, each [m]."""
+    """A cost g, its policy and its conjugate, as functions of one control or one w, both [m]."""
 
     cost: Callable[[Array], Scalar]
     """g(u); infinite where u is out of range."""
@@ -32,13 +32,13 @@ class ActionCost(NamedTuple):
 
 
 def quadratic(R: Any) -> ActionCost:
-    """½ uᵀ R u of unlimited controls, which are linear in w.
+    """½ uᵀ R u, for unlimited controls, which are linear in w.
 
     Args:
-        R: symmetric, positive definite [m, m], or a number for each control alike.
+        R: symmetric, positive definite [m, m], or one number for all controls.
 
     Raises:
-        InputError: an R that is not.
+        InputError: an R of another form.
     """
     R = np.asarray(R, float)
     if R.ndim not in (0, 2) or (R.ndim and (R.shape[0] != R.shape[1] or not np.allclose(R, R.T))):
@@ -58,7 +58,7 @@ def quadratic(R: Any) -> ActionCost:
 
 
 def _within(least: float, most: float, cost: Callable[[Array], Array]) -> Callable[[Array], Scalar]:
-    """The sum over controls, infinite where one is out of range; what is no number stays none."""
+    """Sum over controls, infinite if one is out of range; NaN stays NaN."""
     return lambda u: jnp.sum(jnp.where((u < least) | (u > most), jnp.inf, cost(jnp.clip(u, least, most))))
 
 
@@ -91,25 +91,25 @@ tanh = ActionCost(
 )
 """The entropy of (u + 1)/2, zero at 0, on (-1, 1)."""
 bang_bang = ActionCost(_within(-1.0, 1.0, lambda u: 0 * u), jnp.sign, lambda w: jnp.sum(jnp.abs(w)))
-"""Nothing within [-1, 1]: the control is at a limit."""
+"""Zero within [-1, 1]: the control is at a limit."""
 bang_lin = ActionCost(_within(-1.0, 1.0, lambda u: 0.5 * u**2), lambda w: jnp.clip(w, -1, 1), _huber)
 """½ u² within [-1, 1]: linear up to the limits."""
 
 
 def scaled(cost: ActionCost, a: Any) -> ActionCost:
-    """a g(u/a): the range is a times as wide; the same for every control."""
+    """a g(u/a): the range is a times as wide, for all controls."""
     _require_scale(a=a)
     return ActionCost(lambda u: a * cost.cost(u / a), lambda w: a * cost.policy(w), lambda w: a * cost.conjugate(w))
 
 
 def weighted(cost: ActionCost, b: Any) -> ActionCost:
-    """b g(u): controls that cost b times as much."""
+    """b g(u): controls cost b times as much."""
     _require_scale(b=b)
     return ActionCost(lambda u: b * cost.cost(u), lambda w: cost.policy(w / b), lambda w: b * cost.conjugate(w / b))
 
 
 def shifted(cost: ActionCost, c: Any) -> ActionCost:
-    """g(u + c) - g(c), whose range is shifted by -c."""
+    """g(u + c) - g(c): the range is shifted by -c."""
     c = jnp.asarray(c, float)
     return ActionCost(
         lambda u: cost.cost(u + c) - cost.cost(c),
@@ -119,14 +119,14 @@ def shifted(cost: ActionCost, c: Any) -> ActionCost:
 
 
 def centred(cost: ActionCost, u: Any) -> ActionCost:
-    """g less its tangent at u0: least, and zero, at the control u0 that holds a goal, within the same limits.
+    """g minus its tangent at u0: minimal and zero at the control u0 that holds a goal, within the same limits.
 
     Args:
         cost: g, with a slope at u0.
         u: u0 [m].
 
     Raises:
-        InputError: g does not lead to u0, which may be out of its range.
+        InputError: the policy of g does not return u0, which may be out of its range.
     """
     u = jnp.asarray(u, float)
     slope = jax.grad(cost.cost)(u)
@@ -150,11 +150,11 @@ def limited_atan(limit: float, weight: float) -> ActionCost:
     b = 4 a² R/π, so that the curvature is 2 a R (its comment says 2 R).
 
     Args:
-        limit: a, of each control.
+        limit: a, of all controls.
         weight: b.
 
     Raises:
-        InputError: what is not positive.
+        InputError: a number that is not positive.
     """
     _require_scale(limit=limit, weight=weight)
     return weighted(scaled(atan, 2 * limit / np.pi), weight)

@@ -1,13 +1,13 @@
-"""What an adversary of bounded strength does to a plant, in closed form (Lutter et al. 2021, arXiv:2105.12189).
+"""Worst-case disturbances of bounded strength, in closed form (Lutter et al. 2021, arXiv:2105.12189).
 
     dx/dt = f(x + xi_o, u + xi_u, p + xi_p) + xi_x
 
-Each disturbance drives the cost to go up as fast as its bound lets it, to first order along V_xᵀ f:
+Every disturbance increases the cost to go as fast as its bound permits, to first order along V_xᵀ f:
 
-    xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   each of a given length,
-    xi_p = +- a share of each parameter, by the sign of (df/dp)ᵀ V_x
+    xi_x along V_x,   xi_u along Bᵀ V_x,   xi_o along (df/dx)ᵀ V_x,   all of prescribed length,
+    xi_p = +- a share of every parameter, by the sign of (df/dp)ᵀ V_x
 
-A value function that is trained against it is one of robust control.
+A value function trained against them gives robust control.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from jax import Array
 from dln_jax.types import InputError
 
 Disturbance = Callable[[Array, Array, Array], Array]
-"""(x, V_x, u) -> the change of dx/dt [n] that an adversary makes."""
+"""(x, V_x, u) -> the change of dx/dt [n] due to an adversary."""
 
 
 class Bounds(NamedTuple):
-    """Of the disturbances; zero for those that are not there."""
+    """Bounds of the disturbances; zero for none."""
 
     state: float = 0.0
     """|xi_x|, in the units of dx/dt."""
@@ -44,14 +44,14 @@ def adversary(
     least: Any = None,
     most: Any = None,
 ) -> Disturbance:
-    """The worst of all disturbances at once.
+    """Returns the worst case of all disturbances at once.
 
     Args:
         plant: (x [n], u [m], p [k]) -> dx/dt [n], f.
         parameters: p.
-        bounds: of each.
-        least: bound of p + xi_p from below [k], as no mass is negative; by default none.
-        most: likewise from above.
+        bounds: of the disturbances.
+        least: lower bound of p + xi_p [k], for example zero for masses; by default none.
+        most: upper bound of p + xi_p [k]; by default none.
 
     Raises:
         InputError: bounds that are negative.
@@ -73,7 +73,7 @@ def adversary(
 
 
 def unit(z: Array) -> Array:
-    """z / |z|, zero where z is, with finite derivatives."""
+    """z / |z|, or zero if z is zero, with finite derivatives."""
     square = jnp.sum(z**2)
     some = square > 0
     return jnp.where(some, z / jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""The box of states where a value is wanted: its circles, its limits, and states drawn in it."""
+"""The box of states of a value function: its angles, its limits, and random states in it."""
 
 import jax
 import jax.numpy as jnp
@@ -10,25 +10,25 @@ from dln_jax.control.optimal.problem import ControlProblem
 
 
 def circles(problem: ControlProblem) -> np.ndarray:
-    """Which of the n coordinates are angles on a circle."""
+    """Mask of the n coordinates that are angles on a circle."""
     on_circle = np.array(problem.joints) == "revolute"
     return np.concatenate([on_circle, np.zeros(len(problem.low) - len(on_circle), bool)])
 
 
 def limits(problem: ControlProblem) -> tuple[np.ndarray, np.ndarray]:
-    """The box, without limits of angles on a circle."""
+    """Returns the box, without limits for angles on a circle."""
     angles = circles(problem)
     return np.where(angles, -np.inf, problem.low), np.where(angles, np.inf, problem.high)
 
 
 def uniform(problem: ControlProblem, key: Array, samples: int) -> Float[Array, "samples n"]:
-    """States, uniform in the box."""
+    """Random states, uniform in the box."""
     low, high = jnp.asarray(problem.low, float), jnp.asarray(problem.high, float)
     return jax.random.uniform(key, (samples, len(low)), low.dtype, low, high)
 
 
 def widened(problem: ControlProblem, factor: float) -> ControlProblem:
-    """The problem in a box that is so many times as wide."""
+    """Returns the problem in a box that is `factor` times as wide."""
     low, high = np.asarray(problem.low), np.asarray(problem.high)
     middle, half = (low + high) / 2, factor * (high - low) / 2
     straight = ~circles(problem)
@@ -36,10 +36,10 @@ def widened(problem: ControlProblem, factor: float) -> ControlProblem:
 
 
 def drawn(problem: ControlProblem, key: Array, count: int) -> Float[Array, "N n"]:
-    """States of which half are uniform in the box, and half in boxes that are shrunk, by a share that is uniform too.
+    """Random states, half of them uniform in the box, half in boxes shrunk by a uniformly distributed factor.
 
-    Angles on a circle are uniform in both. In a box of several dimensions nearly all states are far from rest, where
-    few motions ever are.
+    Angles on a circle are uniform in both. In a box of several dimensions nearly all uniform states are far from rest,
+    where motions rarely are.
     """
     of_box, of_share = jax.random.split(key)
     goal = jnp.asarray(problem.goal, float)

@@ -1,10 +1,10 @@
-"""Returns of a policy as continuous fitted value iteration was evaluated (arXiv:2105.04682 and its program).
+"""Returns of a policy, with the evaluation of continuous fitted value iteration (arXiv:2105.04682 and its program).
 
-Euler's method at 250 Hz for 5 s, controls at 125 Hz, states that are not on a circle held within the box, and
+Euler's method at 250 Hz for 5 s, controls at 125 Hz, states that are not on a circle clipped to the box, and
 
     return = - sum of dt (q(x) + g(u)),
 
-undiscounted, with walls and all; it is the reward of the papers, so more is better.
+undiscounted, including the walls. It is the reward of the papers, so more is better.
 """
 
 from collections.abc import Callable
@@ -22,23 +22,23 @@ from dln_jax.control.optimal.problem import rates
 
 RATE, SECONDS, HELD = 250.0, 5.0, 2
 UP = 0.1
-"""rad, within which a pole is up."""
+"""Angle in rad below which a pole counts as upright."""
 Where = Literal["down", "uniform"]
 
 
 class Returns(NamedTuple):
-    """Of some starts."""
+    """Returns of runs from several initial states."""
 
     returns: Float[np.ndarray, " N"]
     settled: Float[np.ndarray, " N"]
-    """s from which on the pole is up; infinite where it is not up at the end."""
+    """Time in s after which the pole stays upright; infinite if it is not upright at the end."""
     most: float
     """The largest control."""
     x: Float[np.ndarray, "N T n"]
 
 
 def starts(plant: ValuePlant, where: Where, count: int = 100, seed: int = 0) -> Float[np.ndarray, "N n"]:
-    """States to start from, as published."""
+    """Random initial states, as published."""
     random, (mean, variance, widths) = np.random.default_rng(seed), plant.starts
     if where == "down":
         return np.asarray(mean) + np.sqrt(variance) * random.normal(size=(count, len(mean)))

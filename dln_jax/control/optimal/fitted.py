@@ -1,16 +1,16 @@
-"""Continuous fitted value iteration: a network's greedy policy is followed, and the network fitted to what that costs.
+"""Continuous fitted value iteration: follows a network's greedy policy and fits the network to the resulting costs.
 
-Each iteration draws states in the box and follows u = grad g*(-Bᵀ V_x) from them for N steps. Along each trajectory,
+Every iteration draws states in the box and follows u = grad g*(-Bᵀ V_x) from them for N steps. Along a trajectory,
 backwards, costs are added up with exponential weights (Lutter et al. 2021, arXiv:2105.04682):
 
     G_k = c_k + e^(-rho dt) [(1 - w) V(x_{k+1}) + w G_{k+1}],    G_N = V(x_N),    w = e^(-dt / memory)
 
-so that every state on the way has a target, and not the first alone. So has its slope p_k = dG_k/dx, by the chain rule
-through the closed loop, policy and all: with the controls held instead, as in the costate of Pontryagin's principle,
-slopes of an unstable plant would grow backwards wherever the controls are not yet best. With a long memory the targets
-are the policy's own cost, above the best by the square of what the policy is off, and the iteration is Howard's of
-policies, which converges as Newton's method does. With a short one they are those of n-step returns, which need no good
-policy.
+so that all states on the way have a target, not only the first. They also have a target for the slope p_k = dG_k/dx, by
+the chain rule through the closed loop, including the policy. With fixed controls instead, as in the costate of
+Pontryagin's principle, slopes of an unstable plant would grow backwards wherever the controls are not yet optimal. With
+a long memory the targets are the policy's own cost, whose excess over the optimum is quadratic in the policy's error,
+and the iteration is Howard's policy iteration, which converges like Newton's method. With a short one they are n-step
+returns, which do not require a good policy.
 """
 
 import functools
@@ -34,25 +34,25 @@ from dln_jax.scale.mesh import local, program
 from dln_jax.types import InputError, require_positive
 
 VALIDATED = 256
-"""States from which the policy's cost is compared between iterations."""
+"""Number of states from which the policy's cost is compared between iterations."""
 
 
 class Progress(NamedTuple):
-    """Of an iteration."""
+    """Progress after an iteration."""
 
     iteration: int
     loss: float
     validation: float
-    """Mean cost of the policy from validation states, and what V is off it."""
+    """Mean cost of the policy from validation states, plus the mean of |V - cost|."""
     seconds: float
-    """Since the start, compilation apart."""
+    """Time since the start, without compilation."""
 
 
 class Fitted(NamedTuple):
-    """What came of an iteration."""
+    """Result of the iterations."""
 
     parameters: Any
-    """Those with the least validation."""
+    """Parameters with the lowest validation."""
     history: list[Progress]
     train_seconds: float
     compile_seconds: float
@@ -70,17 +70,17 @@ def fit_value(
     mesh: Mesh | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Fitted:
-    """Iterates, and keeps what does best from validation states that are drawn apart.
+    """Runs the iterations and keeps the best parameters on separate validation states.
 
     Args:
-        problem: what is controlled.
-        network: family of values.
+        problem: the control problem.
+        network: family of value functions.
         seed: of parameters and states.
         numbers: of the iteration.
-        parameters: to start from; by default drawn.
+        parameters: initial ones; random by default.
         double: whether to compute in float64, which takes twice as long.
         disturbance: of an adversary, for a robust value.
-        mesh: devices that share the states from which the policy is followed; the fits are done by each.
+        mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
         report: called after every iteration.
 
     Raises:
@@ -103,7 +103,7 @@ def fit_values(
     mesh: Mesh | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> list[Fitted]:
-    """As `fit_value` for several seeds, one after the other, by a program that is compiled once."""
+    """Runs `fit_value` for several seeds, one after the other, with a program that is compiled once."""
     require_positive(**{name: number for name, number in numbers._asdict().items() if name != "slope_weight"})
     problem = widened(problem, numbers.margin)
     with jax.enable_x64(double):
@@ -119,7 +119,7 @@ class _Programs(NamedTuple):
     iterate: Callable[..., tuple[Any, Any, Array]]
     score: Callable[[Any, Array], Array]
     local: Callable[[Any], Any]
-    """What the programs give, as arrays of this process."""
+    """Turns the programs' results into arrays of this process."""
 
 
 def _compiled(subject: Subject, parameters: Any) -> _Programs:

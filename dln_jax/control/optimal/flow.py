@@ -1,4 +1,4 @@
-"""Steps of a control problem with its cost: the state after a time with held controls, and what that time costs.
+"""Steps of a control problem: the state after a time with held controls, and the cost of that time.
 
     x(t + dt),   integral from 0 to dt of e^(-rho s) (q(x(t + s)) + g(u)) ds
 
@@ -21,14 +21,14 @@ Flow = Callable[..., tuple[Array, Scalar]]
 
 
 def flow(problem: ControlProblem, dt: float, *, substeps: int = 1, clipped: bool = False) -> Flow:
-    """The step of a problem.
+    """Returns the step of a problem.
 
     Args:
-        problem: whose plant and costs.
-        dt: for which the controls are held, s.
-        substeps: of the integrator.
-        clipped: whether states that are not on a circle end at the box, as published fitted iterations have it: a plant
-            that is another one wherever trajectories leave the box.
+        problem: with plant and costs.
+        dt: time for which the controls are held, s.
+        substeps: integrator steps.
+        clipped: whether states that are not on a circle are clipped to the box, as in published fitted iterations; this
+            changes the plant wherever trajectories leave the box.
     """
     require_positive(dt=dt, substeps=substeps)
     field, rho = rates(problem), problem.discount

@@ -1,17 +1,17 @@
-"""The value of a control problem of two states on a grid: an independent solution that others are measured against.
+"""Value of a control problem of two states on a grid: an independent reference for other solutions.
 
     V(x) = min over u of  integral from 0 to dt of e^(-rho t) (q + g) dt + e^(-rho dt) V(x(dt))
 
-A semi-Lagrangian scheme (Falcone and Ferretti 2014): the feet x(dt) of characteristics are found by the classical
-Runge-Kutta method with held controls, and V there by linear interpolation. That makes the scheme monotone and its fixed
-point unique: it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V,
-converges to the fixed point. (With cubic interpolation it need not: it did not at ridges.) Controls are chosen among
-the one at hand, a list over their range, and those that the conjugate of their cost gives for the slopes of V on each
-side, u = grad g*(-Bᵀ V_x). Coarse grids start fine ones.
+A semi-Lagrangian scheme (Falcone and Ferretti 2014): the classical Runge-Kutta method with held controls gives the feet
+x(dt) of characteristics, and linear interpolation V there. That makes the scheme monotone and its fixed point unique:
+it converges to the viscosity solution, and Howard's policy iteration (1960), which never raises V, converges to the
+fixed point. (With cubic interpolation it need not: it did not at ridges.) The candidates for a control are the present
+one, a list over their range, and the controls from the conjugate of their cost for the slopes of V on both sides,
+u = grad g*(-Bᵀ V_x). Coarse grids initialise fine ones.
 
 Linear interpolation costs O(h²/dt) and held controls O(dt²), so dt should be as long as the controls allow. The change
-between two grids shows how far V is from its limit; `extrapolated` removes most of it where V is smooth. `lookahead`
-gives the policy of V; the cost of following it bounds the true value from above.
+between two grids estimates the distance of V from its limit; `extrapolated` removes most of it where V is smooth.
+`lookahead` gives the policy of V; the cost of following it bounds the true value from above.
 """
 
 import math
@@ -33,9 +33,9 @@ from dln_jax.solvers.ending import Ending
 from dln_jax.types import InputError, require_positive
 
 CONTROLS = 25
-"""Listed over the range."""
+"""Number of listed controls."""
 SWEEPS = 20_000
-"""Of the value between two improvements of the policy, at most."""
+"""Largest number of sweeps of the value between two improvements of the policy."""
 
 
 class GridValue(NamedTuple):
@@ -51,7 +51,7 @@ class GridValue(NamedTuple):
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether `change` came within the tolerance; `solvers.ending.reason(found.ending)` says why not."""
+        """Whether `change` is within the tolerance; `solvers.ending.reason(found.ending)` says why not."""
         return self.ending == Ending.CONVERGED
 
 
@@ -67,18 +67,18 @@ def solve_on_grid(
     improvements: int = 100,
     start: GridValue | None = None,
 ) -> GridValue:
-    """The value on the last of several grids, the coarsest first.
+    """Solves for the value on several grids, the coarsest first, and returns it on the last.
 
     Args:
         problem: of two states and one control.
-        points: number of nodes of each side, for each grid; on a circle its last node is its first.
-        low: corner of the rectangle [2]. Trajectories that would leave it stay on its edge: take it so large that
-            those of interest do not.
+        points: number of nodes per side, for every grid; on a circle the last node is the first.
+        low: corner of the rectangle [2]. Trajectories that would leave it stay on its edge: make it large enough for
+            those of interest.
         high: the opposite corner.
-        most: size of the largest control, where its cost is finite.
+        most: magnitude of the largest control, where its cost is finite.
         dt: s. Controls are held for it, which costs O(dt²); interpolation costs O(h²/dt) for nodes at a distance h.
         tolerance: of V, relative to its largest.
-        improvements: of the policy on each grid, at most; the result says whether they sufficed.
+        improvements: largest number of policy improvements per grid; the result states whether they sufficed.
         start: a solution on a coarser grid.
 
     Raises:
@@ -107,7 +107,7 @@ def solve_on_grid(
 
 
 def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
-    """V at states [..., 2] by Richardson's extrapolation from two grids: their errors are as the squares of h."""
+    """V at states [..., 2] by Richardson's extrapolation from two grids, whose errors are proportional to h²."""
     ratio = (coarse.grid.steps[0] / fine.grid.steps[0]) ** 2
     of_coarse, of_fine = (interpolated(each.grid, each.V, x) for each in (coarse, fine))
     return of_fine + (of_fine - of_coarse) / (ratio - 1)
@@ -116,9 +116,9 @@ def extrapolated(coarse: GridValue, fine: GridValue, x: Any) -> Array:
 def lookahead(
     problem: ControlProblem, found: GridValue, *, most: float, dt: float = 0.05
 ) -> Callable[[Array], Float[Array, " 1"]]:
-    """The policy of a value on a grid: x [2] -> the listed control u [1] of least cost over dt and V thereafter.
+    """Returns the policy of a value on a grid: x [2] -> the listed control u [1] with the lowest cost over dt plus V.
 
-    Following it costs at least the true value, so it bounds V from above.
+    The cost of following it is at least the true value, so it bounds V from above.
     """
     step, listed = flow(problem, dt), jnp.linspace(-most, most, 8 * CONTROLS + 1)
 
@@ -156,14 +156,14 @@ def _iterate(
         return cost + discount * read(V, linear(grid, after))
 
     def conjugates(V: Array) -> list[Array]:
-        """Controls of the slopes before, after, and between."""
+        """Controls of the backward, forward and mean slopes."""
         sides = [one_sided_slopes(grid, V, axis) for axis in (0, 1)]
         pairs = [tuple(side[which] for side in sides) for which in (0, 1)]
         pairs.append(tuple((before + after) / 2 for before, after in sides))
         return [jnp.clip(_over(policy)(nodes, jnp.stack(pair, axis=-1)), -most, most) for pair in pairs]
 
     def improved(V: Array, u: Array) -> tuple[Array, Array]:
-        """The best control at each node, and V by it; the one at hand stays where no other is better."""
+        """Returns the best control at every node and its V; the present control stays unless another is better."""
 
         def better(best: tuple[Array, Array], other: Array) -> tuple[tuple[Array, Array], None]:
             of_other = total(V, other)
@@ -175,7 +175,7 @@ def _iterate(
         return jax.lax.scan(better, (u, total(V, u)), others)[0]
 
     def followed(V: Array, u: Array, close: Array) -> Array:
-        """V of a policy, to within `close`; a contraction by the discount."""
+        """Returns V of a policy, to within `close`; the iteration is a contraction by the discount."""
         after, cost = feet(u)
         at = linear(grid, after)
 

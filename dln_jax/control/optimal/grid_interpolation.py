@@ -1,8 +1,8 @@
-"""Values at states between the nodes of a rectangular grid of two dimensions.
+"""Interpolation between the nodes of a rectangular grid of two dimensions.
 
 Linear interpolation is monotone: its weights are not negative and sum to one, so that larger values at the nodes give
-larger values between them. Cubic interpolation is more accurate where the values are smooth; limited to the values of
-the four corners around (Bermejo and Staniforth 1992) it does not overshoot at ridges.
+larger values between them. Cubic interpolation is more accurate for smooth values. Limited to the values of the four
+surrounding corners (Bermejo and Staniforth 1992) it does not overshoot at ridges.
 """
 
 from typing import Any, NamedTuple
@@ -18,10 +18,10 @@ class Grid(NamedTuple):
 
     low: tuple[float, ...]
     steps: tuple[float, ...]
-    """Distance between neighbouring nodes of each side."""
+    """Distance between neighbouring nodes on the sides."""
     shape: tuple[int, ...]
     circle: tuple[bool, ...]
-    """Whether the last node of a side, which is not stored, is its first."""
+    """Whether a side is a circle: its last node is its first and is not stored."""
 
     @property
     def nodes(self) -> Float[np.ndarray, "A B 2"]:
@@ -32,7 +32,7 @@ class Grid(NamedTuple):
 
 
 class Stencil(NamedTuple):
-    """Nodes about some states on both sides, and their weights; `read` takes values there."""
+    """Nodes around some states on both sides, and their weights, for `read`."""
 
     rows: Array
     """[k, ...]."""
@@ -43,13 +43,13 @@ class Stencil(NamedTuple):
 
 
 def linear(grid: Grid, x: Array) -> Stencil:
-    """The stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value counts."""
+    """Stencil of bilinear interpolation at states x [..., 2]; beyond an edge, the edge's value applies."""
     (rows, row_weights), (columns, column_weights) = (_linear(x[..., i], *side) for i, side in enumerate(_sides(grid)))
     return Stencil(rows, columns, row_weights, column_weights)
 
 
 def read(values: Array, at: Stencil) -> Array:
-    """Values of the nodes [A, B] at the states of a stencil."""
+    """Evaluates values at the nodes [A, B] at the states of a stencil."""
     count = at.rows.shape[0]
     total = jnp.zeros(at.rows.shape[1:], values.dtype)
     for i in range(count):
@@ -59,7 +59,7 @@ def read(values: Array, at: Stencil) -> Array:
 
 
 def interpolated(grid: Grid, values: Array, x: Any) -> Array:
-    """Limited cubic interpolation of the nodes' values [A, B], such as V, at states [..., 2]."""
+    """Limited cubic interpolation of values at the nodes [A, B], such as V, at states [..., 2]."""
     x = jnp.asarray(x)
     (rows, row_weights), (columns, column_weights) = (_cubic(x[..., i], *side) for i, side in enumerate(_sides(grid)))
     smooth = read(values, Stencil(rows, columns, row_weights, column_weights))
@@ -69,7 +69,7 @@ def interpolated(grid: Grid, values: Array, x: Any) -> Array:
 
 
 def one_sided_slopes(grid: Grid, values: Array, axis: int) -> tuple[Array, Array]:
-    """Differences with the node before and the node after along an axis; at an edge both are the one there is."""
+    """Backward and forward difference quotients along an axis; at an edge both are the one that exists."""
     forward = (jnp.roll(values, -1, axis) - values) / grid.steps[axis]
     backward = jnp.roll(forward, 1, axis)
     if grid.circle[axis]:
@@ -98,7 +98,7 @@ def _cubic(x: Array, low: float, step: float, count: int, circle: bool) -> tuple
     place = (x - low) / step
     if not circle:
         place = jnp.clip(place, 0.0, count - 1.0)
-    # At an edge the four nodes are to one side of the cell.
+    # At an edge the four nodes lie on one side of the cell.
     first = jnp.floor(place) if circle else jnp.clip(jnp.floor(place), 1.0, count - 3.0)
     s = place - first
     weights = jnp.stack(

@@ -1,4 +1,4 @@
-"""One iteration of continuous fitted value iteration: trajectories, their targets, a fit to them, and its judgement."""
+"""One iteration of continuous fitted value iteration: trajectories, their targets, the fit, and its score."""
 
 import functools
 import math
@@ -24,51 +24,51 @@ class Iteration(NamedTuple):
 
     iterations: int = 36
     starts: int = 1024
-    """States that are drawn in an iteration."""
+    """States drawn per iteration."""
     seconds: float = 3.0
-    """For which the policy is followed from each."""
+    """Time in s for which the policy is followed from every state."""
     dt: float = 0.02
-    """s, of a step."""
+    """Time step, s."""
     memory: float = 3.0
-    """s, in the last iteration; infinite for the policy's own cost."""
+    """Memory in the last iteration, s; infinite for the policy's own cost."""
     first_memory: float = 0.3
-    """s, in the first."""
+    """Memory in the first iteration, s."""
     kept: int = 8
-    """States of a trajectory that are fitted: the first, and others ever less densely."""
+    """States per trajectory that are fitted: the first, and others with growing distance."""
     steps: int = 200
-    """Of Adam in an iteration."""
+    """Adam steps per iteration."""
     batch: int = 1024
     learning_rate: float = 1e-2
-    """The largest; falls by a cosine over all iterations."""
+    """Peak; it decays by a cosine over all iterations."""
     slope_weight: float = 0.05
-    """Of the slopes' misfit, in units of the box, beside that of the values."""
+    """Weight of the slopes' misfit, in units of the box, relative to that of the values."""
     floor: float = 0.02
-    """Share of the largest target that is added to a target to make a misfit relative."""
+    """Share of the largest target added to every target in relative misfits."""
     margin: float = 1.25
-    """Factor on the box: states are drawn within, and trajectories end there; 1 as published, where a value of the box
-    alone counts what its edges do."""
+    """Factor on the box for drawing states and clipping trajectories; 1 as published, where the edges of the box affect
+    the value inside."""
 
 
 class Subject(NamedTuple):
-    """What is iterated."""
+    """Problem, network and settings of the iterations."""
 
     problem: ControlProblem
     network: ValueNetwork
     numbers: Iteration
     disturbance: Disturbance | None
     mesh: Mesh | None
-    """Devices that share the trajectories; each does the fit."""
+    """Devices that share the trajectories; all devices do the whole fit."""
 
     @property
     def steps(self) -> int:
-        """Of a trajectory."""
+        """Number of steps of a trajectory."""
         return round(self.numbers.seconds / self.numbers.dt)
 
 
 def iterate(
     subject: Subject, adam: optax.GradientTransformation, parameters: Any, state: Any, key: Array, memory: Array
 ) -> tuple[Any, Any, Array]:
-    """Parameters, state of the optimiser and mean loss after an iteration with this memory, in s."""
+    """Returns parameters, state of the optimiser and mean loss after an iteration with this memory, in s."""
     problem, network, numbers = subject.problem, subject.network, subject.numbers
     of_starts, of_batches = jax.random.split(key)
     data = _kept_targets(subject, parameters, drawn(problem, of_starts, numbers.starts), memory)
@@ -95,7 +95,7 @@ def iterate(
 
 
 def _kept_targets(subject: Subject, parameters: Any, x: Array, memory: Array) -> Targets:
-    """Targets at some states of the trajectories from x [N, n], one row each."""
+    """Targets at some states of the trajectories from x [N, n], one row per state."""
 
     def of_start(parameters: Any, memory: Array, x: Array) -> Targets:
         return targets(
@@ -116,13 +116,13 @@ def _kept_targets(subject: Subject, parameters: Any, x: Array, memory: Array) ->
 
 
 def _robust(off: Array) -> Array:
-    """Quadratic where small, else linear: at a ridge the slopes of either side are far from each other."""
+    """Loss that is quadratic for small errors and linear for large ones, because slopes jump at a ridge of V."""
     size = 0.1
     return size**2 * (jnp.sqrt(1 + (off / size) ** 2) - 1)
 
 
 def score(subject: Subject, parameters: Any, x: Array) -> Array:
-    """Mean cost of the policy from states x [N, n], and what V is off it."""
+    """Mean cost of the policy from states x [N, n], plus the mean of |V - cost|."""
     problem, network, dt = subject.problem, subject.network, subject.numbers.dt
 
     def one(parameters: Any, x: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Settings with which the values of the published plants are fitted."""
+"""Settings of the fits of the published plants' values."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from dln_jax.control.optimal.fitted import Iteration
 
 
 class Fit(NamedTuple):
-    """What is trained."""
+    """Network and iteration of a fit."""
 
     widths: tuple[int, ...]
     numbers: Iteration
@@ -31,4 +31,4 @@ FITS = {
         ),
     ),
 }
-"""By plant."""
+"""Settings by plant."""

@@ -1,7 +1,7 @@
 """Plants and costs of continuous fitted value iteration (Lutter et al. 2021, arXiv:2105.04682, and its program).
 
 Angles are zero upright and enter the costs as π sin(θ/2). The action cost is that of limited controls with the weight
-b = 4 limit² R/π, as the program has it. The cart's rail has a barrier in the state cost.
+b = 4 limit² R/π, as in the program. The cart's rail is a barrier in the state cost.
 """
 
 import math
@@ -22,32 +22,32 @@ from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.types import JointKind, Scalar
 
 MARGIN = 1e-3
-"""By which the action cost's range is wider than the limit."""
+"""Margin of the action cost's range beyond the limit."""
 
 
 class Starts(NamedTuple):
-    """Where the published evaluation starts: about hanging, and anywhere around the circle at rest."""
+    """Initial states of the published evaluation: near hanging, and anywhere around the circle at rest."""
 
     down: Sequence[float]
     """Mean [n]."""
     down_variance: Sequence[float]
     uniform: Sequence[float]
-    """Half widths about the goal [n]."""
+    """Half widths around the goal [n]."""
 
 
 class ValuePlant(NamedTuple):
-    """A problem and what else is known of it."""
+    """A control problem with its limit, initial states and published results."""
 
     problem: ControlProblem
     limit: float
-    """Of the control, N m or N."""
+    """Limit of the control, N m or N."""
     starts: Starts
     angle: int
-    """Which coordinate is the pole's."""
+    """Index of the pole's angle."""
     reference: dict[str, float]
-    """Mean returns of the published policies, re-run, from starts that hardly differ from draw to draw."""
+    """Mean returns of the published policies, re-run from initial states whose draw hardly matters."""
     rest: float = 0.0
-    """What the published costs have at the goal, in a second; the problem's are without."""
+    """Cost per second of the published costs at the goal; the problem's costs are zero there."""
 
 
 def pendulum() -> ValuePlant:
@@ -80,7 +80,7 @@ def cart_pole_on_rail() -> ValuePlant:
 
 
 def desktop_rotary_pendulum() -> ValuePlant:
-    """A rotary pendulum of desktop size with 50 mN m; costs are ours, for the published ones are not printed."""
+    """A rotary pendulum of desktop size with 50 mN m; the costs are ours, as the published ones are not printed."""
     scene = rotary_pendulum(friction=1e-5)
     box, weights = (math.pi, math.pi, 25.0, 40.0), (0.5, 1.0, 0.005, 0.01)
     problem = _problem(scene.closed_form, scene.needs.actuation, scene.needs.joints, weights, 50.0, 0.05, 0.80, box)
@@ -89,9 +89,9 @@ def desktop_rotary_pendulum() -> ValuePlant:
 
 
 PLANTS = {"pendulum": pendulum, "cart-pole": cart_pole_on_rail, "rotary-pendulum": desktop_rotary_pendulum}
-"""By name."""
+"""Plants by name."""
 HORIZON = 5.0
-"""s, after which a cost counts as much as the share that is given."""
+"""Time in s after which a cost counts by the factor `share`."""
 
 
 def _problem(
@@ -115,7 +115,7 @@ def _problem(
         return sum((weight * way**2 for weight, way in zip(weights, ways(x), strict=True)), jnp.zeros((), x.dtype))
 
     def with_walls(x: Array) -> Scalar:
-        # The walls begin at 0.4 m of a rail's 0.5 m, and are felt a little at the goal, where costs are to be zero.
+        # The walls begin at 0.4 m of a rail's 0.5 m. Their value at the goal, where costs are zero, is subtracted.
         turned = [
             each - 2 * math.pi * jnp.round(each / (2 * math.pi)) if turns else each
             for each, turns in zip(x, circular, strict=True)

@@ -1,4 +1,4 @@
-"""The law of a value function: u = grad g*(-Bᵀ V_x)."""
+"""Policy of a value function: u = grad g*(-Bᵀ V_x)."""
 
 import jax.numpy as jnp
 
@@ -7,16 +7,16 @@ from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, op
 
 
 def hjb_policy(value_and_gradient: ValueAndGradient, problem: ControlProblem) -> Law:
-    """x [n] -> u [m], within the limits of the action cost; NaN where the state is not finite.
+    """x [n] -> u [m], within the limits of the action cost; NaN if the state is not finite.
 
     Args:
-        value_and_gradient: x -> V and V_x, such as a trained network's with its parameters closed over.
-        problem: whose B and g they are for.
+        value_and_gradient: x -> V and V_x, for example of a trained network.
+        problem: with B and g.
     """
 
     def law(x):
         u = optimal_control(problem, x, value_and_gradient(x)[1])
-        # A limited control is finite even where a rate is infinite.
+        # A limited control is finite even if a rate is infinite.
         return jnp.where(jnp.isfinite(x).all(), u, jnp.nan)
 
     return law

@@ -2,11 +2,11 @@
 
     V(x) = min_u  integral_0^inf e^(-rho t) [q(x) + g(u)] dt,    dx/dt = a(x) + B(x) u
 
-With g convex the best control is in closed form, and the equation has no minimum in it (Lutter, Belousov et al. 2019):
+For convex g the optimal control has a closed form, which removes the minimum (Lutter, Belousov et al. 2019):
 
     u = grad g*(-Bᵀ V_x),    rho V + g*(-Bᵀ V_x) - q - aᵀ V_x = 0
 
-V is a cost, not negative and to be made small. Those who count rewards, such as continuous fitted value iteration
+V is a cost, non-negative and minimised. Formulations with rewards, such as continuous fitted value iteration
 (arXiv:2105.04682), have -q - g, the value -V and u = grad g*(+Bᵀ dvalue/dx).
 """
 
@@ -29,26 +29,26 @@ ValueAndGradient = Callable[[Array], tuple[Scalar, Array]]
 
 
 class ControlProblem(NamedTuple):
-    """What is to be controlled, at which cost, and where."""
+    """Dynamics, costs and box of a control problem."""
 
     drift: Callable[[Array], Array]
     """a: x [n] -> [n]."""
     actuation: Callable[[Array], Array]
     """B: x [n] -> [n, m]."""
     state_cost: Callable[[Array], Scalar]
-    """q: x -> the cost of a second there, zero at the goal."""
+    """q: x -> cost per second, zero at the goal."""
     action_cost: ActionCost
     """g."""
     discount: float
-    """rho, 1/s; the cost after a time T counts exp(-rho T)."""
+    """rho, 1/s; a cost at time T has the weight exp(-rho T)."""
     low: Any
-    """Lower corner of the box of states [n] where V is wanted."""
+    """Lower corner of the box of states [n] on which V is wanted."""
     high: Any
     """Upper corner."""
     joints: tuple[JointKind, ...]
-    """Kinds of the first coordinates of x, of which revolute ones are angles."""
+    """Kinds of the first coordinates of x; revolute ones are angles."""
     goal: Any
-    """x0 [n], at rest without a control."""
+    """x0 [n], at rest without control."""
 
 
 class Affine(NamedTuple):
@@ -59,21 +59,21 @@ class Affine(NamedTuple):
 
 
 def from_plant(plant: Dynamics | PlainDynamics, actuation: Any = None) -> Affine:
-    """a and B of a mechanical system, on x = (q, qd), whose accelerations are affine in the forces.
+    """Returns a and B of a mechanical system, on x = (q, qd), whose accelerations are affine in the forces.
 
     Args:
-        plant: such as `mechanics.equations.dynamics` gives.
-        actuation: matrix [d, m] in tau = actuation u; by default each coordinate has its own motor.
+        plant: for example from `mechanics.equations.dynamics`.
+        actuation: matrix [d, m] in tau = actuation u; by default every coordinate has its own motor.
     """
     return from_field(field_of(plant, actuation), None if actuation is None else np.shape(actuation)[1])
 
 
 def from_field(field: Field, controls: int | None = None) -> Affine:
-    """a and B of a field (x, u) -> dx/dt that is affine in its controls.
+    """Returns a and B of a field (x, u) -> dx/dt that is affine in its controls.
 
     Args:
         field: of the plant.
-        controls: m; by default half as many as states.
+        controls: m; by default half the number of states.
     """
 
     def rest(x: Array) -> Array:
@@ -81,7 +81,7 @@ def from_field(field: Field, controls: int | None = None) -> Affine:
 
     return Affine(
         lambda x: field(x, rest(x)),
-        # Affine: the derivative at one control is that at all.
+        # The field is affine, so the derivative is the same at all controls.
         lambda x: jax.jacfwd(lambda u: field(x, u))(rest(x)),
     )
 
@@ -97,21 +97,21 @@ def optimal_control(problem: ControlProblem, x: Array, slope: Array) -> Array:
 
 
 def hjb_residual(problem: ControlProblem, x: Array, value: Scalar, slope: Array) -> Scalar:
-    """rho V + g*(-Bᵀ V_x) - q - aᵀ V_x, the cost of a second by which V fails the equation at x."""
+    """rho V + g*(-Bᵀ V_x) - q - aᵀ V_x, the residual of the equation at x as a cost per second."""
     gain = problem.action_cost.conjugate(-problem.actuation(x).T @ slope)
     return problem.discount * value + gain - problem.state_cost(x) - problem.drift(x) @ slope
 
 
 def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProblem:
-    """The problem, with its box and goal as arrays, if it is one.
+    """Validates a problem and returns it with its box and goal as arrays.
 
     Args:
-        problem: as given.
-        tolerance: of |dx/dt| at the goal with the control that costs least, and of its cost.
+        problem: to validate.
+        tolerance: of |dx/dt| at the goal with the cheapest control, and of its cost.
 
     Raises:
-        InputError: shapes that do not agree, an empty box, a negative discount, or a goal that is no equilibrium or
-            costs something.
+        InputError: shapes that do not agree, an empty box, a negative discount, or a goal that is not an equilibrium or
+            has a cost.
     """
     low, high, goal = (np.asarray(each, float) for each in (problem.low, problem.high, problem.goal))
     if goal.ndim != 1 or low.shape != goal.shape or high.shape != goal.shape:
@@ -125,7 +125,7 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
     if not problem.discount >= 0:
         raise InputError(f"discount is {problem.discount}; expected a rate in 1/s, 0 or more")
 
-    @jax.jit  # compiled once, for many small programs take longer
+    @jax.jit  # as one program, because many small ones take longer to compile
     def at_rest(x: Array) -> tuple[Array, Array]:
         u = optimal_control(problem, x, jnp.zeros_like(x))
         return jnp.max(jnp.abs(rates(problem)(x, u))), problem.state_cost(x) + problem.action_cost.cost(u)
@@ -142,13 +142,14 @@ def checked(problem: ControlProblem, *, tolerance: float = 1e-6) -> ControlProbl
 
 
 def at_goal(problem: ControlProblem, goal: Any, *, tolerance: float = 1e-6) -> ControlProblem:
-    """The problem of another goal: the state cost moves there, and controls cost what they differ from the one that
-    holds it.
+    """Returns the problem with another goal.
+
+    The state cost is shifted, and controls cost their difference from the one that holds the new goal.
 
     Args:
-        problem: whose goal costs nothing.
+        problem: with zero cost at its goal.
         goal: state [n].
-        tolerance: of what is left of dx/dt.
+        tolerance: of the remaining dx/dt.
 
     Raises:
         InputError: no control holds the goal, or none within the limits of the action cost.

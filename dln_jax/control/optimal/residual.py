@@ -1,13 +1,12 @@
-"""Value functions from the Hamilton-Jacobi-Bellman equation itself, by Levenberg-Marquardt in float64.
+"""Fits value functions to the Hamilton-Jacobi-Bellman equation, by Levenberg-Marquardt in float64.
 
-The mean square over the box of
+The fit minimises the mean square over the box of
 
     (rho V + g*(-Bᵀ V_x) - q - aᵀ V_x) / (mean of q)
 
-is made small. The equation has several solutions, only one of which is the cost to go. With a large discount that one
-is near q / rho and the others are far away, so training starts there and follows it while the discount comes down to
-the problem's own (continuation: Lutter, Belousov et al. 2019). The samples of each discount are new ones; parameters
-are chosen by samples that no fit has seen.
+The equation has several solutions, only one of which is the cost to go. With a large discount that one is near q / rho
+and the others are far away. Training starts there and follows it while the discount decreases to the problem's own
+(continuation: Lutter, Belousov et al. 2019). Every discount has new samples; unseen samples select the parameters.
 """
 
 import functools
@@ -30,21 +29,21 @@ from dln_jax.types import InputError, require_positive
 
 
 class Stage(NamedTuple):
-    """A discount, and how far the equation is from holding there."""
+    """Residuals of the equation after the fit at one discount."""
 
     discount: float
     iterations: int
     residual: float
-    """Root mean square on the samples of the fit, as a share of the mean of q."""
+    """Root mean square on the samples of the fit, relative to the mean of q."""
     validation: float
-    """On samples of validation, with this discount."""
+    """The same on the validation samples, with this discount."""
 
 
 class ResidualFit(NamedTuple):
-    """What a training gives."""
+    """Result of a training."""
 
     parameters: Any
-    """Of the lowest validation at the problem's own discount."""
+    """Parameters with the lowest validation at the problem's own discount."""
     validation: float
     stages: list[Stage]
 
@@ -54,9 +53,9 @@ def discounts_down_to(discount: float, *, first: float = 30.0, ratio: float = 0.
 
     Args:
         discount: rho of the problem.
-        first: what is added at first; V is then about q / (rho + first).
-        ratio: of one step to the one before, between 0 and 1.
-        last: least that is added.
+        first: first increment; V is then about q / (rho + first).
+        ratio: of consecutive increments, between 0 and 1.
+        last: lower bound of the increments.
 
     Raises:
         InputError: numbers out of range.
@@ -84,25 +83,25 @@ def fit_residual(
     mesh: Mesh | None = None,
     report: Callable[[Stage], None] = lambda stage: None,
 ) -> ResidualFit:
-    """The value function of a family that fits the equation best, in float64.
+    """Fits the value function of a family to the equation, in float64.
 
     Args:
-        problem: whose cost to go is wanted.
-        value_and_gradient: (parameters, x) -> V and V_x, such as `value_network` has.
-        parameters: to start from, float64.
+        problem: the control problem.
+        value_and_gradient: (parameters, x) -> V and V_x, for example of `value_network`.
+        parameters: initial parameters, float64.
         key: of the samples.
-        discounts: to go through, the problem's own last; by default `discounts_down_to` it.
-        samples: uniform in the box, for each discount.
-        validation: samples that parameters are chosen by.
-        iterations: of Levenberg-Marquardt for each draw of samples, at most.
-        rounds: of new samples at the last discount, at most.
-        patience: rounds without a lower validation, after which it ends.
+        discounts: decreasing to the problem's own; by default `discounts_down_to` it.
+        samples: uniform in the box, for every discount.
+        validation: number of samples that select the parameters.
+        iterations: largest number of Levenberg-Marquardt iterations per draw of samples.
+        rounds: largest number of draws at the last discount.
+        patience: the fit ends after this many rounds without a lower validation.
         disturbance: of an adversary, for a robust value function.
         mesh: devices that share the samples of a fit.
-        report: called after each draw.
+        report: called after every draw.
 
     Raises:
-        InputError: a problem that is none, discounts that do not end with its own, or an equation that is not finite.
+        InputError: an invalid problem, discounts that do not end with its own, or an equation that is not finite.
     """
     problem = checked(problem)
     require_positive(samples=samples, validation=validation, iterations=iterations, rounds=rounds, patience=patience)
@@ -136,7 +135,7 @@ def fit_residual(
     def fitted(parameters: Any, discount: float) -> Any:
         x = uniform(problem, jax.random.fold_in(of_draws, len(stages)), samples)
         parameters, done, loss = advance(parameters, x, jnp.asarray(discount))
-        # Decides how many rounds there are, in all processes.
+        # This number decides how many rounds there are, so all processes must use the same one.
         left = of_first_process(float(validated(parameters, jnp.asarray(discount))), mesh)
         stages.append(Stage(discount, int(done), float(loss), float(left)))
         report(stages[-1])

@@ -1,4 +1,4 @@
-"""What a value is fitted to along a trajectory: costs with exponential weights, and their slopes; see `fitted`."""
+"""Targets of a value along a trajectory: costs with exponential weights, and their slopes; see `fitted`."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from dln_jax.types import Scalar
 
 
 class Targets(NamedTuple):
-    """Of the states of trajectories."""
+    """Targets at the states of trajectories."""
 
     x: Float[Array, "N n"]
     V: Float[Array, " N"]
@@ -26,7 +26,7 @@ class Targets(NamedTuple):
 def greedy(
     problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
 ) -> Callable[[Array], tuple[Array, Scalar]]:
-    """x -> the state after a step under the value's own policy, against an adversary if there is one, and its cost."""
+    """x -> the state after a step under the value's policy, against an adversary if any, and the step's cost."""
     step: Flow = flow(problem, dt, clipped=True)
 
     def closed(x: Array) -> tuple[Array, Scalar]:
@@ -47,16 +47,16 @@ def targets(
     memory: Any,
     disturbance: Disturbance | None = None,
 ) -> Targets:
-    """Targets at all states of the trajectory from x [n], the last of which is not among them.
+    """Returns targets at all states of the trajectory from x [n], without the last.
 
     Args:
-        problem: what is controlled.
-        value: the present one.
-        x: the start.
+        problem: the control problem.
+        value: the present value function.
+        x: initial state.
         steps: N.
         dt: s.
         memory: of the weights, s.
-        disturbance: of an adversary, held over a step as the controls are.
+        disturbance: of an adversary, held over a step like the controls.
     """
     closed = greedy(problem, value, dt, disturbance)
     share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)

@@ -1,12 +1,11 @@
-"""Costs to go as networks that are zero at the goal and positive elsewhere, with their gradients in the same pass.
+"""Networks for the cost to go that are zero at the goal and positive elsewhere, with gradients in the same pass.
 
     V(x) = (z - z0)ᵀ L(z) L(z)ᵀ (z - z0)
 
-L is lower triangular, its entries are the outputs of a differential network of z - z0, and its diagonal is positive
-(Lutter et al. 2021, arXiv:2105.04682). z has the sine and cosine of each angle and the other states in units of the
-box. Without hidden layers L is constant: V is a quadratic form, which a linear-quadratic problem needs exactly.
-
-An ensemble is a leading axis of members in the parameters; V and V_x are the means over it.
+L is lower triangular with a positive diagonal; its entries are the outputs of a differential network of z - z0
+(Lutter et al. 2021, arXiv:2105.04682). z holds the sines and cosines of angles and the other states in units of the
+box. Without hidden layers L is constant and V a quadratic form, which solves a linear-quadratic problem exactly.
+The parameters have a leading axis of ensemble members; V and V_x are the means over it.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +25,14 @@ from dln_jax.types import InputError, require_positive
 
 
 class ValueNetwork(NamedTuple):
-    """A family of values; functions of one state."""
+    """A family of value functions, for one state."""
 
     init: Callable[[Array], Any]
-    """Key -> parameters, whose leading axis is that of the members."""
+    """Key -> parameters, with a leading axis of members."""
     value_and_gradient: Callable[[Any, Array], tuple[Array, Array]]
     """(parameters, x [n]) -> V and V_x [n], means over the members."""
     members: Callable[[Any, Array], tuple[Array, Array]]
-    """(parameters, x [n]) -> V [K] and V_x [K, n] of each."""
+    """(parameters, x [n]) -> V [K] and V_x [K, n] of the members."""
 
 
 def value_network(
@@ -45,18 +44,18 @@ def value_network(
     floor: float = 1e-3,
     scale: float = 1.0,
 ) -> ValueNetwork:
-    """A family for the states of a problem.
+    """Returns a family of value functions for a problem.
 
     Args:
-        problem: whose box, joints and goal give z.
+        problem: its box, joints and goal define z.
         widths: of the hidden layers; none for a constant L.
         members: K of the ensemble.
         activation: between layers.
-        floor: least entry of the diagonal of L; 0 leaves the form semi-definite.
-        scale: factor on V, such as the cost that is expected at the edge of the box.
+        floor: lower bound on the diagonal of L; 0 leaves the form semi-definite.
+        scale: factor on V, for example the expected cost at the edge of the box.
 
     Raises:
-        InputError: sizes that make no network.
+        InputError: sizes out of range.
     """
     require_positive(members=members, scale=scale)
     for width in widths:
@@ -69,7 +68,7 @@ def value_network(
 
     def init(key: Array) -> Any:
         layers = ensembles.init(key, (size, *widths, len(rows)), members=members)
-        # Without hidden layers the output layer's bias alone is L.
+        # Without hidden layers, L is the bias of the output layer.
         return layers if widths else layers[-1][1]
 
     def one(layers: Any, x: Array) -> tuple[Array, Array]:
@@ -81,7 +80,7 @@ def value_network(
         lower = jnp.where(diagonal, softplus.value(entries) + floor, entries)
         L = jnp.zeros((size, size), z.dtype).at[rows, columns].set(lower)
         y = L.T @ z
-        # dV/dL = 2 z yᵀ, of which the network has the lower triangle.
+        # dV/dL = 2 z yᵀ; the network outputs the lower triangle.
         slopes = 2 * (z[rows] * y[columns]) * jnp.where(diagonal, softplus.first(entries), 1.0)
         (slope,) = back_to_x(2 * L @ y + back_to_z(slopes))
         return scale * (y @ y), scale * slope

@@ -1,1 +1,1 @@
-"""The one loop of all trainings: `fit`, its optimisers as records, and how a run is stored."""
+"""The training loop `fit`, its optimisers as records, and the checkpoints of a run."""

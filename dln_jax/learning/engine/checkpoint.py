@@ -1,4 +1,4 @@
-"""How a run is stored so that it can continue, and by what it is recognised."""
+"""Stores runs so that they can continue, and identifies them."""
 
 import hashlib
 import math
@@ -17,32 +17,32 @@ from dln_jax.types import InputError
 from dln_jax.zoo import parameter_files as checkpoints
 
 CHECKPOINT = "checkpoint"
-"""Name of the file pair in a run's folder from which it can continue."""
+"""Name of the pair of checkpoint files in a run's folder."""
 
 
 class Checkpoint(NamedTuple):
-    """Where a run is stored, and by what it is recognised."""
+    """Folder and identity of a stored run."""
 
     directory: Path
     """An existing folder."""
     identity: dict[str, Any]
-    """JSON values that decide the result: `settings` and `data`. A run of other values is not continued."""
+    """JSON values that decide the result: `settings` and `data`. A run with other values is not continued."""
     resume: bool = False
-    """Continue from what is stored, if anything is."""
+    """Continue from the stored run, if there is one."""
     name: str = CHECKPOINT
 
 
 def identity(optimiser: Optimiser, arrays: Iterable[np.ndarray | Array | None], **settings: Any) -> dict[str, Any]:
-    """By what a run is recognised: its optimiser, the numbers that it reads, and whatever else decides its result.
+    """Returns the identity of a run: its optimiser, a fingerprint of its data, and all settings that decide its result.
 
-    Time does not: a run may continue with more of it.
+    The time limit is not part of it: a run may continue with more time.
     """
     stated = {"optimiser": type(optimiser).__name__, **optimiser._asdict(), **settings}
     return {"settings": stated, "data": fingerprint(arrays)}
 
 
 def fingerprint(arrays: Iterable[np.ndarray | Array | None]) -> str:
-    """SHA-256 of the numbers that a run reads, by which a resumed run knows its data."""
+    """Returns the SHA-256 of a run's arrays; a resumed run uses it to recognise its data."""
     digest = hashlib.sha256()
     for array in arrays:
         if array is not None:
@@ -51,7 +51,7 @@ def fingerprint(arrays: Iterable[np.ndarray | Array | None]) -> str:
 
 
 def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
-    """Writes the state of a run and what it has reported so far."""
+    """Writes the state of a run and its history so far."""
     facts = {
         **checkpoint.identity,
         "history": finite([[np.asarray(value).tolist() for value in row] for row in history]),
@@ -61,7 +61,7 @@ def store(checkpoint: Checkpoint, state: Any, history: list[Progress]) -> None:
 
 
 def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progress]] | None:
-    """The stored state and history, or `None` where a run is to start from the beginning.
+    """Returns the stored state and history, or `None` if the run has to start from the beginning.
 
     Raises:
         InputError: the stored run had other settings or data, or its files are damaged.
@@ -81,8 +81,9 @@ def restore(checkpoint: Checkpoint | None, like: Any) -> tuple[Any, list[Progres
 
 
 def stored_rows(path: Path, manifest: dict[str, Any], key: str, types: Sequence[Any]) -> list[list[Any]]:
-    """The rows under a key of a manifest, with one JSON value of each of these types; where several seeds trained
-    together, a list of them.
+    """Returns the rows under a key of a manifest.
+
+    A row holds one JSON value of each type in `types`, or a list of such values if several seeds trained together.
 
     Raises:
         InputError: the manifest has no such rows.
@@ -101,7 +102,7 @@ def stored_rows(path: Path, manifest: dict[str, Any], key: str, types: Sequence[
 
 
 def has_checkpoint(directory: Path, name: str = CHECKPOINT) -> bool:
-    """Whether a run in this folder got as far as its first checkpoint."""
+    """Whether this folder holds a checkpoint of a run."""
     return is_file(directory / f"{name}.json")
 
 

@@ -1,7 +1,7 @@
 """Adam as a stage of `fit`: many steps per dispatch, on-device shuffling, best parameters by validation.
 
-One dispatch runs whole epochs in one loop on the device: each epoch draws a permutation from the run's key and its own
-number, so that a run that continues from a stored state takes exactly the steps of an unbroken one.
+A dispatch runs whole epochs in one loop on the device. The permutation of an epoch depends only on the run's key and
+the epoch's number, so a resumed run takes exactly the steps of an uninterrupted one.
 """
 
 import functools
@@ -22,36 +22,37 @@ from dln_jax.scale.mesh import first, mean, share, shares
 
 
 class State(NamedTuple):
-    """Everything that a run needs to continue; with a leading axis where there are several seeds."""
+    """State of a run; resuming from it is exact. Several seeds add a leading axis."""
 
     parameters: Any
     optimiser: optax.OptState
     key: Array
-    """[2] raw key data, so that it can be stored as it is."""
+    """[2] raw key data, which can be stored without conversion."""
     epoch: Array
     """[] epochs done."""
     step: Array
     """[] steps done."""
     best: Best
     failed_step: Array
-    """[] steps after which the loss was not finite, -1 while it is; the rest is the state before that dispatch."""
+    """[] number of steps before the first loss that was not finite, -1 if there was none. On failure, the rest of the
+    state is that before the dispatch."""
 
 
 class Lengths(NamedTuple):
-    """How long a run and its parts are."""
+    """Sizes of a run and of its parts."""
 
     batch: int
     batches: int
-    """Of an epoch; what is left over of its permutation is not used in it."""
+    """Batches of an epoch. The rest of its permutation, shorter than a batch, is not used in that epoch."""
     epochs: int
     epochs_per_dispatch: int
 
 
 def stages(problem: Problem, adam: Adam, shared: Sharing) -> list[Stage]:
-    """The one stage of a run.
+    """Returns the single stage of a run.
 
     Raises:
-        InputError: devices that do not divide a batch.
+        InputError: the number of devices does not divide a batch.
     """
     samples = problem.arrays[0].shape[0]
     batch = min(adam.batch, samples)
@@ -99,7 +100,7 @@ def _begin(adam: Adam, parameters: Any, seed: Any) -> State:
 def _dispatch(
     problem: Problem, adam: Adam, lengths: Lengths, mesh: Mesh | None, epochs: Array, before: State
 ) -> tuple[State, Array]:
-    """Some epochs of one seed, and [loss, validation, monitor]; devices of a mesh share the samples of every batch."""
+    """Runs some epochs of one seed and returns [loss, validation, monitor]; devices of a mesh share every batch."""
     dtype = before.best.validation.dtype
     loss, optimiser = loss_of(problem), optimisers.transformation(adam)
     drawn = _shuffled(problem.arrays, before, lengths, mesh)
@@ -113,20 +114,20 @@ def _dispatch(
             parameters=optax.apply_updates(state.parameters, updates),
             optimiser=optimiser_state,
             step=state.step + 1,
-            # The first loss that is not finite; the steps after it are thrown away with the dispatch.
+            # Number of the first loss that is not finite; the steps after it are discarded with the dispatch.
             failed_step=jnp.where(jnp.isfinite(value) | (state.failed_step >= 0), state.failed_step, state.step),
         )
         return state, total + value
 
-    # One flat loop, whose length is an argument: the last dispatch of a run may be shorter.
+    # One flat loop with a traced length, because the last dispatch of a run may be shorter.
     steps = epochs * lengths.batches
     state, total = jax.lax.fori_loop(0, steps, step, (before, jnp.zeros((), dtype)))
     state = state._replace(epoch=before.epoch + epochs)
     finite = jnp.isfinite(optax.tree.norm(state.parameters))
     failed_step = jnp.where(finite | (state.failed_step >= 0), state.failed_step, state.step)
-    # One copy a dispatch keeps the last good state, where a test after every step would slow each of them.
+    # One copy per dispatch keeps the last good state; a test in every step would slow down the loop.
     state = jax.tree.map(lambda new, old: jnp.where(failed_step < 0, new, old), state, before)
-    # Devices of other makes may round otherwise: all go on from the first one's.
+    # Devices of different models may round differently: all continue from the state of the first.
     state = first(state, mesh)
     value, shown = first(problem.score(state.parameters), mesh)
     best = better_of(state.best, state.parameters, value, state.step)
@@ -135,7 +136,7 @@ def _dispatch(
 
 
 def _shuffled(arrays: Any, state: State, lengths: Lengths, mesh: Mesh | None) -> Any:
-    """The batches of a dispatch, one permutation for each of its epochs; of devices that share them each one's part."""
+    """Batches of a dispatch, with one permutation per epoch; devices that share them get their own part."""
     samples = jax.tree.leaves(arrays)[0].shape[0]
 
     def order(epoch: Array) -> Array:
@@ -149,10 +150,10 @@ def _shuffled(arrays: Any, state: State, lengths: Lengths, mesh: Mesh | None) ->
 
 
 def _permutation(key: Array, count: int) -> Array:
-    """A random order of 0..count-1.
+    """Returns a random order of 0..count-1.
 
-    Up to 2^16 it sorts twice by single words, random bits above the place, four times as fast as the library sorts
-    indices by random keys. What ties in one sort is in the order of the other: half a pair in 2^16 ties in both.
+    Up to 2^16 it sorts single words twice, with random bits above the index: four times as fast as
+    `jax.random.permutation`. Ties in one sort keep the order of the other; at 2^16, about half a pair ties in both.
     """
     place_bits = max(1, (count - 1).bit_length())
     if place_bits > 16:

@@ -1,4 +1,4 @@
-"""The one loop of all trainings: dispatches of compiled steps, stored so that a run can continue bit for bit."""
+"""The one loop of all trainings: dispatches of compiled steps, with checkpoints for resuming bit for bit."""
 
 import math
 import time
@@ -20,12 +20,12 @@ from dln_jax.types import InputError, require_positive
 
 
 class _Run(NamedTuple):
-    """Everything that a run needs to continue."""
+    """State of a training run; resuming from it is exact."""
 
     state: Any
-    """Of the optimiser."""
+    """State of the optimiser."""
     stage: Array
-    """[] which one."""
+    """[] index of the stage."""
 
 
 def fit(
@@ -38,24 +38,24 @@ def fit(
     must_start: bool = True,
     mesh: Mesh | None = None,
 ) -> Training:
-    """Makes a problem's loss small and keeps the parameters with the lowest score.
+    """Minimises a problem's loss and keeps the parameters with the lowest score.
 
     Args:
-        problem: what is made small.
+        problem: residual or loss, initial parameters, samples and score.
         optimiser: `Adam` or `GaussNewton`; the latter needs parameters and data in float64.
-        checkpoint: where to store the run after every dispatch, and whether to continue one.
+        checkpoint: where to store the run after every dispatch, and whether to resume a stored run.
         report: called after every dispatch.
-        seconds: after which to stop, compilation included and since the call, also of a resumed run; looked at between
-            dispatches, of which there is one at least. The learning rate falls as it would have without it.
-        must_start: whether a loss that is not finite to begin with is an error, rather than a result.
-        mesh: devices that share the training. Several seeds are split over them, and each device trains its own. Of one
-            seed the samples are split: those of a step's batch for Adam, all for Gauss-Newton; each device works out
-            the whole score. What is stored does not depend on the devices, and a run may continue on others. Results
-            are those of one device to rounding, which long trainings amplify.
+        seconds: time limit of this call, compilation included, also for a resumed run. It is checked between
+            dispatches; at least one dispatch runs. The schedule of the learning rate does not depend on it.
+        must_start: whether an initial loss that is not finite raises an error; otherwise it is a result.
+        mesh: devices that share the training. Several seeds are split over them, and every device trains its own. With
+            one seed the samples are split: those of a step's batch for Adam, all of them for Gauss-Newton; every device
+            computes the whole score. Checkpoints do not depend on the devices, so a run may continue on others. Results
+            equal those of one device to rounding, which long trainings amplify.
 
     Raises:
-        InputError: settings out of range, a loss that is not finite to begin with, a checkpoint that does not fit, or
-            devices that do not divide the samples of a batch.
+        InputError: settings are out of range, the initial loss is not finite, the checkpoint belongs to another run, or
+            the number of devices does not divide the samples of a batch.
     """
     began = time.perf_counter()
     require_positive(seconds=seconds)
@@ -90,7 +90,7 @@ def fit(
                 run, dispatched = run._replace(state=state), True
                 ended = stage.ended(state)
                 if ended and ended.reason == "not finite" and np.array_equal(before, state.step):
-                    continue  # nothing to report, and what is stored is as good
+                    continue  # nothing to report, and the stored state is as good
                 at = Progress(plain(state.step), loss, validation, monitor, train_seconds, stage.name)
                 history.append(at)
                 if checkpoint is not None:

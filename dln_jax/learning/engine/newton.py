@@ -1,4 +1,4 @@
-"""Gauss-Newton (Levenberg-Marquardt) as stages of `fit`: on some samples, where there are many, and on all."""
+"""Gauss-Newton (Levenberg-Marquardt) as stages of `fit`: on a subset of the samples if there are many, then on all."""
 
 import functools
 from collections.abc import Callable
@@ -20,25 +20,25 @@ from dln_jax.solvers.levenberg_marquardt import Arrays, Status
 from dln_jax.types import InputError
 
 SOME, ALL = "some samples", "all samples"
-"""The stages of a run that starts on a part of the samples."""
+"""Names of the two stages of a run that starts on a subset of the samples."""
 
 
 class State(NamedTuple):
-    """Everything that a run needs to continue."""
+    """State of a run; resuming from it is exact."""
 
     solver: levenberg_marquardt.LevenbergMarquardtState
     earlier: Array
-    """[] iterations of the stage before."""
+    """[] iterations of the stage before this one."""
     best: Best
 
     @property
     def step(self) -> int:
-        """Iterations done, of several seeds the most."""
+        """Iterations done; with several seeds, their maximum."""
         return int(self.earlier) + int(np.max(np.asarray(self.solver.iteration)))
 
 
 def stages(problem: Problem, optimiser: GaussNewton, shared: Sharing) -> list[Stage]:
-    """One stage, or two."""
+    """Returns one stage, or two if the run starts on a subset of the samples."""
     if problem.residual is None:
         raise InputError("Gauss-Newton needs the residuals of a sample, which this problem lacks; take Adam")
     leaves = jax.tree.leaves(problem.parameters)
@@ -94,7 +94,7 @@ def _compile(
     iterations: int,
     state: State,
 ) -> Dispatch:
-    """Iterations, and their score and the best so far: two programs, of which the first is to be compiled quickly."""
+    """Compiles two programs: the iterations (with quick compilation), and their score with the best state so far."""
     chunks = jax.jit(lambda arrays: levenberg_marquardt.in_chunks(arrays, shared.samples))(arrays)
     chunks = replicate(chunks, shared.seeds) if shared.samples is None else shard(chunks, shared.samples)
 
@@ -105,7 +105,7 @@ def _compile(
 
     def judge(step: Array, given: tuple[Best, levenberg_marquardt.LevenbergMarquardtState]) -> tuple[Best, Array]:
         best, solver = given
-        # One seed after the other: a score that calls LAPACK must not do so for a batch (see `solvers.lapack`).
+        # One seed after the other: LAPACK calls in a score must not be batched (see `solvers.lapack`).
         scores = lax.map(score, solver.parameters) if problem.several else score(solver.parameters)
         better = jax.vmap(better_of, (0, 0, 0, None)) if problem.several else better_of
         best = better(best, solver.parameters, scores[..., 0], jnp.asarray(step, jnp.int32))
@@ -126,7 +126,7 @@ def _compile(
 
 
 def _remaining(state: State, iterations: int) -> int:
-    """Iterations that the seeds which still run have to go."""
+    """Largest number of iterations left to the seeds that still run."""
     solver = state.solver
     done = np.ravel(solver.iteration)[np.ravel(solver.status) == Status.RUNNING]
     return max(iterations - int(done.min()), 0) if done.size else 0

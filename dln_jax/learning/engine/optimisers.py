@@ -1,4 +1,4 @@
-"""The optimisers that `fit` takes, as records of all their settings, and which of them suits a problem."""
+"""The optimisers of `fit`, as records of all their settings, and the choice between them."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,60 +10,60 @@ from dln_jax.solvers.normal_equations import count, jacobian_bytes
 from dln_jax.types import InputError, require_positive
 
 MOST_PARAMETERS = 2_000
-"""Above, an iteration's P³ is more than a thousand steps of Adam: `suited` prefers those."""
+"""Above this number P of parameters an iteration's P³ costs more than a thousand steps of Adam; `suited` takes Adam."""
 MOST_BYTES = 2**31
-"""Of the normal equations and a piece of the Jacobian, for `suited`."""
+"""Largest memory that `suited` allows for the normal equations and a chunk of the Jacobian."""
 
 
 class Adam(NamedTuple):
-    """AdamW on minibatches: linear warm-up of the rate, then cosine decay.
+    """AdamW on minibatches: linear warm-up of the learning rate, then cosine decay.
 
-    The default decay of the second moment forgets within a hundred steps; residuals shrink by orders of magnitude
-    during a run, and a longer memory keeps the steps too small (validation torque MSE 9e-7, against 4e-6 with
-    0.999 and the best of three learning rates).
+    The second moment forgets within a hundred steps by default. Residuals shrink by orders of magnitude during a run,
+    and a longer memory keeps the steps too small: the validation torque MSE is 9e-7, against 4e-6 with 0.999 and the
+    best of three learning rates.
     """
 
     steps: int = 20_000
     """Rounded up to whole epochs."""
     batch: int = 512
-    """Samples of a step, drawn without replacement; at most all of them."""
+    """Samples per step, drawn without replacement; at most all of them."""
     learning_rate: float = 5e-3
-    """The largest."""
+    """Peak of the schedule."""
     weight_decay: float = 1e-5
-    """Decoupled."""
+    """Decoupled weight decay."""
     patience: int = 10_000
     """Steps without a lower score after which training stops."""
     second_moment_decay: float = 0.99
     warm_up_share: float = 0.02
-    """Of the steps; 0 with a final share of 1 is a constant rate."""
+    """Share of the steps in the warm-up; 0 with a final share of 1 gives a constant rate."""
     final_share: float = 1e-3
-    """Of the rate, after the last step."""
+    """Learning rate after the last step, as a share of the peak."""
     steps_per_dispatch: int = 200
-    """Between two scores; rounded up to whole epochs."""
+    """Steps between two scores; rounded up to whole epochs."""
 
 
 class GaussNewton(NamedTuple):
     """Levenberg-Marquardt on all samples at once, in float64.
 
-    With many more samples than parameters, the first iterations need not see them all: a run may start on a part of
-    them, at a fraction of the cost, and end on all.
+    With many more samples than parameters, a run may take its first iterations on a subset, at a fraction of the cost,
+    and its last ones on all samples.
     """
 
     steps: int = 150
-    """Iterations on all samples, at most."""
+    """Largest number of iterations on all samples."""
     coarse_steps: int = 0
-    """Iterations before, at most, on `coarse_samples`."""
+    """Largest number of iterations on the first `coarse_samples`, before those on all."""
     coarse_samples: int = 2_048
-    """The first ones, so they must be in random order. Sets of less than twice as many skip that stage."""
+    """The first samples, so they must be in random order. Sets with fewer than twice as many skip that stage."""
     improvement: float = 0.0
-    """Relative decrease of the loss in an iteration at which a stage ends."""
+    """A stage ends when an iteration decreases the loss by less than this fraction."""
     target: float = -math.inf
-    """Score at which to stop; of several seeds the worst counts."""
+    """Score at which to stop; with several seeds, all must reach it."""
     steps_per_dispatch: int = 5
     """Iterations between two scores."""
 
     def has_coarse_stage(self, samples: int) -> bool:
-        """Whether a run on so many samples starts on a part of them."""
+        """Whether a run on this number of samples starts on a subset of them."""
         return self.coarse_steps > 0 and samples >= 2 * self.coarse_samples
 
 
@@ -85,7 +85,7 @@ def check(optimiser: Optimiser) -> None:
 
 
 def transformation(adam: Adam) -> optax.GradientTransformation:
-    """AdamW of these settings."""
+    """AdamW with these settings."""
     rate = adam.learning_rate
     if (adam.warm_up_share, adam.final_share) != (0, 1):
         warm_up = max(1, round(adam.warm_up_share * adam.steps))
@@ -100,10 +100,10 @@ def transformation(adam: Adam) -> optax.GradientTransformation:
 
 
 def suited(parameters: Any, samples: int, residuals: int) -> tuple[type[Adam] | type[GaussNewton], str]:
-    """The optimiser for parameters of these shapes, and why, in a sentence.
+    """Returns the optimiser that suits parameters of these shapes, and a sentence with the reason.
 
-    Gauss-Newton takes P parameters to 1e-8 and below in seconds while its P x P equations are small; Adam's steps grow
-    with P only.
+    Gauss-Newton brings P parameters to errors of 1e-8 and below in seconds while its P x P equations are small; the
+    cost of Adam's steps grows only with P.
     """
     size = count(parameters)
     needed = jacobian_bytes(parameters, samples, residuals, chunk_size=CHUNK, keep=False)

@@ -1,4 +1,4 @@
-"""What a training is given and what it gives, whatever is trained and by which optimiser."""
+"""Inputs and results of a training, for any model and optimiser."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -12,28 +12,28 @@ from jax import Array
 from dln_jax.types import InputError, Scalar
 
 NO_START = "the loss is not finite before training; look for very large numbers in the data"
-"""What is refused where a training cannot begin."""
+"""Error message of a training whose initial loss is not finite."""
 
 
 class Problem(NamedTuple):
-    """What is made small, from where, and what is kept."""
+    """Loss, initial parameters, samples and score of a training."""
 
     residual: Callable[..., Array] | None
     """(parameters, *sample) -> the residuals of one sample, of any shape; the loss is the mean over samples of the sum
-    of their squares. `None` where the loss is no such sum."""
+    of their squares. `None` if the loss has no such form."""
     parameters: Any
-    """To start from."""
+    """Initial parameters."""
     arrays: tuple[Any, ...]
-    """Samples on axis 0; `None` is handed on as it is."""
+    """Samples on axis 0; `None` is passed on unchanged."""
     score: Callable[[Any], tuple[Array, Array]]
-    """Parameters of one seed -> the value that is to be low, and one that is only shown (NaN for none)."""
+    """Parameters of one seed -> the score to minimise, and a score for display only (NaN for none)."""
     seed: int | Array = 0
-    """Of the order of the samples. An array [K] trains K seeds in one program, each as it would alone: the parameters
-    then have a leading axis of K."""
+    """Seed of the order of the samples. An array [K] trains K seeds in one program, with the results of K runs; the
+    parameters then have a leading axis of K."""
     loss: Callable[[Any, Any], Array] | None = None
-    """(parameters, batch) -> what Adam makes small, where that is not the mean of squared residuals."""
+    """(parameters, batch) -> the loss that Adam minimises, if it is not the mean of squared residuals."""
     loss_is_mean: bool = True
-    """Whether `loss` is the mean of those of equal parts of a batch, so that devices may share its samples."""
+    """Whether `loss` is the mean of the losses of equal parts of a batch, so that devices may share its samples."""
 
     @property
     def several(self) -> bool:
@@ -58,14 +58,14 @@ def mean_square(residual: Callable[..., Array], batch: tuple[Any, ...]) -> Scala
 
 
 def unmonitored(value: Scalar) -> tuple[Scalar, Scalar]:
-    """A score beside which nothing is shown."""
+    """Returns a score with nothing to display beside it."""
     return value, jnp.full_like(value, jnp.nan)
 
 
 def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
-    """Raises `InputError` unless the (first seed's) loss on these arrays is finite where training starts.
+    """Raises `InputError` unless the initial loss on these arrays is finite (with several seeds, that of the first).
 
-    Takes a compilation.
+    This compiles the loss.
     """
     parameters = jax.tree.map(lambda leaf: leaf[0], problem.parameters) if problem.several else problem.parameters
     options = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
@@ -74,41 +74,41 @@ def require_finite_start(problem: Problem, arrays: tuple[Any, ...]) -> None:
 
 
 class Best(NamedTuple):
-    """The parameters with the lowest score so far; with a leading axis where there are several seeds."""
+    """Parameters with the lowest score so far. Several seeds add a leading axis."""
 
     parameters: Any
     validation: Array
-    """Their score; inf before the first."""
+    """Score of the parameters; inf before the first."""
     step: Array
-    """Step at which it was reached."""
+    """Step at which the score was reached."""
 
 
 def no_best(parameters: Any) -> Best:
-    """Before the first score, of one seed."""
+    """State before the first score, for one seed."""
     dtype = jnp.result_type(*jax.tree.leaves(parameters))
     return Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.zeros((), jnp.int32))
 
 
 def better_of(best: Best, parameters: Any, validation: Array, step: Array) -> Best:
-    """The better of one seed's best and its parameters of now; NaN is never better."""
+    """Returns the better of one seed's best and current parameters; NaN is never better."""
     better = validation < best.validation
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), Best(parameters, validation, step), best)
 
 
 class Progress(NamedTuple):
-    """State of a run after a dispatch; numbers, or an array [seeds] where several train together."""
+    """State of a run after a dispatch: numbers, or arrays [seeds] if several seeds train together."""
 
     step: Any
     loss: Any
-    """Of Adam the mean over the steps of the dispatch."""
+    """For Adam, the mean over the steps of the dispatch."""
     validation: Any
-    """The score that is to be low."""
+    """Score that selects the parameters."""
     monitor: Any
-    """The score that is only shown; NaN where nothing is monitored."""
+    """Score for display only; NaN if nothing is monitored."""
     seconds: float
-    """Training time so far, compilation and interruptions apart."""
+    """Training time so far, without compilation and interruptions."""
     stage: str = ""
-    """What is trained at the moment, where a training has several stages."""
+    """Name of the current stage, if the training has several."""
 
 
 class Stop(NamedTuple):
@@ -117,28 +117,28 @@ class Stop(NamedTuple):
     reason: str
     """"finished", "no improvement", "time" or "not finite"."""
     step: int
-    """Steps taken; for "not finite" those after which the loss was not."""
+    """Steps taken; for "not finite", the steps before the loss that was not finite."""
 
 
 class Training(NamedTuple):
-    """What a run gives."""
+    """Result of a run."""
 
     parameters: Any
-    """Those with the lowest validation; with a leading axis where several seeds trained."""
+    """Parameters with the lowest validation score. Several seeds add a leading axis."""
     history: list[Progress]
     stop: Stop
     best_step: Any
-    """Step of the lowest validation; an integer, or an array [seeds]."""
+    """Step of the lowest validation score: an integer, or an array [seeds]."""
     compile_seconds: float
 
     @property
     def train_seconds(self) -> float:
-        """Training time, compilation apart."""
+        """Training time without compilation."""
         return self.history[-1].seconds if self.history else 0.0
 
     @property
     def validation(self) -> Any:
-        """The lowest validation; inf before the first. A number, or an array [seeds]."""
+        """Lowest validation score, inf before the first: a number, or an array [seeds]."""
         values = [at.validation for at in self.history]
         return plain(np.nanmin([np.full_like(values[0], np.inf, float), *values], axis=0)) if values else math.inf
 
@@ -151,7 +151,7 @@ def silent(progress: Progress) -> None:
 
 
 def one_after_the_other(histories: Iterable[list[Progress]]) -> list[Progress]:
-    """The histories of several trainings as one, whose steps and seconds go on."""
+    """Joins the histories of consecutive trainings; steps and seconds continue."""
     joined: list[Progress] = []
     for history in histories:
         step, seconds = (joined[-1].step, joined[-1].seconds) if joined else (0, 0.0)
@@ -166,19 +166,19 @@ def plain(values: Any) -> Any:
 
 
 Dispatch = Callable[[Any], tuple[Any, Array]]
-"""state -> state, [loss, validation, monitor] or [seeds, 3]; the given state may be used up."""
+"""state -> state, [loss, validation, monitor] or [seeds, 3]; the argument may be donated."""
 
 
 class Stage(NamedTuple):
-    """A stretch of a training that is one compiled program, as the loop in `fit` sees it.
+    """Part of a training with one compiled program, as the loop in `fit` sees it.
 
-    States are those of the optimiser: `step` and `best` are all that the loop reads of them.
+    States are those of the optimiser; the loop reads only their `step` and `best`.
     """
 
     name: str
     start: Callable[[Any], Any]
-    """The state in which the stage before ended, `None` for the first -> the state before the first step."""
+    """Last state of the stage before, or `None` for the first stage -> the initial state."""
     compile: Callable[[Any], Dispatch]
-    """A state -> some steps and their score, compiled."""
+    """A state -> a compiled dispatch of some steps and their score."""
     ended: Callable[[Any], Stop | None]
-    """A state -> why the stage is over, `None` while it is not."""
+    """A state -> the reason why the stage is over, or `None` if it is not."""

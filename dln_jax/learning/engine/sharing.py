@@ -1,4 +1,4 @@
-"""How devices share a training: several seeds are split over them, and of one the samples."""
+"""Shares a training between devices: splits several seeds over them, or the samples of one seed."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,19 +12,19 @@ from dln_jax.types import InputError
 
 
 class Sharing(NamedTuple):
-    """What is split over a mesh; one of both at most."""
+    """Meshes that split the seeds or the samples; at most one of them."""
 
     seeds: Mesh | None
-    """Each device trains its own, as it would alone: nothing is sent but the results. Some may have one more."""
+    """Every device trains its own seeds, as on its own: only results are sent. Some devices may have one seed more."""
     samples: Mesh | None
-    """Each device sums over its own, and the sums are added up in every step."""
+    """Every device sums over its own samples; every step adds up the sums."""
 
 
 def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
-    """What the devices of a mesh share of a problem.
+    """Returns what the devices of a mesh share in this problem: seeds or samples.
 
     Raises:
-        InputError: one seed, of a loss that is not the mean of those of parts of a batch.
+        InputError: one seed, with a loss that is not the mean of the losses of parts of a batch.
     """
     if mesh is None or np.size(problem.seed) > 1:
         return Sharing(mesh, None)
@@ -34,9 +34,9 @@ def sharing(problem: Problem, mesh: Mesh | None) -> Sharing:
 
 
 def by_devices(function: Callable[[Any, Any], Any], shared: Sharing) -> Callable[[Any, Any], Any]:
-    """The same function of what is whole and what the seeds have, each device for its seeds.
+    """Distributes a function of (whole, seeds): every device evaluates it for its own seeds.
 
-    Devices that share the samples work at all seeds together, and the function itself brings their sums together.
+    Devices that share the samples work on all seeds together, and the function itself adds up their sums.
     """
     together = on_devices(lambda given, _: function(*given), shared.samples)
     return spread(lambda whole, seeds: together((whole, seeds), None), shared.seeds)

@@ -13,21 +13,22 @@ from dln_jax.learning.kinematics.frames import Frames, displaced, free_direction
 from dln_jax.learning.kinematics.projection import Projection, Samples, Structure, project
 
 LENGTH = 0.3
-"""m that weigh as much as a radian in the damping."""
+"""Length in m that weighs as much as a radian in the damping."""
 LARGEST_STEP = 0.6
-"""rad, and as much of `LENGTH`: longer steps are cut."""
+"""Largest step of a coordinate, in rad, and in units of `LENGTH` for positions: longer steps are scaled down."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-12, 1e3
-"""Relative to the mean of the normal matrix' diagonal; at the most, no step is found that descends."""
+"""Initial, smallest and largest damping, relative to the mean of the normal matrix' diagonal; a descent ends at the
+largest."""
 FEWER, MORE = 0.2, 5.0
-"""By which damping changes after a step that descends, and after one that does not."""
+"""Factors of the damping after a step that descends, and after one that does not."""
 CHUNK = 10
-"""Iterations in a program."""
+"""Iterations per dispatch."""
 SETTLED = 1e-4
-"""Relative decrease over a chunk below which a descent has ended."""
+"""A descent ends when the loss decreases by less than this fraction over a chunk."""
 
 
 class State(NamedTuple):
-    """Of a descent."""
+    """State of a descent."""
 
     frames: Frames
     at: Projection
@@ -35,11 +36,11 @@ class State(NamedTuple):
 
 
 Program = Callable[[State, Samples, Array], State]
-"""(state, samples, unit of each joint's torque) -> the state after `CHUNK` iterations."""
+"""(state, samples, scales of the joints' torques) -> the state after `CHUNK` iterations."""
 
 
 def compiled(structure: Structure, *, ridge: float) -> Program:
-    """The program of a structure, which compiles once for a number of samples."""
+    """Returns the program of a structure; it compiles once per number of samples."""
     places = free_directions(structure.parents, structure.joints)
     lengths = np.where(places % 6 < 3, 1.0, LENGTH)
     d = len(structure.joints)
@@ -53,7 +54,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
         step = step * jnp.minimum(1.0, LARGEST_STEP / jnp.maximum(longest, LARGEST_STEP))
         frames = displaced(state.frames, jnp.zeros(6 * d).at[places].set(step).reshape(d, 6))
         at = project(structure, frames, samples, unit, ridge=ridge)
-        lower = at.loss < state.at.loss  # not where it is NaN
+        lower = at.loss < state.at.loss  # false for NaN
         damping = jnp.clip(state.damping * jnp.where(lower, FEWER, MORE), LEAST_DAMPING, MOST_DAMPING)
         before = (state.frames, state.at)
         frames, at = jax.tree.map(lambda new, old: jnp.where(lower, new, old), (frames, at), before)
@@ -66,7 +67,7 @@ def compiled(structure: Structure, *, ridge: float) -> Program:
 
 
 def unseen(frames: Frames, linear: int, directions: int) -> State:
-    """A state from which the first iteration looks at the frames as they are, and steps nowhere."""
+    """Returns a state from which the first iteration only evaluates the frames, without a step."""
     d = len(frames.positions)
     at = Projection(
         loss=jnp.asarray(jnp.inf),
@@ -88,7 +89,7 @@ def descend(
     iterations: int,
     expired: Callable[[], bool] = lambda: False,
 ) -> State:
-    """Iterates until the loss settles, no step descends, the iterations are used up, or time is."""
+    """Iterates until the loss settles, no step descends, or the iterations or the time are used up."""
     samples, unit = jax.tree.map(jnp.asarray, samples), jnp.asarray(unit)
     directions = len(free_directions(structure.parents, structure.joints))
     state = unseen(frames, structure.linear_count, directions)

@@ -1,4 +1,4 @@
-"""Fitting a tree of unknown kinematics to states and torques: search, refinement, and one last linear problem."""
+"""Fits a tree of unknown kinematics to states and torques: search, refinement, and a final linear problem."""
 
 import functools
 import time
@@ -23,39 +23,39 @@ from dln_jax.solvers import least_squares
 from dln_jax.types import InputError, Needs, require_positive
 
 FINALISTS, NEAR = 3, 2.0
-"""Valleys that are refined and judged by validation: at most so many, whose losses are at most so many times the
-lowest."""
+"""Largest number of local minima that are refined and compared by validation, and the largest ratio of their loss to
+the lowest."""
 ROUNDS = 2
-"""Of weighting each joint by what its torques leave unexplained, after which weights change by percents."""
+"""Rounds of weighting the joints by their unexplained torques; further rounds change the weights by percents."""
 LEAST_NOISE = 1e-7
-"""Relative to the torque: no joint is weighted as if it were measured better."""
+"""Lower bound on a joint's noise in the weights, relative to its torque."""
 
 
 class TreeFit(NamedTuple):
-    """A tree that explains torques, and how it was found."""
+    """Tree fitted to torques, with errors and statistics of the search."""
 
     parameters: SerialTreeParameters
-    """Of `make_serial_tree`."""
+    """Parameters of `make_serial_tree`."""
     frames: Frames
     torque_mse: float
     """Mean over the fitted samples of the sum of squared errors over joints; (N m)² or N²."""
     joint_mse: Float[np.ndarray, " d"]
-    """(N m)² or N², mean over the fitted samples."""
+    """Mean squared error of every joint over the fitted samples, (N m)² or N²."""
     validation_error: float
-    """As `torque_mse`, of the validation samples; NaN without any."""
+    """`torque_mse` of the validation samples; NaN without any."""
     parameter_count: int
-    """Numbers of the frames that are no gauges, and of the linear problem."""
+    """Parameters of the frames, without gauges, and of the linear problem."""
     rank: int
-    """Of the linear problem: combinations of inertias and friction that the data determine."""
+    """Rank of the linear problem: combinations of inertias and friction that the data determine."""
     condition: float
     losses: Float[np.ndarray, " K"]
-    """Ends of all descents, mean squares in units of each torque's standard deviation, lowest first."""
+    """Final losses of all descents, lowest first: mean squares in units of the torques' standard deviations."""
     agreeing: int
-    """Descents that ended as low as the lowest."""
+    """Descents that ended at the lowest loss."""
     agreement: int
-    """Descents that the search wanted to agree (`Search.agreement`)."""
+    """Descents that the search required to agree (`Search.agreement`)."""
     seconds: float
-    """Of the whole call, compilation included."""
+    """Duration of the whole call, compilation included."""
 
 
 def fit_tree(
@@ -72,27 +72,29 @@ def fit_tree(
     most_samples: int = 4000,
     report: Callable[[str], None] = lambda text: None,
 ) -> TreeFit:
-    """The frames, inertias, armature and friction with which a tree explains torques, computed in float64.
+    """Fits a tree's frames, inertias, armature and friction to measured torques, in float64.
 
-    Random frames are refined by Gauss-Newton, all else eliminated (`projection`), on some samples; the best also on
-    all, each joint then weighted by its own unexplained torque. Its valleys within a factor of two are chosen from by
-    validation. Handedness and other gauges (see `models.serial_tree`) are as they happen to come.
+    Gauss-Newton refines random frames on a subset of the samples, with all else eliminated (`projection`). The best are
+    refined on all samples, with joints weighted by their unexplained torque. Validation chooses between local minima
+    whose losses differ by less than a factor of two. Handedness and other gauges (see `models.serial_tree`) are
+    arbitrary.
 
     Args:
         needs: kinds of joints, gravity, friction.
-        train: to fit to; accelerations count.
-        validation: to choose by; without it the training error does.
-        parents: link that each hangs on; by default one after the other.
+        train: samples to fit, with accelerations.
+        validation: samples that choose the local minimum; the training error chooses without them.
+        parents: parent link of every link; a serial chain by default.
         acceleration: of gravity, m/s².
         velocity_scale: of dry friction, 1/s or m/s.
-        settings: how much is tried.
-        ridge: of the elimination, relative to the squared length of each column.
-        rank_tolerance: of the last linear problem, as in `solvers.least_squares.solve`.
-        most_samples: that frames are refined on; the last linear problem has all.
-        report: is told what was found, a line at a time.
+        settings: starts, samples and limits of the search.
+        ridge: of the elimination, relative to the squared length of the columns.
+        rank_tolerance: of the final linear problem, as in `solvers.least_squares.solve`.
+        most_samples: largest number of samples for refining frames; the final linear problem uses all.
+        report: called with lines of text about the search.
 
     Raises:
-        InputError: torques that do not vary, other joints than the data's, or a setting out of range.
+        InputError: torques that do not vary, a number of joints that differs from the data's, or a setting out of
+            range.
     """
     require_positive(ridge=ridge, most_samples=most_samples, samples=settings.samples)
     if needs.degrees_of_freedom != train.degrees_of_freedom:
@@ -137,13 +139,13 @@ def fit_tree(
 
 
 def _some(data: Trajectories, most: int, seed: int) -> Samples:
-    """All samples, or so many that are drawn."""
+    """Returns all samples, or a random subset of at most `most`."""
     some = drawn(data, most, seed)
     return Samples(some.q, some.qd, some.qdd, some.tau)
 
 
 def _finalists(found: list[State], validation: Trajectories | None) -> list[State]:
-    """The lowest of each valley that validation may prefer to the lowest of all."""
+    """Returns the lowest state of every local minimum that validation may prefer to the lowest of all."""
     kept = found[:1]
     for state in found[1:]:
         loss, last = float(state.at.loss), float(kept[-1].at.loss)
@@ -161,7 +163,7 @@ def _refined(
     scale: Float[np.ndarray, " d"],
     settings: Search,
 ) -> tuple[State, Float[np.ndarray, " d"]]:
-    """The descent carried on with all samples, and then with units of the torque that each joint leaves over."""
+    """Continues the descent on all samples, then with the joints' residual torques as units."""
     unit = scale
     for last in range(ROUNDS + 1):
         state = descend(program, structure, state.frames, samples, unit, iterations=settings.iterations)
@@ -173,7 +175,7 @@ def _refined(
 def _solved(
     columns: Callable, state: State, unit: Float[np.ndarray, " d"], data: Trajectories, rank_tolerance: float
 ) -> least_squares.Solution:
-    """The linear parameters of given frames from all data, by singular values."""
+    """Solves for the linear parameters of known frames on all data, by singular values."""
 
     def equations() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for Phi, tau in _designs(columns, state.frames, data):
@@ -183,7 +185,7 @@ def _solved(
 
 
 def _joint_errors(columns: Callable, frames: Frames, linear: np.ndarray, data: Trajectories) -> Float[np.ndarray, " d"]:
-    """Mean squared error of each joint's torque."""
+    """Mean squared error of every joint's torque."""
     squares = [np.sum((Phi @ linear - tau) ** 2, axis=0) for Phi, tau in _designs(columns, frames, data)]
     return np.sum(squares, axis=0) / len(data.tau)
 
@@ -197,14 +199,14 @@ def _columns(structure: Structure) -> Callable:
 def _designs(
     columns: Callable, frames: Frames, data: Trajectories, *, length: int = 4096
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Phi [n, d, P] and tau [n, d] of so many samples at a time."""
+    """Phi [n, d, P] and tau [n, d], at most `length` samples at a time."""
     for first in range(0, len(data.tau), length):
         rows = slice(first, first + length)
         yield np.asarray(columns(frames, data.q[rows], data.qd[rows], data.qdd[rows])), data.tau[rows]
 
 
 def _parameters(structure: Structure, frames: Frames, linear: np.ndarray) -> SerialTreeParameters:
-    """Of the model."""
+    """Parameters of the model."""
     armature, *friction = linear[len(structure.inertial) :].reshape(-1, len(structure.joints))
     turns = np.array([rotation_vector(each) for each in np.asarray(frames.rotations)])
     inertias = inertias_of(structure, jnp.asarray(linear))

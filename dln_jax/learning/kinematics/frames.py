@@ -1,4 +1,4 @@
-"""Joint frames as points to search among: random ones, steps between them, and moves to other valleys."""
+"""Joint frames as the unknowns of a search: random ones, steps between them, and moves to other local minima."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -12,11 +12,11 @@ from dln_jax.models.serial_tree import rotation
 from dln_jax.types import JointKind
 
 REACH = 0.15
-"""m, standard deviation of each coordinate of a random joint's place."""
+"""Standard deviation in m of the coordinates of a random joint's position."""
 
 
 class Frames(NamedTuple):
-    """Of the links of a tree at q = 0, each in that of the link that it hangs on; joints are about z."""
+    """Link frames of a tree at q = 0, relative to the parent link; joint axes are z."""
 
     rotations: Any
     """[d, 3, 3]."""
@@ -25,14 +25,14 @@ class Frames(NamedTuple):
 
 
 def random_frames(d: int, random: np.random.Generator) -> Frames:
-    """Frames turned in any way."""
+    """Returns frames with random orientations and positions."""
     rotations, _ = np.linalg.qr(random.normal(size=(d, 3, 3)))
     rotations = rotations * np.sign(np.linalg.det(rotations))[:, None, None]
     return Frames(rotations, REACH * random.normal(size=(d, 3)))
 
 
 def rough_frames(sketch: Frames, random: np.random.Generator, *, angle: float, length: float) -> Frames:
-    """Frames some way from a sketch: turned by `angle`, rad, about a random axis, and moved by `length`, m."""
+    """Perturbs prior frames: rotates them by `angle`, rad, about random axes, and moves them by `length`, m."""
     directions = random.normal(size=(2, *np.shape(sketch.positions)))
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     turns = np.asarray(jax.vmap(rotation)(jnp.asarray(angle * directions[0])))
@@ -40,10 +40,11 @@ def rough_frames(sketch: Frames, random: np.random.Generator, *, angle: float, l
 
 
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:
-    """Places in a flat step [d, 6] of the numbers that torques may show; the others are gauges.
+    """Indices into a flat step [d, 6] of the coordinates that torques may identify; the others are gauges.
 
-    A link's frame may turn about and slide along its own z, so that four numbers are left: two tilts of the axis, and
-    two shifts across it. A prismatic joint's axis, and the base's, have a direction and no place.
+    A link's frame may rotate about its own z and slide along it, which leaves four coordinates: two tilts of the axis
+    and two shifts across it. The axis of a prismatic joint, and of a joint on the base, has a direction but no
+    position.
     """
     places = []
     for link, (parent, kind) in enumerate(zip(parents, joints, strict=True)):
@@ -53,15 +54,15 @@ def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.n
 
 
 def displaced(frames: Frames, step: Float[Array, "d 6"]) -> Frames:
-    """Frames turned by rotation vectors step[:, :3], rad, and moved by step[:, 3:], m, both in their own axes."""
+    """Rotates frames by the vectors step[:, :3], rad, and moves them by step[:, 3:], m, both in their own axes."""
     positions = frames.positions + jnp.einsum("iab,ib->ia", frames.rotations, step[:, 3:])
     return Frames(frames.rotations @ jax.vmap(rotation)(step[:, :3]), positions)
 
 
 def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
-    """The same arm at q = 0 with one joint that turns, or slides, the other way.
+    """Returns the same arm at q = 0 with one joint's direction of motion reversed.
 
-    Where gravity rules, it hardly tells these two apart, and descents end in either.
+    Where gravity dominates, torques hardly distinguish the two arms, and descents end in either.
     """
     half = np.diag([1.0, -1.0, -1.0])
     rotations, positions = (np.array(each) for each in frames)
@@ -73,10 +74,9 @@ def turned_round(frames: Frames, parents: Sequence[int], joint: int) -> Frames:
 
 
 def mirrored(frames: Frames, parents: Sequence[int], joints: Sequence[JointKind]) -> Frames:
-    """The mirror image, which the same motions take through the same torques if the inertias are mirrored too.
+    """Returns the mirror image: it moves alike under the same torques if the inertias are mirrored too.
 
-    Reflecting x, also of every link's frame, reverses how joints turn; y and z of the links that turn are reversed to
-    undo it.
+    Reflecting x in every frame reverses the rotation of revolute joints; reversing y and z of their links restores it.
     """
     mirror, half = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0])
     own = [half if kind == "revolute" else np.eye(3) for kind in joints]

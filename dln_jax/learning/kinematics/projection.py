@@ -1,12 +1,12 @@
-"""Variable projection: for given frames, inertias and friction are a linear problem, and drop out.
+"""Variable projection: for fixed frames, inertias and friction solve a linear problem and are eliminated.
 
     tau = Phi(frames) theta,   r = (1 - U Uᵀ) y,   J = -(1 - U Uᵀ) dPhi theta
 
-y are the torques in their units, Phi likewise, U spans its columns. J is Kaufman's (1975) simplification of Golub and
-Pereyra's derivative: its gradient Jᵀr is exact, and it needs no derivative of U. The columns are those of a minimal
-parametrisation (the others are carried by the link before: Khalil and Dombre 2002, section 9.4), scaled to length one;
-the ridge, relative to them, decides where data cannot. Sums over samples only are formed, so that a step takes
-milliseconds; `fit` solves the last linear problem with all digits.
+y holds the scaled torques, Phi is scaled likewise, and U spans its columns. J is Kaufman's (1975) simplification of
+Golub and Pereyra's derivative: its gradient Jᵀr is exact, and it needs no derivative of U. The columns are those of a
+minimal parametrisation (the parent link takes up the others: Khalil and Dombre 2002, section 9.4), scaled to length
+one. The ridge, relative to them, decides directions that the data leave undetermined. Only sums over samples are
+formed, so that a step takes milliseconds; `fit` solves the final linear problem to full precision.
 """
 
 from typing import Any, NamedTuple
@@ -21,41 +21,41 @@ from dln_jax.mechanics.trees.scanned import scanned_forces, scanned_regressor
 from dln_jax.types import JointKind, Vector
 
 OF_REVOLUTE = np.array([1, 2, 4, 5, 6, 8, 9])
-"""Inertial parameters of a link that turns; m, h_z and I_yy are the link's before."""
+"""Inertial parameters of a revolute link; the parent link takes up m, h_z and I_yy."""
 OF_PRISMATIC = np.array([0, 1, 2, 3])
-"""Of a link that slides; its moments are the link's before."""
+"""Inertial parameters of a prismatic link; the parent link takes up its moments."""
 
 
 class Structure(NamedTuple):
-    """What is known of a tree."""
+    """Known properties of a tree."""
 
     parents: tuple[int, ...]
     joints: tuple[JointKind, ...]
     acceleration: float
-    """Of gravity, m/s²."""
+    """Acceleration of gravity, m/s²."""
     friction: bool
     velocity_scale: float
-    """Of dry friction, 1/s or m/s."""
+    """Velocity scale of dry friction, 1/s or m/s."""
 
     @property
     def gravity(self) -> tuple[float, float, float]:
-        """m/s², z up."""
+        """Gravity, m/s², z up."""
         return (0.0, 0.0, -self.acceleration)
 
     @property
     def inertial(self) -> np.ndarray:
-        """Places in a flat [d, 10] of the inertial parameters of the minimal parametrisation."""
+        """Indices into a flat [d, 10] of the inertial parameters of the minimal parametrisation."""
         kept = (OF_REVOLUTE if kind == "revolute" else OF_PRISMATIC for kind in self.joints)
         return np.concatenate([10 * link + own for link, own in enumerate(kept)])
 
     @property
     def linear_count(self) -> int:
-        """P, of the linear parameters."""
+        """P, the number of linear parameters."""
         return len(self.inertial) + len(self.joints) * (4 if self.friction else 1)
 
 
 class Samples(NamedTuple):
-    """States and torques, [N, d] each."""
+    """States and torques, as arrays [N, d]."""
 
     q: Any
     qd: Any
@@ -64,12 +64,12 @@ class Samples(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """What is left of the torques once the linear parameters are eliminated, in the joints' units."""
+    """Residual torques after elimination of the linear parameters, in the joints' units."""
 
     loss: Any
-    """Mean of squares over samples and joints."""
+    """Mean square over samples and joints."""
     squares: Any
-    """[d], mean over samples."""
+    """[d], mean squares over samples."""
     linear: Any
     """[P]: inertial parameters of `Structure.inertial`, armature, and viscous, dry and offset friction."""
     normal: Any
@@ -79,7 +79,7 @@ class Projection(NamedTuple):
 
 
 def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi of one state, without units."""
+    """Phi of one state, unscaled."""
     d = q.shape[0]
     regressor = scanned_regressor(structure.parents, structure.joints, structure.gravity, *frames, q, qd, qdd)
     columns = [regressor.reshape(d, 10 * d)[:, structure.inertial], jnp.diag(qdd)]
@@ -89,7 +89,7 @@ def design(structure: Structure, frames: Frames, q: Vector, qd: Vector, qdd: Vec
 
 
 def inertias_of(structure: Structure, linear: Float[Array, " P"]) -> Float[Array, "d 10"]:
-    """The links' inertial parameters, zero where the minimal parametrisation has none."""
+    """Inertial parameters of the links, zero where the minimal parametrisation has none."""
     d, places = len(structure.joints), structure.inertial
     return jnp.zeros(10 * d, linear.dtype).at[places].set(linear[: len(places)]).reshape(d, 10)
 
@@ -97,14 +97,14 @@ def inertias_of(structure: Structure, linear: Float[Array, " P"]) -> Float[Array
 def project(
     structure: Structure, frames: Frames, samples: Samples, unit: Float[Array, " d"], *, ridge: float
 ) -> Projection:
-    """Eliminates the linear parameters, and gives the normal equations of a step of the frames.
+    """Eliminates the linear parameters and returns the normal equations of a step of the frames.
 
     Args:
-        structure: what is known.
-        frames: that are tried.
-        samples: to explain.
-        unit: of each joint's torque, N m or N.
-        ridge: added to the Gram matrix of the columns, each scaled to length one.
+        structure: known properties of the tree.
+        frames: current frames.
+        samples: states and measured torques.
+        unit: scale of the joints' torques, N m or N.
+        ridge: added to the diagonal of the Gram matrix of the columns, scaled to length one.
     """
     *state, tau = samples
     equations = tau.size
@@ -112,7 +112,7 @@ def project(
     Phi, y = Phi.reshape(equations, -1), (tau / unit).ravel()
     gram = Phi.T @ Phi
     lengths = jnp.sqrt(jnp.diag(gram))
-    seen = lengths > 1e-9 * jnp.max(lengths)  # others are rounding, which scaling would blow up
+    seen = lengths > 1e-9 * jnp.max(lengths)  # shorter columns are rounding, which scaling would amplify
     scale = jnp.where(seen, lengths, 1.0)
     both = seen[:, None] & seen
     gram = jnp.where(both, gram / (scale[:, None] * scale), 0.0) + jnp.diag(jnp.where(seen, ridge, 1.0))

@@ -1,6 +1,6 @@
-"""Many descents of joint frames from random starts, and discrete moves of the best; two or more threads at a time.
+"""Searches joint frames by many descents from random starts, and by discrete moves of the best, in parallel threads.
 
-Descents end in few valleys that recur. That several starts agree on the lowest says that it is the lowest.
+Descents end in a few recurring local minima. If several starts agree on the lowest, it is probably the global minimum.
 """
 
 import functools
@@ -20,46 +20,46 @@ from dln_jax.learning.kinematics.projection import Samples, Structure
 from dln_jax.types import require_positive, require_seed
 
 WAVE = 8
-"""Starts between two looks at whether they agree, whatever the number of threads: results do not depend on it."""
+"""Starts between two tests of agreement; it is independent of the number of threads, and so are the results."""
 ALIKE = 0.02
-"""Relative difference of two losses of the same valley."""
+"""Largest relative difference of two losses that count as the same local minimum."""
 
 
 class Search(NamedTuple):
-    """How much is tried; whatever ends first."""
+    """Limits of the search; the first one that is reached ends it."""
 
     starts: int = 64
-    """Random starts at most."""
+    """Largest number of random starts."""
     agreement: int = 5
-    """Starts that must reach the lowest loss of all for the search to end."""
+    """Number of starts that must reach the lowest loss for the search to end."""
     iterations: int = 150
-    """Of a descent, at most."""
+    """Largest number of iterations of a descent."""
     samples: int = 160
-    """Drawn from the data for the search; the best is refined on all."""
+    """Samples drawn from the data for the search; the best frames are refined on all."""
     seconds: float = float("inf")
-    """After which the best so far is taken; at least one wave of starts is done."""
+    """Time after which the best frames so far are taken; at least one wave of starts runs."""
     seed: int = 0
-    """Of the starts and of the samples."""
+    """Seed of the starts and of the samples."""
     threads: int = 2
     sketch: Frames | None = None
-    """Frames to start near, such as of a drawing: link lengths, and axes known roughly."""
+    """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""
     sketch_angle: float = 0.5
-    """rad, by which axes of the sketch are off."""
+    """Deviation of the prior's axes, rad."""
     sketch_length: float = 0.05
-    """m, likewise places."""
+    """Deviation of the prior's positions, m."""
 
 
 def search(
     structure: Structure, program: Program, samples: Samples, unit: Float[np.ndarray, " d"], settings: Search
 ) -> list[State]:
-    """The ends of all descents, the lowest first.
+    """Returns the final states of all descents, lowest loss first.
 
     Args:
-        structure: what is known of the tree.
-        program: of the structure.
-        samples: to explain, those of the data that the search sees.
-        unit: of each joint's torque.
-        settings: how much is tried.
+        structure: known properties of the tree.
+        program: descent of the structure, from `compiled`.
+        samples: samples of the data for the search.
+        unit: scale of the joints' torques.
+        settings: limits of the search.
 
     Raises:
         InputError: a setting out of range.
@@ -87,7 +87,7 @@ def search(
 
 
 def agreeing(found: list[State]) -> int:
-    """How many descents ended as low as the lowest."""
+    """Number of descents that ended at the lowest loss."""
     return sum(float(state.at.loss) <= (1 + ALIKE) * float(found[0].at.loss) for state in found)
 
 
@@ -104,7 +104,7 @@ def _start(structure: Structure, settings: Search, index: int) -> Frames:
 
 
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:
-    """So many joints at a time that turn the other way."""
+    """Yields the frames with every combination of this number of joints reversed."""
     for chosen in itertools.combinations(range(len(structure.joints)), joints):
         yield functools.reduce(lambda frames, joint: turned_round(frames, structure.parents, joint), chosen, frames)
 
@@ -118,7 +118,7 @@ def _end(
     expired: Callable[[], bool],
     frames: Frames,
 ) -> State:
-    with jax.enable_x64(True):  # a setting of each thread
+    with jax.enable_x64(True):  # the setting is local to a thread
         return descend(program, structure, frames, samples, unit, iterations=iterations, expired=expired)
 
 

@@ -1,6 +1,6 @@
-"""A rough description of an arm, near which the search for its frames starts.
+"""Kinematic prior of an arm: a rough description near which the search for its frames starts.
 
-Where joints are in space at q = 0, with the ground's z up: axes and a point on each; or Denavit-Hartenberg rows.
+It holds the joint axes in space at q = 0, with z up, and a point on every axis; or Denavit-Hartenberg rows.
 """
 
 import reprlib
@@ -15,7 +15,7 @@ from dln_jax.mechanics.trees.description import dh_frames
 from dln_jax.types import InputError, finite_array
 
 FIELDS = {"axes": 3, "points": 3, "dh_rows": 4}
-"""Columns of each."""
+"""Number of columns of the fields."""
 ROUGHNESS = {"angle_degrees": 30.0, "length": 0.05}
 EXPECTED = (
     'expected {"axes": [[x, y, z], ...], "points": [[x, y, z], ...]} or {"dh_rows": [[alpha, a, d, theta], ...]}, a '
@@ -24,24 +24,24 @@ EXPECTED = (
 
 
 class Sketch(NamedTuple):
-    """Frames, and how rough they are."""
+    """Frames and their deviations."""
 
     frames: Frames
     angle: float = float(np.radians(ROUGHNESS["angle_degrees"]))
-    """rad, by which axes are off."""
+    """Deviation of the axes, rad."""
     length: float = ROUGHNESS["length"]
-    """m, likewise places."""
+    """Deviation of the positions, m."""
 
 
 def frames_of_axes(
     axes: Float[np.ndarray, "d 3"], points: Float[np.ndarray, "d 3"], parents: Sequence[int] | None = None
 ) -> Frames:
-    """Frames with z along each joint's axis and the origin at its point, each in that of the link that it hangs on.
+    """Returns frames with z along the joints' axes and the origin at their points, relative to the parent link.
 
     Args:
         axes: of the joints in space at q = 0, of any length.
-        points: on them, m.
-        parents: link that each hangs on, -1 for the ground; by default one after the other.
+        points: on the axes, m.
+        parents: parent link of every link, -1 for the ground; a serial chain by default.
 
     Raises:
         InputError: arrays of another shape or not finite, or an axis of length zero.
@@ -62,10 +62,10 @@ def frames_of_axes(
 
 
 def sketch_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> Sketch:
-    """The sketch of d joints that JSON values state.
+    """Builds the prior of d joints from JSON values.
 
     Raises:
-        InputError: other fields than those that there are, another number of rows, or what `frames_of_axes` refuses.
+        InputError: unknown fields, another number of rows, or arrays that `frames_of_axes` refuses.
     """
     names = set(values) - set(ROUGHNESS) if isinstance(values, dict) else set()
     if names not in ({"axes", "points"}, {"dh_rows"}):
@@ -98,7 +98,7 @@ def _positive(name: str, given: Any) -> float:
 
 
 def _with_z_along(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """A rotation whose last column is a unit vector."""
+    """Returns a rotation whose last column is the unit vector `axis`."""
     x = np.cross(np.eye(3)[np.argmin(abs(axis))], axis)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)

@@ -1,4 +1,4 @@
-"""Friction of joints: laws, their Rayleigh functions, load in transmissions, and how they join a system's energies."""
+"""Friction of joints: laws, their Rayleigh functions, and load in transmissions."""
 
 from dln_jax.mechanics.friction.curves import unit_force
 from dln_jax.mechanics.friction.dissipation import joint_dissipation, joint_rates, require_shape

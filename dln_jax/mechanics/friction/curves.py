@@ -1,7 +1,7 @@
-"""Rayleigh functions of unit coefficients, elementwise in the rate u of a joint, with their forces as exact slopes.
+"""Rayleigh functions of unit coefficients, elementwise in the rate u of a joint, with exact forces as derivatives.
 
-Each is the integral of its force from rest. Derivatives are written out, and not those of the integral, whose terms
-cancel; further ones are exact derivatives of the force.
+Every function is the integral of its force from rest. Its derivative is written out, because the terms in that of the
+integral cancel; higher derivatives are exact derivatives of the force.
 """
 
 import math
@@ -17,11 +17,11 @@ from dln_jax.mechanics.friction.laws import FrictionShape
 from dln_jax.types import Vector
 
 NODES, WEIGHTS = (0.5 * (each + shift) for each, shift in zip(np.polynomial.legendre.leggauss(40), (1, 0), strict=True))
-"""Of Gauss and Legendre's rule on [0, 1]; exact to rounding for what is integrated here."""
+"""Gauss-Legendre nodes and weights on [0, 1]; exact to rounding for the integrands here."""
 
 
 def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callable[..., Array]:
-    """The function value(x, *rest), elementwise in x, whose derivative by x is `slope(x, *rest)`."""
+    """Returns the function value(x, *rest), elementwise in x, with the derivative `slope(x, *rest)` by x."""
     function = jax.custom_jvp(value)
 
     def rule(primals, tangents):
@@ -31,7 +31,7 @@ def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callab
         total = jnp.zeros_like(result) if isinstance(change, SymbolicZero) else slope(*primals) * change
         for place, other in enumerate(others):
             if not isinstance(other, SymbolicZero):
-                # Of what follows x by differentiating the integral.
+                # Derivatives by the arguments after x come from the integral.
                 moved = lambda r, place=place: value(x, *rest[:place], r, *rest[place + 1 :])  # noqa: E731
                 total = total + jax.jvp(moved, (rest[place],), (other,))[1]
         return result, total
@@ -41,7 +41,7 @@ def integral(value: Callable[..., Array], slope: Callable[..., Array]) -> Callab
 
 
 def _log_cosh(x: Vector) -> Vector:
-    """Without cosh, which overflows."""
+    """log cosh x without cosh, which overflows."""
     return jnp.logaddexp(x, -x) - jnp.log(jnp.asarray(2.0, x.dtype))
 
 
@@ -64,7 +64,7 @@ def _one_sided(side: int) -> Callable[[Vector], Vector]:
 
 
 def _stribeck_value(x: Vector, ratio: Vector) -> Vector:
-    """√π/2 erf|x| less the integral of exp(-s²) (1 - tanh(s / ratio)), which lives near rest."""
+    """√π/2 erf|x| minus the integral of exp(-s²) (1 - tanh(s / ratio)), whose integrand vanishes away from rest."""
     size = jnp.abs(x)
     reach = jnp.minimum(size, jnp.minimum(20 * ratio, 7.0))[..., None]
     s = reach * jnp.asarray(NODES, x.dtype)
@@ -111,7 +111,7 @@ POTENTIALS: Mapping[str, Callable[[Vector, FrictionShape], Vector]] = {
     "coulomb_backward": _scaled(dry_backward, 1),
     "sigmoid": _sigmoid,
 }
-"""By the name of a coefficient, the Rayleigh function of one unit of it, [d], for each joint; W."""
+"""Rayleigh function of one unit of a coefficient, by its name, [d] for the joints; W."""
 
 
 def unit_force(coefficient: str, u: Vector, shape: FrictionShape) -> Vector:

@@ -1,4 +1,4 @@
-"""Friction of joints as a Rayleigh function D(q, qd), whose slope by the velocity is the force."""
+"""Friction of joints as a Rayleigh function D(q, qd), whose derivative by the velocity is the force."""
 
 from typing import Any
 
@@ -27,16 +27,18 @@ def joint_dissipation(
     sigmoid_shift: Any = 0.0,
     joint_map: Any = None,
 ) -> Dissipation | None:
-    """(q, qd) -> D in W, or `None` where all coefficients are absent, or known to be zero.
+    """(q, qd) -> D in W, or `None` if all coefficients are absent or known to be zero.
 
-    D is the sum over joints of the laws' integrals, smooth at rest, and not negative for coefficients that are not
-    (the offset's part apart, which is no loss). The force is that of the formulas in `friction.laws`, and is exact.
+    D is the sum over joints of the laws' integrals. It is smooth at rest, and non-negative for non-negative
+    coefficients (except the part of the offset, which is no loss). The force is exactly that of the formulas in
+    `friction.laws`.
 
     Args:
-        viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; for each joint [d] or one for all.
+        viscous, coulomb, offset, stribeck: as in `FrictionCoefficients`; one per joint [d] or one for all.
         viscous_forward, viscous_backward, coulomb_forward, coulomb_backward, sigmoid: likewise.
         velocity_scale, stribeck_velocity, sigmoid_slope, sigmoid_shift: as in `FrictionShape`.
-        joint_map: J [d, d], known, of joint rates J qd where coordinates are others; D(J qd), with the force Jᵀ dD/du.
+        joint_map: known J [d, d] that maps rates of the coordinates to joint rates J qd; D(J qd), with the force
+            Jᵀ dD/du.
 
     Raises:
         InputError: a known coefficient of friction that is negative or not finite, or a known velocity or slope that is
@@ -70,7 +72,7 @@ def joint_dissipation(
 
 
 def joint_rates(joint_map: Any, qd: Vector) -> Vector:
-    """The rates of joints [d], J qd."""
+    """Joint rates J qd [d]."""
     return qd if joint_map is None else jnp.asarray(joint_map, qd.dtype) @ qd
 
 

@@ -1,16 +1,16 @@
-"""The laws of friction in a joint, what numbers each takes, and which of those enter its force linearly.
+"""Friction laws of a joint, their coefficients, and which of them enter the force linearly.
 
 With the joint's rate u, and v, w, a, s the velocity scale, Stribeck's velocity, the sigmoid's slope and its shift,
 
-| law | force | linear in | depends otherwise on |
+| law | force | linear in | other parameters |
 |---|---|---|---|
 | viscous | b u | b | |
 | coulomb | c tanh(u / v) | c | v |
-| stribeck | c_s exp(-(u / w)²) tanh(u / v), on top of coulomb's | c_s, static less dry friction | v, w |
+| stribeck | c_s exp(-(u / w)²) tanh(u / v), on top of coulomb's | c_s, static minus dry friction | v, w |
 | offset | o | o | |
 | asymmetric | b₊ u + c₊ forwards, b₋ u - c₋ backwards | b₊, b₋, c₊, c₋ | v |
 | sigmoid | A / (1 + exp(-a (u + s))) - A / (1 + exp(-a s)) | A | a, s |
-| load | μ abs(tau_link) tanh(u / v) | | v, and bilinear in μ and what tau_link is linear in |
+| load | μ abs(tau_link) tanh(u / v) | | v, and bilinear in μ and the parameters of tau_link |
 
 Stribeck's is the usual form (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994), the sigmoid that of Gaz et al. 2019
 (RA-L, the Panda). The asymmetric law passes smoothly from one direction to the other: with t = tanh(u / v) and
@@ -18,7 +18,7 @@ k = u / √(u² + v²) it is
 
     b₊ u (1 + k)/2 + b₋ u (1 - k)/2 + c₊ t (1 + t)/2 + c₋ t (1 - t)/2
 
-which with equal coefficients is viscous and coulomb, and takes power whatever they are.
+With equal coefficients this is viscous and coulomb; it dissipates power for any coefficients.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,16 +30,16 @@ LAWS: tuple[FrictionLaw, ...] = get_args(FrictionLaw)
 
 
 class FrictionCoefficients(NamedTuple):
-    """What friction is linear in: a number for each joint [d], or one for all; `None` for a law that is not there."""
+    """Linear parameters of friction: a number per joint [d], or one for all; `None` for absent laws."""
 
     viscous: Any = None
     """b, N m s or N s/m."""
     coulomb: Any = None
     """c, N m or N."""
     offset: Any = None
-    """o, N m or N: no loss, but what sensors and gears leave; the only one that may be negative."""
+    """o, N m or N: an offset of sensors and gears rather than a loss; the only one that may be negative."""
     stribeck: Any = None
-    """c_s, N m or N, by which static friction exceeds dry friction."""
+    """c_s, N m or N, static minus dry friction."""
     viscous_forward: Any = None
     """b₊, N m s or N s/m."""
     viscous_backward: Any = None
@@ -53,10 +53,10 @@ class FrictionCoefficients(NamedTuple):
 
 
 class FrictionShape(NamedTuple):
-    """What friction is not linear in: a number for each joint [d], or one for all."""
+    """Nonlinear parameters of friction: a number per joint [d], or one for all."""
 
     velocity_scale: Any = 0.01
-    """v, 1/s or m/s, at which dry friction has 76 % of its force; a joint that rests creeps more slowly."""
+    """v, 1/s or m/s, at which dry friction reaches 76 % of its force; a joint at rest creeps more slowly."""
     stribeck_velocity: Any = 0.1
     """w, 1/s or m/s."""
     sigmoid_slope: Any = 10.0
@@ -74,7 +74,7 @@ COEFFICIENTS: Mapping[FrictionLaw, tuple[str, ...]] = {
     "sigmoid": ("sigmoid",),
     "load": (),
 }
-"""Of each law, in `FrictionCoefficients`."""
+"""Names in `FrictionCoefficients`, by law."""
 SHAPE: Mapping[FrictionLaw, tuple[str, ...]] = {
     "viscous": (),
     "coulomb": ("velocity_scale",),
@@ -84,23 +84,23 @@ SHAPE: Mapping[FrictionLaw, tuple[str, ...]] = {
     "sigmoid": ("sigmoid_slope", "sigmoid_shift"),
     "load": ("velocity_scale",),
 }
-"""Of each law, in `FrictionShape`."""
+"""Names in `FrictionShape`, by law."""
 
 
 def coefficients_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
-    """Names of the coefficients that some laws take, in the order of `FrictionCoefficients`."""
+    """Names of the coefficients of some laws, in the order of `FrictionCoefficients`."""
     named = {name for law in laws for name in COEFFICIENTS[law]}
     return tuple(name for name in FrictionCoefficients._fields if name in named)
 
 
 def shape_of(laws: Iterable[FrictionLaw]) -> tuple[str, ...]:
-    """Names of the numbers of shape that some laws take, in the order of `FrictionShape`."""
+    """Names of the shape parameters of some laws, in the order of `FrictionShape`."""
     named = {name for law in laws for name in SHAPE[law]}
     return tuple(name for name in FrictionShape._fields if name in named)
 
 
 def require_laws(laws: Any, name: str) -> None:
-    """Raises `InputError` unless each of these is a law, once, and no two are the same friction."""
+    """Raises `InputError` unless all are laws, without duplicates, and no two describe the same friction."""
     if unknown := [law for law in laws if law not in LAWS]:
         raise InputError(f"{name} has {unknown[0]!r:.40}; expected some of {', '.join(LAWS)}")
     if len(set(laws)) < len(laws):

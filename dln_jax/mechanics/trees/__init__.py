@@ -1,6 +1,6 @@
 """Rigid bodies in a tree of revolute and prismatic joints: a description, its energies, and recursions over it.
 
-`tree_system(tree)` is a record for `mechanics.equations.dynamics`; `lagrangian(tree)` is the scalar that it comes from.
+`tree_system(tree)` is a record for `mechanics.equations.dynamics`; `lagrangian(tree)` is its Lagrangian.
 """
 
 from dln_jax.mechanics.trees.description import Tree, dh_frames, make_tree, serial, with_payload

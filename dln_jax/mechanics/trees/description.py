@@ -1,4 +1,4 @@
-"""A tree of rigid bodies: which joint hangs on which, where and along which axis, and what each link weighs."""
+"""Description of a tree of rigid bodies: its structure, joint frames and axes, and inertias."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -14,15 +14,15 @@ EARTH = (0.0, 0.0, -9.81)
 
 
 class Tree(NamedTuple):
-    """Rigid bodies in a tree of d joints, one link behind each; a link's frame has its origin at its joint.
+    """Rigid bodies in a tree of d joints, with one link behind every joint; a link's frame has its origin at its joint.
 
-    Where q = 0, link i is turned by `rotations[i]` and placed at `positions[i]` in the frame of the link that it hangs
-    on. It turns about `axes[i]`, or moves along it, in its own frame. The structure is plain Python; the numbers are
-    arrays, of NumPy where they are known (then zeros among them cost nothing) or of JAX where they are learned.
+    At q = 0, link i has the rotation `rotations[i]` and the position `positions[i]` in the frame of its parent link. It
+    rotates about `axes[i]`, or slides along it, in its own frame. The structure is plain Python. The numbers are NumPy
+    arrays if they are known (zeros among them then cost nothing) or JAX arrays if they are learned.
     """
 
     parents: tuple[int, ...]
-    """The link that each hangs on, one before it; -1 is the ground."""
+    """Parent link of every link, an earlier one; -1 is the ground."""
     joints: tuple[JointKind, ...]
     rotations: Any
     """[d, 3, 3]; columns are the axes of the link's frame."""
@@ -31,13 +31,13 @@ class Tree(NamedTuple):
     axes: Any
     """[d, 3], unit vectors."""
     inertias: Any
-    """[d, 10], the inertial parameters of each link in its frame, as `inertia.PARAMETERS`."""
+    """[d, 10], the links' inertial parameters in their own frames, as `inertia.PARAMETERS`."""
     armature: Any
-    """[d], inertia of each motor on the joint's side, kg m² or kg."""
+    """[d], inertias of the motors on the joints' side, kg m² or kg."""
     gravity: Any = np.array(EARTH)
     """[3], m/s², in the frame of the ground."""
     names: tuple[str, ...] = ()
-    """Of the joints, where they have any."""
+    """Names of the joints, if any."""
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -46,7 +46,7 @@ class Tree(NamedTuple):
 
     @property
     def needs(self) -> Needs:
-        """What a model of it needs; friction is stated apart."""
+        """Needs of a model of the tree, without friction, which is specified separately."""
         still = isinstance(self.gravity, np.ndarray) and not self.gravity.any()
         return Needs(joints=self.joints, gravity=not still)
 
@@ -63,11 +63,11 @@ def make_tree(
     gravity: Any = EARTH,
     names: Sequence[str] = (),
 ) -> Tree:
-    """A tree of known numbers, whose structure and shapes are checked; axes are made unit vectors.
+    """Builds a tree of known numbers and checks its structure and shapes; axes are normalised.
 
     Raises:
-        InputError: links out of order, joints of another kind, arrays of another shape or not finite, a rotation that
-            is none, or an axis of length zero.
+        InputError: links out of order, joints of another kind, arrays of another shape or not finite, an invalid
+            rotation, or an axis of length zero.
     """
     d = len(parents)
     if d == 0 or any(not -1 <= parent < link for link, parent in enumerate(parents)):
@@ -97,7 +97,7 @@ def make_tree(
 
 
 def serial(rotations: Any, positions: Any, inertias: Any, *, axes: Any = None, **others: Any) -> Tree:
-    """An arm: each link hangs on the one before; by default revolute joints about z. Others as for `make_tree`."""
+    """Builds an arm, a serial chain by default of revolute joints about z. Other arguments as for `make_tree`."""
     d = np.shape(positions)[0]
     axes = np.tile([0.0, 0.0, 1.0], (d, 1)) if axes is None else axes
     joints = others.pop("joints", ("revolute",) * d)
@@ -108,8 +108,8 @@ def dh_frames(rows: Any) -> tuple[np.ndarray, np.ndarray]:
     """Rotations [d, 3, 3] and positions [d, 3] of an arm whose joints turn about z, from Denavit-Hartenberg rows.
 
     Args:
-        rows: [d, 4], modified, after Craig: each (alpha, a, d, theta) is a turn by alpha, rad, about x and a shift by
-            a, m, along it, then a turn by theta about z and a shift by d along it.
+        rows: [d, 4], modified, after Craig: a row (alpha, a, d, theta) is a rotation by alpha, rad, about x and a shift
+            by a, m, along it, then a rotation by theta about z and a shift by d along it.
 
     Raises:
         InputError: rows of another shape.
@@ -126,7 +126,7 @@ def dh_frames(rows: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_payload(tree: Tree, link: int, inertia: Inertia, *, rotation: Any = None, position: Any = None) -> Tree:
-    """The tree with a body fixed to a link, in whose frame the body's own has this rotation and position.
+    """Adds a body fixed to a link; rotation and position are those of the body's frame in the link's frame.
 
     Raises:
         InputError: no such link.

@@ -1,4 +1,4 @@
-"""Energies of a tree, and the record of mechanics that answers by recursions."""
+"""Energies of a tree, and its record with forces by recursions."""
 
 import jax.numpy as jnp
 
@@ -30,10 +30,10 @@ def kinetic_energy(tree: Tree, q: Vector, qd: Vector) -> Scalar:
 
 
 def potential_energy(tree: Tree, q: Vector) -> Scalar:
-    """V = -sum over links of gravity . (m p + R h), zero where all origins are in that of the ground."""
+    """V = -sum over links of gravity . (m p + R h), zero if all centres of mass are at the ground's origin."""
     tree = aligned(tree)
     frames = placed(tree, q)
-    # Mass and first moment of all that hangs on a link, from the tips to the ground.
+    # Mass and first moment of the subtree of a link, from the tips to the ground.
     hanging = [parts(theta)[:2] for theta in tree.inertias]
     total = jnp.zeros(3, q.dtype)
     for link in reversed(range(len(frames))):
@@ -48,17 +48,17 @@ def potential_energy(tree: Tree, q: Vector) -> Scalar:
 
 
 def lagrangian(tree: Tree) -> Lagrangian:
-    """L(q, qd) = T - V, from which everything else follows."""
+    """L(q, qd) = T - V, from which all dynamics follow."""
     return lambda q, qd: kinetic_energy(tree, q, qd) - potential_energy(tree, q)
 
 
 def tree_energies(tree: Tree, dissipation: Dissipation | None = None) -> LagrangianSystem:
-    """The record of the scalar alone, whose forces are derivatives; slower than `tree_system`, and equal to it."""
+    """Returns a record of the Lagrangian alone, with derivatives as forces; equal to `tree_system`, but slower."""
     return LagrangianSystem(lagrangian(tree), dissipation)
 
 
 def tree_system(tree: Tree, dissipation: Dissipation | None = None) -> RecursiveSystem:
-    """The record that `equations.dynamics` takes, with forces by recursions.
+    """Returns the record for `equations.dynamics`, with forces by recursions.
 
     Args:
         tree: of known or learned numbers.

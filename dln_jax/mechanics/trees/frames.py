@@ -1,6 +1,6 @@
 """Frames of a tree's links, and vectors between them.
 
-Every joint is about z of its link here: `aligned` turns the links of a tree so. Rotations that are known and only
+All joints are about z of their link here: `aligned` rotates the links of a tree accordingly. Known rotations that only
 exchange axes cost nothing but signs.
 """
 
@@ -19,10 +19,10 @@ Vector3 = Float[Array, "3"]
 
 
 class Placed(NamedTuple):
-    """A link's frame in that of the link that it hangs on, at one state."""
+    """Frame of a link relative to its parent link, at one state."""
 
     rotation: Any
-    """[3, 3] where q = 0."""
+    """[3, 3] at q = 0."""
     turned: tuple[Array, Array] | None
     """Cosine and sine of the joint's angle; `None` for a prismatic joint."""
     position: Any
@@ -30,7 +30,7 @@ class Placed(NamedTuple):
 
 
 def aligned(tree: Tree) -> Tree:
-    """The same bodies and joints in frames whose joint axis is z; payloads and frames of links are others then."""
+    """Returns the same bodies and joints in frames whose joint axis is z; frames and payloads of links change."""
     if not isinstance(tree.axes, np.ndarray) or np.array_equal(
         tree.axes, np.tile([0.0, 0.0, 1.0], (len(tree.axes), 1))
     ):
@@ -38,7 +38,7 @@ def aligned(tree: Tree) -> Tree:
     turns = [_onto(axis) for axis in tree.axes]
     rotations, positions = [], []
     for link, parent in enumerate(tree.parents):
-        # In the frame of the parent as it was, then as it is turned.
+        # In the original frame of the parent, then in its rotated frame.
         rotation, position = tree.rotations[link] @ turns[link], tree.positions[link]
         back = np.eye(3) if parent < 0 else turns[parent].T
         rotations.append(back @ rotation)
@@ -51,7 +51,7 @@ def aligned(tree: Tree) -> Tree:
 
 
 def _onto(axis: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is an axis, of whole numbers where that is one of the frame's."""
+    """A rotation whose third column is the axis, with whole numbers if that is an axis of the frame."""
     place = int(np.argmax(np.abs(axis)))
     first = np.eye(3)[(place + 1) % 3]
     first = first - axis * (axis @ first)
@@ -60,7 +60,7 @@ def _onto(axis: np.ndarray) -> np.ndarray:
 
 
 def placed(tree: Tree, q: Vector) -> list[Placed]:
-    """Where each link of an aligned tree is on the one that it hangs on."""
+    """Frames of the links of an aligned tree relative to their parent links."""
     found = []
     for link, kind in enumerate(tree.joints):
         rotation, position = tree.rotations[link], tree.positions[link]
@@ -72,7 +72,7 @@ def placed(tree: Tree, q: Vector) -> list[Placed]:
 
 
 def outwards(frame: Placed, vector: Vector3) -> Vector3:
-    """A vector of the parent's frame in that of the link."""
+    """Maps a vector from the parent's frame to the link's."""
     x, y, z = _product(frame.rotation.T, vector)
     if frame.turned is None:
         return jnp.stack([x, y, z])
@@ -81,7 +81,7 @@ def outwards(frame: Placed, vector: Vector3) -> Vector3:
 
 
 def inwards(frame: Placed, vector: Vector3) -> Vector3:
-    """A vector of the link's frame in that of the parent."""
+    """Maps a vector from the link's frame to the parent's."""
     if frame.turned is not None:
         c, s = frame.turned
         x, y, z = vector
@@ -105,7 +105,7 @@ def _product(matrix: Any, vector: Vector3) -> list[Any]:
 
 
 def cross(a: Any, b: Any) -> Vector3:
-    """a x b, of which either may be known; then zeros among its numbers cost nothing."""
+    """a x b, without terms that are known to be zero."""
 
     def difference(i: int, j: int) -> Any:
         terms = [(1, a[i], b[j]), (-1, a[j], b[i])]
@@ -123,7 +123,7 @@ def _is_zero(number: Any) -> bool:
 
 
 def world_frames(tree: Tree, q: Vector) -> tuple[Float[Array, "d 3 3"], Float[Array, "d 3"]]:
-    """Rotations and origins of the links' own frames in that of the ground, for figures and tips."""
+    """Rotations and origins of the links' own frames in the ground's frame, for figures and tips."""
     rotations: list[Any] = []
     origins: list[Any] = []
     for link, (parent, kind) in enumerate(zip(tree.parents, tree.joints, strict=True)):

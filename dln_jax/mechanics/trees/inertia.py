@@ -2,7 +2,7 @@
 
     theta = (m, h_x, h_y, h_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz)
 
-m in kg; h = m c in kg m, of the centre of mass c; I in kg m² about the origin of the body's frame, along its axes.
+m in kg; h = m c in kg m, with the centre of mass c; I in kg m² about the origin of the body's frame, along its axes.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 def inertial_parameters(mass: Any, centre: Any, about_centre: Any) -> Inertia:
-    """theta of a body, of NumPy in double precision where all is known.
+    """theta of a body, in NumPy with double precision if all arguments are known.
 
     Args:
         mass: m, kg.
@@ -35,7 +35,7 @@ def parts(theta: Inertia) -> tuple[Any, Any, Any]:
 
 
 def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
-    """theta of the same body in the frame in which its own has this rotation (columns are its axes) and position."""
+    """theta of a body in another frame, where its own frame has this rotation (columns are its axes) and position."""
     own, R, r = _alike(theta, rotation, position)
     m, h, moments = parts(own)
     turned = R @ h
@@ -45,7 +45,7 @@ def moved(theta: Inertia, rotation: Any, position: Any) -> Inertia:
 
 
 def pseudo_inertia(theta: Inertia) -> Any:
-    """The matrix that is positive definite exactly for bodies that exist (Wensing, Kim and Slotine, RA-L 2018).
+    """The matrix that is positive definite for physically consistent bodies only (Wensing, Kim and Slotine, RA-L 2018).
 
     J = [[tr(I) / 2 - I, h], [hᵀ, m]]
     """
@@ -69,6 +69,6 @@ def _joined(m: Any, h: Any, moments: Any) -> Any:
 
 
 def _alike(*arrays: Any) -> list[Any]:
-    """All as arrays of NumPy, or all of JAX where any is."""
+    """Converts all to NumPy arrays, or all to JAX arrays if any is one."""
     learned = any(isinstance(each, Array) for each in arrays)
     return [jnp.asarray(each) if learned else np.asarray(each, float) for each in arrays]

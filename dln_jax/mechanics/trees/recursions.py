@@ -1,4 +1,4 @@
-"""Dynamics of a tree by recursions over its links, for one state: each takes some hundred operations a link.
+"""Dynamics of a tree by recursions over its links, for one state: about a hundred operations per link.
 
 `newton_euler` gives forces (Luh, Walker and Paul 1980), `composite_bodies` the mass matrix (Walker and Orin 1982); both
 after Featherstone, Rigid Body Dynamics Algorithms, 2008. Vectors are in the frame of their link, forces about its
@@ -19,7 +19,7 @@ from dln_jax.types import Matrix, Vector
 
 
 def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Generalised force tau [d] that a motion takes, gravity and armature included, friction not."""
+    """Generalised force tau [d] of a motion, with gravity and armature, without friction."""
     tree = aligned(tree)
     frames = placed(tree, q)
     forces: list[Any] = []
@@ -50,9 +50,9 @@ def newton_euler(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Vector:
 
 
 def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]:
-    """Angular velocity and acceleration, and the acceleration of the link's origin, if the joint were still.
+    """Angular velocity and acceleration, and the acceleration of the link's origin, with the joint locked.
 
-    Angular ones are `None` where they are zero: on the ground, and along prismatic joints from there.
+    Angular ones are `None` if they are zero: on the ground, and on prismatic joints from there.
     """
     if motion is None:
         return None, None, outwards(frame, -jnp.asarray(gravity, jnp.result_type(float)))
@@ -65,7 +65,7 @@ def _on_parent(motion: Any, frame: Placed, gravity: Any) -> tuple[Any, Any, Any]
 
 
 def _force(theta: Any, w: Any, dw: Any, a: Any) -> tuple[Any, Any]:
-    """Force and moment that a body's motion takes."""
+    """Force and moment of a body's motion."""
     m, h, moments = parts(theta)
     force, moment = m * a, cross(h, a)
     if w is not None:
@@ -104,7 +104,7 @@ def composite_bodies(tree: Tree, q: Vector) -> Matrix:
 
 
 def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
-    """m, h and I of a body in the frame of the link that it hangs on."""
+    """m, h and I of a body in the frame of the parent link."""
     m, h, moments = body
     turned = inwards(frame, jnp.asarray(h))
     half = jnp.stack([inwards(frame, column) for column in jnp.asarray(moments).T], axis=1)
@@ -116,7 +116,7 @@ def _carried(body: tuple[Any, Any, Any], frame: Placed) -> tuple[Any, Any, Any]:
 
 
 def regressor(tree: Tree, q: Vector, qd: Vector, qdd: Vector) -> Float[Array, "d P"]:
-    """Phi with tau = Phi theta, theta the links' ten parameters end to end and then the armature, P = 11 d."""
+    """Phi with tau = Phi theta, where theta holds the links' ten parameters end to end, then the armature, P = 11 d."""
 
     def force(inertias: Array, armature: Array) -> Vector:
         return newton_euler(tree._replace(inertias=inertias, armature=armature), q, qd, qdd)

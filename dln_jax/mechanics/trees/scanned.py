@@ -1,9 +1,9 @@
-"""Forces of a tree whose frames are learned, by one scan over its links: quick to compile, and to differentiate.
+"""Forces of a tree with learned frames, by one scan over its links: quick to compile, and to differentiate.
 
-`recursions` writes every link out, so that zeros of known frames cost nothing. Here no frame is known. A scan carries,
-in each link's frame, the motions of the link for a unit rate of every joint (the columns of its Jacobian), its own
-motion, and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008); each link has
-its forces by itself then. Joints are about z, for one state.
+`recursions` unrolls the links, so that zeros of known frames cost nothing. Here no frame is known. In every link's
+frame the scan carries the link's motions for unit rates of the joints (the columns of its Jacobian), its own motion,
+and its acceleration, all as spatial vectors (Featherstone, Rigid Body Dynamics Algorithms, 2008). The forces of the
+links are then independent. Joints are about z, for one state.
 """
 
 from collections.abc import Sequence
@@ -29,14 +29,14 @@ def scanned_regressor(
     qd: Vector,
     qdd: Vector,
 ) -> Float[Array, "d d 10"]:
-    """d tau / d theta: force of each joint for the unit of each link's inertial parameters, without armature.
+    """d tau / d theta: forces of the joints for unit inertial parameters of the links, without armature.
 
     Args:
         parents: as of a `Tree`.
         joints: kinds.
         gravity: [3], m/s².
-        rotations: [d, 3, 3], of the links at q = 0 in the frames that they hang on.
-        positions: [d, 3], likewise, m.
+        rotations: [d, 3, 3], of the links at q = 0 relative to their parent links.
+        positions: [d, 3], of the links relative to their parent links, m.
         q: with `qd` and `qdd` the state.
     """
 
@@ -86,7 +86,7 @@ def _spatial(
     qd: Vector,
     qdd: Vector,
 ) -> tuple[Float[Array, "d 3 n"], Float[Array, "d 3 n"]]:
-    """Angular and linear parts in each link's frame: d columns of its Jacobian, its velocity, its acceleration."""
+    """Angular and linear parts in the links' frames: d columns of the Jacobian, the velocity, the acceleration."""
     d = len(parents)
     turns = np.array([kind == "revolute" for kind in joints], float)
     c, s = jnp.where(turns > 0, jnp.cos(q), 1.0), jnp.where(turns > 0, jnp.sin(q), 0.0)
@@ -115,7 +115,7 @@ def _spatial(
         found = jnp.stack([angular, linear])
         return (found if serial else carried.at[index].set(found)), found
 
-    # Links of a tree look up their parent; the ground is the last, which -1 names.
+    # Links look up their parent; the ground is stored last, where the index -1 points.
     start = ground if serial else jnp.concatenate([jnp.zeros((d, *ground.shape), q.dtype), ground[None]])
     links = (jnp.arange(d), jnp.asarray(parents), into, places, jnp.asarray(turns, q.dtype), qd, qdd)
     _, found = lax.scan(link, start, links)

@@ -1,4 +1,4 @@
-"""Trees as values that JSON holds, to be stored in a run."""
+"""Trees as JSON values, for storage in a run."""
 
 import reprlib
 from collections.abc import Mapping
@@ -11,17 +11,17 @@ from dln_jax.types import InputError
 
 
 def tree_to_json(tree: Tree) -> dict[str, Any]:
-    """The tree's fields, numbers as lists in double precision."""
+    """Returns the tree's fields, with numbers as lists in double precision."""
     fields = tree._asdict()
     structure = {name: list(fields.pop(name)) for name in ("parents", "joints", "names")}
     return {**structure, **{name: np.asarray(numbers, float).tolist() for name, numbers in fields.items()}}
 
 
 def tree_from_json(values: Any) -> Tree:
-    """The tree of `tree_to_json`.
+    """Returns the tree of `tree_to_json`.
 
     Raises:
-        InputError: fields that are missing or unknown, or what `make_tree` refuses.
+        InputError: fields that are missing or unknown, or that `make_tree` refuses.
     """
     if not isinstance(values, Mapping) or set(values) != set(Tree._fields):
         raise InputError(f"tree: expected the fields {', '.join(Tree._fields)}, got {reprlib.repr(values)}")

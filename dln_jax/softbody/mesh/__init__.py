@@ -1,4 +1,4 @@
-"""Meshes of simplices: drawn, checked and measured."""
+"""Meshes of simplices: generation, validation and measurement."""
 
 from dln_jax.softbody.mesh.creatures import Creature, biped, body_length, crawler, quadruped
 from dln_jax.softbody.mesh.mesh import (

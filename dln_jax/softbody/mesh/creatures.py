@@ -1,8 +1,8 @@
-"""Two-dimensional creatures: a mesh that stands on y = 0, forwards is to the right, and muscles along its skin.
+"""Two-dimensional creatures: a mesh that stands on y = 0 and faces right, with muscles along its skin.
 
-Each is a drawing of square cells (`#`), two triangles each, and pointed ends (`<`, `>`). Every edge of the outline but
-those on the ground is a muscle: both sides of each leg, which bend it, and the upper and lower side of the body.
-Sizes suit the material of the "creature" preset, whose energies count per triangle and not per area.
+A creature is a drawing of square cells (`#`), with two triangles per cell, and pointed ends (`<`, `>`). All edges of
+the outline except those on the ground are muscles: both sides of the legs, to bend them, and the upper and lower side
+of the body. Sizes suit the material of the "creature" preset, whose energies count per triangle and not per area.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Creature(NamedTuple):
     name: str
     mesh: Mesh
     muscles: Int[np.ndarray, "k 2"]
-    """Vertices at the two ends of each muscle, from left to right."""
+    """Vertices at the two ends of the muscles, from left to right."""
 
 
 def crawler() -> Creature:
@@ -47,7 +47,7 @@ def body_length(creature: Creature) -> float:
 
 
 def _drawn(name: str, size: float, *rows: str) -> Creature:
-    """The creature of a drawing whose cells have sides of `size` m."""
+    """Returns the creature of a drawing whose cells have sides of `size` m."""
     drawing = {(x, y): mark for y, row in enumerate(reversed(rows)) for x, mark in enumerate(row)}
     positions, elements = lattice([cell for cell, mark in drawing.items() if mark == "#"])
     number = {tuple(position): index for index, position in enumerate(positions.tolist())}

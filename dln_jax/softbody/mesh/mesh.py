@@ -1,7 +1,7 @@
 """Meshes of simplices: triangles in the plane, tetrahedra in space.
 
-Static NumPy arrays in float64: what a simulation compiles in. A body in the plane is 1 m thick: its areas in m² count
-as volumes in m³. `mesh/simplices.py` has the volumes for a rest shape that one differentiates by.
+Static NumPy arrays in float64, which become constants of the compiled simulation. A body in the plane is 1 m thick: its
+areas in m² count as volumes in m³. `mesh/simplices.py` has volumes that are differentiable by the rest shape.
 """
 
 import itertools
@@ -20,14 +20,14 @@ from dln_jax.types import InputError
 
 
 class Mesh(NamedTuple):
-    """Vertices and the simplices they span; `make_mesh` checks them."""
+    """Vertices and simplices of a body; `make_mesh` validates them."""
 
     vertices: Float[np.ndarray, "n dim"]
     """Rest shape in m; dim is 2 or 3."""
     elements: Int[np.ndarray, "m corners"]
-    """Corners of each triangle (dim 2) or tetrahedron (dim 3), positively oriented."""
+    """Corners of the triangles (dim 2) or tetrahedra (dim 3), positively oriented."""
     turned: int = 0
-    """How many of the elements given to `make_mesh` were inverted (clockwise, in the plane) and have been turned."""
+    """Number of inverted elements (clockwise, in the plane) that `make_mesh` has reoriented."""
 
     @property
     def dimension(self) -> int:
@@ -36,14 +36,14 @@ class Mesh(NamedTuple):
 
 
 def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
-    """A mesh of vertices [n, dim] in m and elements [m, dim + 1], checked and its inverted elements turned.
+    """Builds a mesh of vertices [n, dim] in m and elements [m, dim + 1]; validates it and reorients inverted elements.
 
-    `Mesh.turned` counts those. Elements may overlap, as the energies of all add up; `overlaps` says where.
+    `Mesh.turned` counts those. Elements may overlap, because the energies of all add up; `overlaps` returns where.
 
     Raises:
-        InputError: names the first vertex or element at fault: a position that is not finite, a corner out of range or
-            repeated, an element that is duplicate or degenerate, a vertex in no element. Or elements that share no
-            vertex although some of their corners coincide: a mesh whose vertices were never merged.
+        InputError: names the first invalid vertex or element: a position that is not finite, a corner out of range or
+            repeated, a duplicate or degenerate element, a vertex in no element. Or elements that share no vertex
+            although some of their corners coincide: a mesh whose vertices were never merged.
     """
     positions = as_vertices(vertices)
     corners = as_elements(elements, positions.shape[1])
@@ -53,12 +53,12 @@ def make_mesh(vertices: ArrayLike, elements: ArrayLike) -> Mesh:
 
 
 def volumes(mesh: Mesh) -> Float[np.ndarray, " m"]:
-    """Area in m² or volume in m³ of each element."""
+    """Areas in m² or volumes in m³ of the elements."""
     return simplex_volumes(mesh.vertices, mesh.elements)
 
 
 def edges(mesh: Mesh) -> Int[np.ndarray, "e 2"]:
-    """Each edge once, its smaller vertex first, in lexicographic order."""
+    """Distinct edges, with the smaller vertex first, in lexicographic order."""
     pairs = list(itertools.combinations(range(mesh.dimension + 1), 2))
     return np.unique(np.sort(mesh.elements[:, pairs].reshape(-1, 2), axis=1), axis=0)
 
@@ -74,16 +74,16 @@ def boundary(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
 
 
 def overlaps(mesh: Mesh) -> Int[np.ndarray, "f dim"]:
-    """Facets with two elements or more on one side, which overlap: what they share has the mass and stiffness of all.
+    """Facets with two or more elements on one side. They overlap, with the sum of their masses and stiffnesses.
 
-    Overlaps of elements without a common facet are not found.
+    Overlaps of elements without a common facet are not detected.
     """
     distinct, counts = _facet_sides(mesh)
     return distinct[(counts > 1).any(axis=1)]
 
 
 def components(mesh: Mesh) -> Int[np.ndarray, " m"]:
-    """Number, from 0, of the component that each element belongs to; shared vertices connect elements."""
+    """Index, from 0, of every element's component; shared vertices connect elements."""
     n, m = len(mesh.vertices), len(mesh.elements)
     corners = mesh.elements.ravel()
     first = np.repeat(mesh.elements[:, 0], mesh.elements.shape[1])
@@ -100,7 +100,7 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
     """Indices of the vertices whose rest positions [n, dim] satisfy a condition, such as `lambda x: x[:, 0] < 1e-9`.
 
     Raises:
-        InputError: no vertex does, or the condition does not give one boolean per vertex.
+        InputError: no vertex does, or the condition does not return one boolean per vertex.
     """
     chosen = np.asarray(condition(mesh.vertices))
     if chosen.shape != (len(mesh.vertices),) or chosen.dtype != bool:
@@ -115,14 +115,14 @@ def vertices_where(mesh: Mesh, condition: Callable[[Float[np.ndarray, "n dim"]],
 
 
 def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndarray, " n"]:
-    """Mass of each vertex in kg: every element gives each of its corners an equal share.
+    """Masses of the vertices in kg: an element's corners get equal shares of its mass.
 
     Args:
         mesh: in m.
-        density: in kg/m³ (in the plane for 1 m of thickness), one for all elements or one for each, [m].
+        density: in kg/m³ (in the plane for 1 m of thickness), one for all elements or one per element, [m].
 
     Raises:
-        InputError: a density is not positive and finite, or there are not as many as elements.
+        InputError: a density is not positive and finite, or their number differs from that of the elements.
     """
     densities = np.asarray(density, dtype=np.float64)
     m = len(mesh.elements)
@@ -140,10 +140,10 @@ def lumped_masses(mesh: Mesh, density: int | float | ArrayLike) -> Float[np.ndar
 
 
 def _facet_sides(mesh: Mesh) -> tuple[Int[np.ndarray, "f dim"], Int[np.ndarray, "f 2"]]:
-    """Distinct facets, as their first element has them, and how many elements lie on either side of each."""
+    """Distinct facets, in the orientation of their first element, and the numbers of elements on their two sides."""
     every = facets(mesh.elements).reshape(-1, mesh.dimension)
     _, first, group = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True)
-    # On which side an element lies is the sign of the permutation that sorts its facet's corners.
+    # The sign of the permutation that sorts a facet's corners decides on which side its element lies.
     swaps = sum(every[:, i] > every[:, j] for i, j in itertools.combinations(range(mesh.dimension), 2))
     counts = np.bincount(2 * group.reshape(-1) + swaps % 2, minlength=2 * len(first)).reshape(-1, 2)
     order = np.argsort(first)

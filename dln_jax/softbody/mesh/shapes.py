@@ -25,7 +25,7 @@ PATTERNS = {
         ((1, 1, 1), (0, 1, 1), (1, 1, 0), (1, 0, 1)),
     ),
 }
-"""Corners of each simplex in a cell at even coordinates; in one at odd coordinates x is mirrored."""
+"""Corners of the simplices in a cell at even coordinates; in one at odd coordinates x is mirrored."""
 
 
 def beam(length: float, height: float, cells_x: int, cells_y: int) -> Mesh:
@@ -62,9 +62,9 @@ def disc(radius: float, rings: int) -> Mesh:
 
 
 def lattice(cells: ArrayLike) -> tuple[Int[np.ndarray, "n dim"], Int[np.ndarray, "m corners"]]:
-    """Integer positions and positively oriented elements of the unit cells that have these lower corners [c, dim].
+    """Integer positions and positively oriented elements of the unit cells with these lower corners [c, dim].
 
-    Vertices are in lexicographic order. Cells may be any set; scale the positions and give both to `make_mesh`.
+    Vertices are in lexicographic order. Cells may be any set; scale the positions and pass both to `make_mesh`.
     """
     lower = np.asarray(cells, dtype=np.int64)
     pattern = np.array(PATTERNS[lower.shape[1]])
@@ -88,7 +88,7 @@ def _grid(lengths: tuple[float, ...], cells: tuple[int, ...]) -> Mesh:
 
 
 def _on_ring(k: int, place: int) -> int:
-    """Index of a vertex by its place on ring k, counted on around the ring."""
+    """Index of a vertex by its position on ring k, modulo the ring."""
     return 0 if k == 0 else 1 + 3 * k * (k - 1) + place % (6 * k)
 
 

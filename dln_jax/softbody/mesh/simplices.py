@@ -1,4 +1,4 @@
-"""Volumes, shapes and facets of bare simplices, given by positions and corners, whether they form a mesh or not."""
+"""Volumes, shapes and facets of individual simplices, from positions and corners, whether they form a mesh or not."""
 
 import itertools
 import math
@@ -10,23 +10,23 @@ from jaxtyping import Array, Float, Int
 AnyArray = TypeVar("AnyArray", np.ndarray, Array)
 
 FACETS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))}
-"""Corners of each facet by dimension, outwards: in the plane the body lies on the left of an edge; in space the
-right-hand normal of a triangle points away from the body."""
+"""Corners of the facets by dimension, oriented outwards: in the plane the body lies on the left of an edge; in space
+the right-hand normal of a triangle points away from the body."""
 
 
 def simplex_volumes(
     vertices: Float[AnyArray, "n dim"], elements: Int[np.ndarray, "m corners"]
 ) -> Float[AnyArray, " m"]:
-    """Signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative where the element is inverted.
+    """Signed areas in m² or volumes in m³: det[x1 - x0, ..., xdim - x0] / dim!, negative for inverted elements.
 
-    Takes NumPy and JAX arrays alike, so that it can be differentiated by the rest shape.
+    Takes NumPy and JAX arrays, so that it can be differentiated by the rest shape.
     """
     corners = vertices[elements]
     return determinant((corners[:, 1:] - corners[:, :1]).transpose(1, 2, 0)) / math.factorial(vertices.shape[1])
 
 
 def determinant(F: Any) -> Any:
-    """Of a 2 x 2 or 3 x 3 matrix by its rows; entries are scalars, or arrays of as many as there are matrices."""
+    """Determinant of a 2 x 2 or 3 x 3 matrix from its rows; entries are scalars, or arrays over several matrices."""
     if len(F) == 2:
         return F[0][0] * F[1][1] - F[0][1] * F[1][0]
     cofactor = cofactors(F)
@@ -37,7 +37,7 @@ def cofactors(F: Any) -> list[list[Any]]:
     """Rows of cof F = det F F⁻ᵀ."""
     if len(F) == 2:
         return [[F[1][1], -F[1][0]], [-F[0][1], F[0][0]]]
-    # Taking the indices cyclically gives the signs.
+    # Cyclic indices give the signs.
     return [
         [
             F[(i + 1) % 3][(j + 1) % 3] * F[(i + 2) % 3][(j + 2) % 3]
@@ -49,19 +49,19 @@ def cofactors(F: Any) -> list[list[Any]]:
 
 
 def regularity(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> Float[np.ndarray, " m"]:
-    """Shape of each element: its volume over that of the regular simplex with the same longest edge.
+    """Shapes of the elements: the volume over that of the regular simplex with the same longest edge.
 
-    1 for a regular simplex, 0 for a flat one, negative for an inverted one; 0 also where all corners coincide.
+    1 for a regular simplex, 0 for a flat one, negative for an inverted one; also 0 if all corners coincide.
     """
     dim, corners = vertices.shape[1], vertices[elements]
     pairs = itertools.combinations(range(dim + 1), 2)
     longest = np.max([np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in pairs], axis=0)
     scale = np.where(longest > 0, longest, 1.0)
-    # Scaled before it is multiplied, so that no size of the mesh overflows or underflows.
+    # Scaled before the products, so that no mesh size overflows or underflows.
     shape = determinant(((corners[:, 1:] - corners[:, :1]) / scale[:, None, None]).transpose(1, 2, 0))
     return shape / math.sqrt((dim + 1) / 2**dim)
 
 
 def facets(elements: Int[np.ndarray, "m corners"]) -> Int[np.ndarray, "m corners dim"]:
-    """Edges of each triangle or triangles of each tetrahedron, outwards where the element is not inverted."""
+    """Edges of the triangles or triangles of the tetrahedra, oriented outwards unless the element is inverted."""
     return elements[:, np.array(FACETS[elements.shape[1] - 1])]

@@ -1,7 +1,7 @@
-"""What a mesh must be before anything is simulated on it; every message names the first element or vertex at fault.
+"""Validation of meshes before a simulation; every message names the first invalid element or vertex.
 
-Refused is what has no motion, or not the one meant: a flat element has no strain, a vertex in no element no mass, and
-an element given twice counts twice. Elements may overlap, and any number may meet at a facet: their energies add up.
+Meshes without a well-defined motion are refused: a flat element has no strain, a vertex in no element has no mass, and
+a duplicate element counts twice. Elements may overlap, and any number may meet at a facet: their energies add up.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from dln_jax.softbody.mesh.simplices import regularity
 from dln_jax.types import InputError
 
 FLAT = 1e-12
-"""An element this flat, as `regularity` measures it, is degenerate: its volume is rounding error."""
+"""Largest `regularity` of a degenerate element, whose volume is rounding error."""
 WORDS = {2: ("triangle", "area"), 3: ("tetrahedron", "volume")}
 
 
 def as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
-    """Positions as float64 [n, 2] or [n, 3], all finite; otherwise `InputError`."""
+    """Converts positions to float64 [n, 2] or [n, 3], all finite; raises `InputError` otherwise."""
     array = _as_array("vertices", vertices)
     if array.dtype.kind not in "iuf":
         raise InputError(f"vertices has type {array.dtype}; expected real numbers: positions in m")
@@ -30,7 +30,7 @@ def as_vertices(vertices: ArrayLike) -> Float[np.ndarray, "n dim"]:
 
 
 def as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
-    """Corners as int64 [m, dim + 1]; otherwise `InputError`."""
+    """Converts corners to int64 [m, dim + 1]; raises `InputError` otherwise."""
     array = _as_array("elements", elements)
     kind = WORDS[dim][0]
     if array.ndim != 2 or array.shape[1] != dim + 1 or not array.shape[0]:
@@ -44,7 +44,7 @@ def as_elements(elements: ArrayLike, dim: int) -> Int[np.ndarray, "m corners"]:
 
 
 def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]) -> None:
-    """Raises `InputError` unless the elements form a mesh: valid indices, volumes, none twice, none dangling."""
+    """Raises `InputError` unless the elements form a mesh: valid indices, volumes, no duplicate, no dangling vertex."""
     _require_indices(vertices, elements)
     kind, measure = WORDS[vertices.shape[1]]
     shape = regularity(vertices, elements)
@@ -69,7 +69,7 @@ def require_valid(vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray
 def oriented(
     vertices: Float[np.ndarray, "n dim"], elements: Int[np.ndarray, "m corners"]
 ) -> tuple[Int[np.ndarray, "m corners"], int]:
-    """Valid elements, all of positive volume, and how many were turned for it: by a swap of their last two corners."""
+    """Reorients valid elements to positive volume by swapping their last two corners, and counts these elements."""
     inverted = regularity(vertices, elements) < 0
     turned = np.where(inverted[:, None], elements[:, [*range(elements.shape[1] - 2), -1, -2]], elements)
     return turned, int(inverted.sum())

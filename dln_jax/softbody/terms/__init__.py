@@ -1,4 +1,4 @@
-"""Energy terms of soft bodies, and the laws of material and friction that they are made of."""
+"""Energy terms of soft bodies, with their material and friction laws."""
 
 from dln_jax.softbody.terms.contact import distance_contact, plane_contact
 from dln_jax.softbody.terms.creature import creature_terms

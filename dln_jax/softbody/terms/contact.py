@@ -1,11 +1,11 @@
-"""Contact of vertices with rigid surfaces by a smooth penalty, and Coulomb friction there, smooth and lagged.
+"""Contact of vertices with rigid surfaces by a smooth penalty, with smooth and lagged Coulomb friction.
 
     V = k phi(d),   phi = 0 for d >= 0,  -d³/(6 w) for -w <= d < 0,  d²/2 + w d/2 + w²/6 for d < -w
 
 with the signed distance d to the surface. phi is twice continuously differentiable for w > 0; a vertex at rest lies
-at a depth where k |phi'(d)| carries its weight. Contact and friction are one term, since they share the parameters
-of the surface: friction takes its normal force from the same k, by which it can be differentiated. A contact
-without a friction coefficient computes no friction.
+at the depth where k |phi'(d)| carries its weight. Contact and friction are one term with shared parameters: the normal
+force of the friction comes from the same k, so that it is differentiable by k. A contact without a friction coefficient
+computes no friction.
 
     D = mu lambda_n f(|u|),   u = (1 - n nᵀ)(x - x_n),   f(u) = u²/e - u³/(3 e²) for u < e,  u - e/3 beyond,
 
@@ -38,15 +38,15 @@ from dln_jax.softbody.terms.term import (
 )
 from dln_jax.types import Scalar, require_positive
 
-# Squared slip over squared threshold, below which the cubic part of f is beyond rounding and its derivatives overflow.
+# Ratio of squared slip to squared threshold below which the cubic part of f is rounding and its derivatives overflow.
 _NO_SLIP = 1e-16
 
 
 class PlaneContact(NamedTuple):
-    """Parameters of a plane; stiffness and friction are for all vertices [] or for each [m]."""
+    """Parameters of a plane; stiffness and friction are for all vertices [] or per vertex [m]."""
 
     normal: Float[Array, " dim"]
-    """Pointing out of the ground; its length does not matter."""
+    """Normal out of the ground, of any length."""
     offset: Float[Array, ""]
     """Distance of the plane from the origin along the normal, in m."""
     stiffness: Float[Array, "..."]
@@ -56,7 +56,7 @@ class PlaneContact(NamedTuple):
 
 
 class DistanceContact(NamedTuple):
-    """Parameters of a surface given by its signed distance, for all vertices [] or for each [m]."""
+    """Parameters of a surface with a signed distance, for all vertices [] or per vertex [m]."""
 
     stiffness: Float[Array, "..."]
     """k in N/m."""
@@ -65,7 +65,7 @@ class DistanceContact(NamedTuple):
 
 
 class Slip(NamedTuple):
-    """What the friction of one vertex needs; [m, ...] for all."""
+    """Data of the friction of one vertex; [m, ...] for all."""
 
     start: Float[Array, "*m dim"]
     """Position x_n at the start of the step, in m."""
@@ -74,7 +74,7 @@ class Slip(NamedTuple):
     force: Float[Array, "*m"]
     """Largest friction mu lambda_n, in N."""
     threshold: Float[Array, "*m"]
-    """Slip e in a step from which friction is at its largest, in m."""
+    """Slip e per step at which friction reaches its largest value, in m."""
 
 
 def plane_contact(
@@ -90,7 +90,7 @@ def plane_contact(
 ) -> Term:
     """Contact with the half-space n·x < offset, for the unit normal n.
 
-    Stiffness k in N/m; width w in m, where 0 means ½ k d² below the plane, which is only once continuously
+    Stiffness k in N/m; width w in m. A width of 0 means ½ k d² below the plane, which is only once continuously
     differentiable. `friction` is Coulomb's coefficient, reached at the threshold speed in m/s.
     """
     indices = vertex_list("vertices in contact", vertices)
@@ -128,7 +128,7 @@ def distance_contact(
     """Contact with the body where `distance(x [dim])`, in m, is negative; the other arguments as for a plane.
 
     The function must be twice differentiable wherever it is negative at a vertex. Friction takes the normal from its
-    gradient at the start of the step; where that vanishes (the centre of a ball), there is none.
+    gradient at the start of the step; where the gradient vanishes (the centre of a ball), there is no friction.
     """
     indices = vertex_list("vertices in contact", vertices)
     parameters = DistanceContact(*_contact_parameters(stiffness, friction, len(indices)))
@@ -154,7 +154,7 @@ def penalty(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
 
 
 def penalty_force(distance: Float[Array, "*m"], width: float) -> Float[Array, "*m"]:
-    """-phi'(d) in m: times k, the normal force."""
+    """-phi'(d) in m, the normal force divided by k."""
     if width == 0.0:
         return jnp.where(distance < 0, -distance, 0.0)
     ramp = jnp.where(distance < 0, distance**2 / (2.0 * width), 0.0)
@@ -177,7 +177,7 @@ def _contact(
     width: float,
     threshold_speed: float,
 ) -> Term:
-    """The term of a surface: what of it each vertex needs, the distance, and (distance, normal, steepness) of all."""
+    """Builds the term of a surface from its data per vertex, the distance, and (distance, normal, steepness) of all."""
     require_positive(threshold_speed=threshold_speed)
     if width != 0.0:
         require_positive(width=width)
@@ -189,7 +189,7 @@ def _contact(
             return near, stiffness, None
         depth, normal, steepness = touched(x, near)
         force = parameters.friction * (stiffness * penalty_force(depth, width) * steepness)
-        # A static solve (dt infinite) has no velocities: there is no friction in it.
+        # A static solve (dt infinite) has no velocities, hence no friction.
         moving = jnp.isfinite(context.dt)
         threshold = jnp.where(moving, threshold_speed * context.dt, 1.0)
         slip = Slip(x, normal, jnp.where(moving, force, 0.0), jnp.broadcast_to(threshold, len(x)))

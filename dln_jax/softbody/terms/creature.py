@@ -1,4 +1,4 @@
-"""The terms of the published soft creatures: a preset for comparing with their simulator (2-D; J. Rojas, algovivo).
+"""Terms of the published soft creatures: a preset for comparison with their simulator (2-D; J. Rojas, algovivo).
 
 There a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here the same divided by h², so that V is unscaled:
 
@@ -7,10 +7,10 @@ There a step minimises ½ sum m |x - x_n - h v_n|² + h² V(x); here the same di
     gravity    m g y
     ground     k y² for y < 0, plus friction k_f ((x - x_n)/h)² (0.01 - y_n) for y_n < 0.01
 
-s is the second-order expansion of ln J, and the weight of a triangle is 1 whatever its area, so mu and lambda are in J.
-The friction is viscous and lagged. k_f is in kg/m, because its share of V is an energy although it rubs: with
-vx = (x - x_n)/h the force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step, and h² V is free of h.
-A static solve (h infinite) has none.
+s is the second-order expansion of ln J, and the weight of a triangle is 1 for any area, so mu and lambda are in J.
+The friction is viscous and lagged. k_f is in kg/m, because its part of V is an energy although it is friction: with
+vx = (x - x_n)/h the force is -2 k_f (0.01 - y_n) vx / h, which depends on the time step, and h² V does not contain h.
+A static solve (h infinite) has no friction.
 """
 
 from typing import NamedTuple
@@ -30,15 +30,15 @@ from dln_jax.softbody.terms.term import NOT_NEGATIVE, Context, Corners, Indices,
 from dln_jax.types import InputError, Scalar
 
 MASS = 6.0714288
-"""Of each vertex, in kg."""
+"""Mass of a vertex, in kg."""
 TIME_STEP = 0.033
 """In s."""
 FRICTION_HEIGHT = 0.01
-"""Below which the ground rubs, in m."""
+"""Height below which the ground exerts friction, in m."""
 
 
 class CreatureMaterial(NamedTuple):
-    """Parameters of the triangles, for all [] or for each [m]."""
+    """Parameters of the triangles, for all [] or per triangle [m]."""
 
     mu: Float[Array, "..."]
     """In J."""
@@ -47,7 +47,7 @@ class CreatureMaterial(NamedTuple):
 
 
 class CreatureGround(NamedTuple):
-    """Parameters of the ground, for all vertices [] or for each [n]."""
+    """Parameters of the ground, for all vertices [] or per vertex [n]."""
 
     stiffness: Float[Array, "..."]
     """k in J/m²: half of the stiffness in N/m."""

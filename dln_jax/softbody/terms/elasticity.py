@@ -2,8 +2,8 @@
 
     F = [x1 - x0, ..., xd - x0] [X1 - X0, ..., Xd - X0]⁻¹,   energy = volume W(F, mu, lambda)
 
-in a rest shape X, with Lamé parameters mu = E / 2(1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu). The material is any
-density of `strain_energies`, or the user's own of the same form.
+with the rest shape X and Lamé parameters mu = E / 2(1 + nu) and lambda = E nu / (1 + nu)(1 - 2 nu). The material is any
+density of `strain_energies`, or a custom one of the same form.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ _POISSON_BOUND = Bound(
 
 
 class Material(NamedTuple):
-    """An isotropic elastic material, one for all elements [] or one for each [m]."""
+    """An isotropic elastic material, one for all elements [] or one per element [m]."""
 
     youngs_modulus: Float[Array, "..."]
     """E in Pa."""
@@ -43,9 +43,9 @@ def elastic(
 ) -> Term:
     """Elastic energy of all elements of a mesh; parameters are a `Material`.
 
-    Young's modulus in Pa must be positive and Poisson's ratio lie between -1 and 0.5 (excluded), for all elements or
-    each: `InputError` otherwise, which names the element. In 2-D the strain is plane, so that mu and lambda are those
-    of the solid.
+    Young's modulus in Pa must be positive and Poisson's ratio between -1 and 0.5 (excluded), one for all elements or
+    one per element; otherwise `InputError` names the element. In 2-D the strain is plane, so that mu and lambda are
+    those of the solid.
     """
     count = len(mesh.elements)
     parameters = Material(
@@ -68,9 +68,9 @@ def elastic(
 
 
 def rest_geometry(corners: Float[Array, "corners dim"]) -> tuple[Float[Array, "corners dim"], Scalar]:
-    """Gradients of the linear shape functions in 1/m, F = sum over corners of x_k (grad N_k)ᵀ, and signed volume.
+    """Gradients of a simplex's linear shape functions, 1/m, F = sum over corners of x_k (grad N_k)ᵀ, and signed volume.
 
-    Of a simplex, in m³, or m² in 2-D; written out and differentiable.
+    The volume is in m³, or m² in 2-D. The formulas are written out and differentiable.
     """
     axes = range(corners.shape[1])
     edges = [[corners[k + 1, i] - corners[0, i] for k in axes] for i in axes]

@@ -1,4 +1,4 @@
-"""Weight."""
+"""Gravity as an energy term."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,14 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 class Gravity(NamedTuple):
-    """Parameters of the weight."""
+    """Parameters of gravity."""
 
     acceleration: Float[Array, " dim"]
     """In m/s²."""
 
 
 def gravity(vertices: Mesh | int, acceleration: Numbers | None = None, *, name: str = "gravity") -> Term:
-    """-m g·x for every vertex of a mesh, or for the first so many; g is the acceleration in m/s².
+    """-m g·x for all vertices of a mesh, or for the first `vertices` ones; g is the acceleration in m/s².
 
     With a mesh, g defaults to 9.81 m/s² against the last axis, which points up: y in the plane, z in space.
     """

@@ -1,4 +1,4 @@
-"""Springs, and muscles: springs whose rest length is driven."""
+"""Springs, and muscles: springs with a driven rest length."""
 
 from typing import NamedTuple
 
@@ -11,16 +11,16 @@ from dln_jax.types import InputError, Scalar, require_positive
 
 
 class Springs(NamedTuple):
-    """Parameters of springs, one for all [] or one for each [m]."""
+    """Parameters of springs, one for all [] or one per spring [m]."""
 
     stiffness: Float[Array, "..."]
     """In N/m."""
     rest_length: Float[Array, "..."] | None
-    """In m; `None` where it is taken from the rest shape."""
+    """In m; `None` takes it from the rest shape."""
 
 
 class Muscles(NamedTuple):
-    """Parameters of muscles, one for all [] or one for each [m]."""
+    """Parameters of muscles, one for all [] or one per muscle [m]."""
 
     stiffness: Float[Array, "..."]
     """Energy per squared relative strain, in J."""
@@ -34,12 +34,12 @@ def springs(
     softening: float = 0.0,
     name: str = "springs",
 ) -> Term:
-    """½ k (l - l0)² for each pair of vertices, with l = sqrt(d² + softening²) of the distance d.
+    """½ k (l - l0)² for pairs of vertices, with l = sqrt(d² + softening²) and the distance d.
 
-    The rest length l0 in m is that of the rest shape (softened likewise, so that it carries no force), or
-    `rest_length`, which then is a parameter. Unsoftened, the force of a compressed spring has no direction at d = 0
-    and its stiffness no bound: exactly there, only the parts that have one are kept (zero force, stiffness k), which
-    is the whole truth for l0 = 0.
+    The rest length l0 in m is that of the rest shape (with the same softening, so that it carries no force), or the
+    parameter `rest_length`. Without softening, the force of a compressed spring has no direction at d = 0 and its
+    stiffness no bound. Exactly there, only the well-defined parts are kept (zero force, stiffness k), which is exact
+    for l0 = 0.
     """
     indices = vertex_pairs("pairs of springs", pairs)
     count = len(indices)
@@ -57,7 +57,7 @@ def springs(
 
 
 def muscles(pairs: Indices, *, stiffness: Numbers, softening: float = 1e-3, name: str = "muscles") -> Term:
-    """½ k ((l - a l0)/(a l0))² for each pair of vertices, with l = sqrt(d² + softening²) of the distance d.
+    """½ k ((l - a l0)/(a l0))² for pairs of vertices, with l = sqrt(d² + softening²) and the distance d.
 
     l0 is the distance in the rest shape, which must not be zero, and a > 0 the actuation: `control` [m] of the step,
     in the order of the pairs. k is in J, and softening in m.
@@ -93,7 +93,7 @@ def _energy(softening: float):
 
 
 def _length(squared_distance: Float[Array, "*m"], softening: float) -> Float[Array, "*m"]:
-    """sqrt(d² + softening²); unsoftened, with a derivative of zero at zero."""
+    """sqrt(d² + softening²); without softening its derivative at zero is zero."""
     if softening > 0.0:
         return jnp.sqrt(squared_distance + softening**2)
     apart = squared_distance > 0

@@ -1,8 +1,8 @@
 """Energy densities of isotropic elastic materials, in J per m² or m³ of the rest shape, as functions of F = dx/dX.
 
-With I1 = |F|² and J = det F, each has W = 0 and no stress at rest, and for small strains e = sym(F - I) the energy
-mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is given by its rows, so that all is
-arithmetic of scalars, which fuses under `vmap`.
+With I1 = |F|² and J = det F, all have W = 0 and no stress at rest, and for small strains e = sym(F - I) the energy
+mu |e|² + lambda/2 tr(e)² of linear elasticity, in 2-D (plane strain) and in 3-D. F is a sequence of rows, so that all
+operations are on scalars, which fuse under `vmap`.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,14 +20,14 @@ StrainEnergy = Callable[[DeformationGradient, Scalar, Scalar], Scalar]
 """(F, mu, lambda) -> W in J/m^dim; the Lamé parameters are in Pa."""
 
 _LAGUERRE_STEPS = 20
-"""Enough for double roots, where convergence is linear; elsewhere 1 to 4 are taken."""
+"""Enough for double roots, where convergence is linear; elsewhere 1 to 4 suffice."""
 
 
 def neo_hookean(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu/2 (I1 - dim) - mu ln J + lambda/2 (ln J)² (Bonet and Wood 2008, eq. 6.28).
 
     An inverted or collapsed element (J <= 0) has infinite energy, which every line search refuses, and derivatives of
-    zero, which add nothing wrong to the others.
+    zero, which do not affect those of other elements.
     """
     J = determinant(F)
     valid = J > 0
@@ -65,7 +65,7 @@ def corotated(F: DeformationGradient, mu: Scalar, lam: Scalar) -> Scalar:
     """W = mu |F - R|² + lambda/2 tr(RᵀF - I)² with the rotation R closest to F (McAdams et al. 2011).
 
     By invariants, W = mu (I1 - 2 s + dim) + lambda/2 (s - dim)², where s = tr(RᵀF) is the sum of the singular values,
-    the smallest with the sign of J. R is not unique, and W has a crease, where the two smallest cancel: mirror images
+    the smallest with the sign of J. Where the two smallest cancel, R is not unique and W has a crease: mirror images
     in 2-D, and in 3-D elements collapsed to a line or mirrored in the plane of equal stretches. See `rotation_trace`.
     """
     s, dimension = rotation_trace(F), len(F)
@@ -78,12 +78,12 @@ def squared_norm(F: DeformationGradient) -> Scalar:
 
 
 def rotation_trace(F: DeformationGradient) -> Scalar:
-    """s = max over rotations R of tr(RᵀF), with right first and second derivatives and no singular values.
+    """s = max over rotations R of tr(RᵀF), with correct first and second derivatives and without singular values.
 
     In 2-D s² = (F11 + F22)² + (F21 - F12)². In 3-D s is the largest root of (s² - I1)² - 8 J s - 4 |cof F|² (the
     characteristic polynomial of Davenport's 4x4 matrix, whose roots are all real). On the crease this root is double or
-    triple, so s is exact to 1e-8 or 1e-6 (in float64); the derivative there is one that is right for a change of size,
-    F s/|F|², and zero at F = 0 and on the crease in 2-D, where s = 0.
+    triple, so s is exact to 1e-8 or 1e-6 (in float64). The derivative there is F s/|F|², correct for a change of size;
+    it is zero at F = 0 and on the crease in 2-D, where s = 0.
     """
     if len(F) == 2:
         squared = (F[0][0] + F[1][1]) ** 2 + (F[1][0] - F[0][1]) ** 2
@@ -101,7 +101,7 @@ def _largest_root(I1: Scalar, J: Scalar, minors: Scalar) -> Scalar:
 
     constants = jax.lax.stop_gradient((I1, J, minors))
 
-    # Laguerre's method from an upper bound falls on the largest root, cubically where that is simple.
+    # Laguerre's method from an upper bound decreases to the largest root, cubically if the root is simple.
     def improve(carry):
         s, _, count = carry
         value, rate = polynomial(s, *constants), slope(s, *constants[:2])
@@ -118,7 +118,7 @@ def _largest_root(I1: Scalar, J: Scalar, minors: Scalar) -> Scalar:
     precision = jnp.finfo(start.dtype).eps
     s, _, _ = jax.lax.while_loop(unfinished, improve, (start, start, jnp.asarray(0)))
 
-    # Each Newton step from the constant root doubles the order to which derivatives are right: 1, then 3.
+    # Every Newton step from the constant root doubles the correct order of derivatives: 1, then 3.
     simple = slope(s, *constants[:2]) > 32.0 * jnp.sqrt(precision) * s**3
     root = s
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""What a soft body's energy is made of: terms, each a sum over elements of one scalar function.
+"""Energy terms of a soft body: a term is a sum over elements of one scalar function.
 
     V(x) = sum over terms, sum over elements e:  energy(x[indices[e]], data[e])
 
@@ -6,8 +6,8 @@ An element is whatever the energy couples: the corners of a triangle, the two en
 ground. `prepare` turns a term's parameters into the data of its elements once per time step, so that everything an
 element needs (rest shape, material, actuation, lagged contact forces) is differentiable.
 
-Values that users pass to the factories of terms are checked where the scene is built. Inside a transformation (a scene
-built under `jit` or `grad`) they are unknown and pass unchecked, as do those that later replace the defaults.
+Values that users pass to the factories of terms are checked when the scene is built. Inside a transformation (a scene
+built under `jit` or `grad`) they are traced and pass unchecked, like those that later replace the defaults.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,12 +23,12 @@ from dln_jax.solvers.elements.energies import Corners
 from dln_jax.types import InputError
 
 Numbers = ArrayLike | Sequence[float | int]
-"""One for all elements, or one for each."""
+"""One number for all elements, or one per element."""
 Indices = ArrayLike | Sequence[int | np.integer] | Sequence[Sequence[int | np.integer]]
 
 
 class Context(NamedTuple):
-    """What the preparation of a term may look at: a time step's data, shared by all terms."""
+    """Data of a time step for the preparation of a term, shared by all terms."""
 
     rest: Float[Array, "n dim"]
     """Rest shape in m."""
@@ -46,12 +46,12 @@ class Term(NamedTuple):
     """A sum of energies of elements of one kind."""
 
     name: str
-    """Under which its parameters are found in `Params.terms`; unique in a scene."""
+    """Key of its parameters in `Params.terms`; unique in a scene."""
     indices: Int[np.ndarray, "m k"]
-    """Vertices of each element."""
+    """Vertices of the elements."""
     energy: Callable[[Corners, Any], Float[Array, ""]]
     """(positions x[k][i] of one element's vertices, its data) -> J. The positions are `Corners`, scalars: arithmetic of
-    scalars fuses over all elements, where slices and stacks of arrays do not."""
+    scalars fuses over all elements, while slices and stacks of arrays do not."""
     parameters: Any
     """Default parameters: a NamedTuple of arrays, SI units."""
     prepare: Callable[[Any, Context], Any]
@@ -59,12 +59,12 @@ class Term(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """Which values are accepted."""
+    """Range of accepted values."""
 
     holds: Callable[[np.ndarray], np.ndarray]
     """Elementwise; false for NaN."""
     expected: str
-    """In words."""
+    """The range in words."""
 
 
 POSITIVE = Bound(lambda values: (values > 0) & np.isfinite(values), "a positive number")
@@ -74,7 +74,7 @@ NOT_NEGATIVE = Bound(lambda values: (values >= 0) & np.isfinite(values), "zero o
 def material(
     name: str, value: Numbers, count: int, element: str, bound: Bound = POSITIVE
 ) -> Float[Array, ""] | Float[Array, " m"]:
-    """A value for all elements [] or one for each [m]; `InputError` names the first element that has a wrong one."""
+    """Validates a value for all elements [] or one per element [m]; `InputError` names the first element at fault."""
     result = jnp.asarray(value, dtype=float)
     if result.shape not in ((), (count,)):
         raise InputError(f"{name} has shape {result.shape}; expected one number, or {count}: one per {element}")
@@ -86,7 +86,7 @@ def material(
 
 
 def vector(name: str, value: Numbers, *, zero_allowed: bool = True) -> Float[Array, " dim"]:
-    """A finite vector of the plane or of space."""
+    """Validates a finite vector of the plane or of space."""
     result = jnp.asarray(value, dtype=float)
     if result.shape not in ((2,), (3,)):
         raise InputError(f"{name} has shape {result.shape}; expected 2 or 3 components")
@@ -100,7 +100,7 @@ def vector(name: str, value: Numbers, *, zero_allowed: bool = True) -> Float[Arr
 
 
 def require_dimension(name: str, components: int, dimension: int) -> None:
-    """Raises `InputError` where a vector belongs to another space than the scene."""
+    """Raises `InputError` if a vector does not have the scene's dimension."""
     if components != dimension:
         raise InputError(f"{name} has {components} components in a scene of dimension {dimension}")
 
