@@ -85,7 +85,7 @@ def own_first(arguments: type[Arguments]) -> type[Arguments]:
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:
-    """The names of an option such as --hold, which commas separate; none where it was not given."""
+    """The names of an option such as --lock, which commas separate; none where it was not given."""
     return tuple(name for each in (text or "").split(",") if (name := each.strip()))
 
 

@@ -89,7 +89,7 @@ def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
     if count := int((found.repeats.q | found.repeats.tau).sum()):
         lines.append(f"{count} samples repeat the one before and are resampled over")
     if found.left_out:
-        lines.append(f"{found.left_out} stretches are too short for the filter and left out")
+        lines.append(f"{found.left_out} segments are too short for the filter and left out")
     return lines
 
 
@@ -128,7 +128,7 @@ def checked(
     more = f"python -m scripts.check_data --data {path}"
     if getattr(given, "robot", None) is not None:
         more += f" --robot {getattr(given, 'robot')}"  # noqa: B009  only some commands have it
-        more += f" --hold '{hold}'" if (hold := getattr(given, "hold", None)) else ""
+        more += f" --lock '{lock}'" if (lock := getattr(given, "lock", None)) else ""
     errors = [f"{finding.said}; {finding.remedy}" for finding in found if finding.severity == "error"]
     if errors and not given.accept_log:
         raise InputError(f"{path}: {'; also '.join(errors)}; or go on with --accept-log ({more} says more)")

@@ -24,7 +24,7 @@ class Resumable(Folder):
 
 @dataclass(frozen=True)
 class Drawn:
-    """Whether pictures are wanted."""
+    """Whether figures are wanted."""
 
     figures: bool = True
     """Draw the figures."""

@@ -1,7 +1,7 @@
 """Controllers from known or learned energies: tracking, regulators, swing-up, and the closed loop around them."""
 
 from dln_jax.control.balance import Region, error, region_of_attraction, regulated, switched, value
-from dln_jax.control.closed_loop import Controller, Laboratory, Run, following, simulate, stateless, with_differences
+from dln_jax.control.closed_loop import Controller, Hardware, Run, following, simulate, stateless, with_differences
 from dln_jax.control.delays import with_prediction
 from dln_jax.control.energy_shaping import (
     EnergyGains,
@@ -29,14 +29,14 @@ from dln_jax.control.tracking import (
     limited,
     trusted,
 )
-from dln_jax.control.trajectories import Plan, Problem, first_plan, improve, optimise, receding
+from dln_jax.control.trajectories import Plan, Problem, first_plan, improve, mpc, optimise
 
 __all__ = [
     "Controller",
     "EnergyGains",
     "Gains",
+    "Hardware",
     "Judgement",
-    "Laboratory",
     "Linearisation",
     "Outcomes",
     "Parts",
@@ -67,12 +67,12 @@ __all__ = [
     "limited",
     "linearise",
     "lqr",
+    "mpc",
     "optimise",
     "outcomes",
     "partial_linearisation",
     "parts_of",
     "passive_energy",
-    "receding",
     "region_of_attraction",
     "regulated",
     "sampled_lqr",

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool
 
-from dln_jax.control.closed_loop import Controller, Laboratory, simulate
+from dln_jax.control.closed_loop import Controller, Hardware, simulate
 from dln_jax.control.finite import where_finite
 from dln_jax.control.quadratic import Regulator
 from dln_jax.control.state_space import Field
@@ -102,14 +102,14 @@ def region_of_attraction(
     surface = (sphere / np.sqrt(sizes)) @ axes.T
     cost = value(regulator, goal, joints)
     controller = Controller((), lambda memory, t, y: (memory, law(y)))
-    lab = Laboratory(least, most)
+    lab = Hardware(least, most)
 
     @jax.jit
     def arrives(level: Array) -> Bool[Array, " starts"]:
         def one(start: Array) -> Array:
             run = simulate(
                 field, controller, jnp.asarray(goal) + jnp.sqrt(level) * start,
-                seconds=seconds, rate=rate, controls=controls, laboratory=lab,
+                seconds=seconds, rate=rate, controls=controls, hardware=lab,
             )  # fmt: skip
             return cost(run.x[-1]) <= 0.01 * level
 

@@ -1,4 +1,4 @@
-"""Closed loop of a plant in continuous time and a sampled controller, with the effects of a laboratory on both.
+"""Closed loop of a plant in continuous time and a sampled controller, with the effects of the hardware on both.
 
 At every sample the controller receives the measured coordinates and returns controls. They are limited, delayed by
 whole samples and noisy, and held until the next sample while the classical Runge-Kutta method integrates the plant.
@@ -32,7 +32,7 @@ class Controller(NamedTuple):
     """(memory, t, measured y) -> (memory, u [m])."""
 
 
-class Laboratory(NamedTuple):
+class Hardware(NamedTuple):
     """Limits, sensors, noise and delay between a controller and a plant; by default none."""
 
     least: Any = -jnp.inf
@@ -132,7 +132,7 @@ def simulate(
     seconds: float,
     rate: float,
     controls: int,
-    laboratory: Laboratory = Laboratory(),  # noqa: B008
+    hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
     substeps: int = 1,
 ) -> Run:
@@ -145,7 +145,7 @@ def simulate(
         seconds: duration of the run.
         rate: of the samples, Hz.
         controls: m.
-        laboratory: limits, noise, delay.
+        hardware: limits, noise, delay.
         key: of the noise; required if there is any.
         substeps: integrator steps per sample.
 
@@ -153,7 +153,7 @@ def simulate(
         InputError: settings out of range, or noise without a key.
     """
     require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
-    lab = laboratory
+    lab = hardware
     key = noise_of(lab, key)
     samples, dt = round(seconds * rate), 1.0 / rate
     x = jnp.asarray(x, float)
@@ -173,36 +173,36 @@ def simulate(
     return Run(dt * jnp.arange(samples + 1), jnp.concatenate([x[None], later]), u, y)
 
 
-def noise_of(laboratory: Laboratory, key: Array | None) -> Array:
+def noise_of(hardware: Hardware, key: Array | None) -> Array:
     """Returns the key, or any key without noise; raises `InputError` for noise without a key, or an invalid delay."""
-    delay = laboratory.delay
+    delay = hardware.delay
     if delay < 0 or delay != int(delay):
         raise InputError(f"delay is {delay}; expected a whole number of samples, 0 or more")
-    if _noisy(laboratory) and key is None:
-        raise InputError("the laboratory has noise; give a key of jax.random, a new one for each run")
+    if _noisy(hardware) and key is None:
+        raise InputError("the hardware has noise; give a key of jax.random, a new one for each run")
     return jax.random.key(0) if key is None else key
 
 
-def measured(laboratory: Laboratory, x: Array, key: Array) -> Array:
+def measured(hardware: Hardware, x: Array, key: Array) -> Array:
     """Measurement of a state (q, qd) that the controller receives."""
     q, qd = jnp.split(x, 2)
-    if _noisy(laboratory):
-        q = q + laboratory.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
-    y = rounded(q, laboratory.encoder_step)
-    return jnp.concatenate([y, qd]) if laboratory.sees_rates else y
+    if _noisy(hardware):
+        q = q + hardware.encoder_noise * jax.random.normal(key, q.shape, x.dtype)
+    y = rounded(q, hardware.encoder_step)
+    return jnp.concatenate([y, qd]) if hardware.sees_rates else y
 
 
-def delivered(laboratory: Laboratory, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
+def delivered(hardware: Hardware, waiting: Array, wanted: Array, key: Array) -> tuple[Array, Array]:
     """Returns the controls that act now, and the queue [delay, m] of delayed controls after adding the wanted ones."""
-    queue = jnp.concatenate([waiting, limited(wanted, laboratory.least, laboratory.most)[None]])
+    queue = jnp.concatenate([waiting, limited(wanted, hardware.least, hardware.most)[None]])
     u = queue[0]
-    if _noisy(laboratory):
-        u = u + laboratory.control_noise * jax.random.normal(key, u.shape, u.dtype)
+    if _noisy(hardware):
+        u = u + hardware.control_noise * jax.random.normal(key, u.shape, u.dtype)
     return u, queue[1:]
 
 
-def _noisy(laboratory: Laboratory) -> bool:
-    stated = laboratory.encoder_noise, laboratory.control_noise
+def _noisy(hardware: Hardware) -> bool:
+    stated = hardware.encoder_noise, hardware.control_noise
     return any(not isinstance(each, int | float) or each != 0 for each in stated)
 
 

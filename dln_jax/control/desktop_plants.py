@@ -1,4 +1,4 @@
-"""Two laboratory plants: friction, limits, encoders, noise and delay, defined in one place.
+"""Two desktop plants: friction, limits, encoders, noise and delay, defined in one place.
 
 | | cart-pole | rotary pendulum |
 |---|---|---|
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dln_jax.control.closed_loop import Laboratory
+from dln_jax.control.closed_loop import Hardware
 from dln_jax.control.energy_shaping import EnergyGains
 from dln_jax.control.swing_up import SwingUpNumbers
 from dln_jax.mechanics.friction import FrictionCoefficients, FrictionShape
@@ -34,15 +34,15 @@ TURN = 2 * np.pi / 2048
 
 
 class DesktopPlant(NamedTuple):
-    """A plant with one motor and one free pole to swing up, and its laboratory."""
+    """A plant with one motor and one free pole to swing up, with its sensors and actuators."""
 
     scene: Scene
     """Scene with the plant's friction."""
-    makers: Callable[..., Scene]
+    nominal: Callable[..., Scene]
     """Builds the manufacturer's model, without friction, from its sizes."""
     sizes: Mapping[str, float]
     """True masses in kg and lengths in m."""
-    laboratory: Laboratory
+    hardware: Hardware
     rate: float
     """Sampling rate of the controller, Hz."""
     substeps: int
@@ -58,7 +58,7 @@ def desktop_cart_pole() -> DesktopPlant:
     sizes = {"cart_mass": 0.57, "pole_mass": 0.127, "length": 0.16825}
     friction = FrictionCoefficients(viscous=(0.1, 1e-3), coulomb=(0.3, 5e-4), stribeck=(0.1, 2e-4))
     shape = FrictionShape(velocity_scale=(0.005, 0.01), stribeck_velocity=(0.05, 0.1))
-    lab = Laboratory(-10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False)
+    lab = Hardware(-10.0, 10.0, encoder_step=np.array([2.3e-5, TURN]), control_noise=0.05, delay=1, sees_rates=False)
     numbers = SwingUpNumbers(
         EnergyGains(1100.0, 21.0, 4.7),
         np.diag([10.0, 10.0, 1.0, 0.1]),
@@ -76,7 +76,7 @@ def desktop_rotary_pendulum() -> DesktopPlant:
     sizes = {"arm_mass": 0.095, "arm_length": 0.085, "pole_mass": 0.024, "pole_length": 0.129}
     friction = FrictionCoefficients(viscous=(1e-4, 1e-5), coulomb=(1.5e-3, 5e-5), stribeck=(5e-4, 2e-5))
     shape = FrictionShape(velocity_scale=(0.01, 0.01), stribeck_velocity=(0.1, 0.1))
-    lab = Laboratory(-0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False)
+    lab = Hardware(-0.05, 0.05, encoder_step=np.array([TURN, TURN]), control_noise=2.5e-4, delay=1, sees_rates=False)
     numbers = SwingUpNumbers(
         EnergyGains(4.3e7, 32.0, 11.0),
         np.diag([1.0, 1.0, 0.01, 0.01]),

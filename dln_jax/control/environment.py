@@ -1,4 +1,4 @@
-"""A plant in its laboratory as a `gymnasium.Env`, for training controllers with other libraries (extra `[rl]`).
+"""A plant with sensors and actuators as a `gymnasium.Env`, to train controllers with other libraries (extra `[rl]`).
 
 NumPy in float32; actions in [-1, 1] are scaled to the limits of the controls. The loop is that of `simulate`.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.closed_loop import Laboratory, delivered, measured, noise_of
+from dln_jax.control.closed_loop import Hardware, delivered, measured, noise_of
 from dln_jax.control.state_space import Field, integrated
 from dln_jax.types import InputError, JointKind, Scalar, require_positive
 
@@ -28,7 +28,7 @@ class _Place(NamedTuple):
 class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
     """Environment of one plant: actions in [-1, 1] span the controls' limits, the reward is minus the sample's cost.
 
-    Observations are the measurements of the laboratory, with cosine and sine for revolute joints. An episode is
+    Observations are the measurements of the hardware, with cosine and sine for revolute joints. An episode is
     truncated after `seconds`. It is terminated if the state is not finite: `info["failed"]` is then true, the
     observation is the last finite one, and the reward is minus the cost of a failure. `info["x"]` is the true state,
     `info["u"]` the acting control.
@@ -40,7 +40,7 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         joints: their kinds [d].
         seconds: duration of an episode.
         rate: of the samples, Hz.
-        laboratory: with finite limits, one per control or one for all.
+        hardware: with finite limits, one per control or one for all.
         controls: m.
         substeps: integrator steps per sample.
         failure_cost: cost of a state that is not finite; it should exceed the remaining cost of any other episode.
@@ -58,23 +58,23 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         *,
         seconds: float,
         rate: float,
-        laboratory: Laboratory,
+        hardware: Hardware,
         controls: int = 1,
         substeps: int = 1,
         failure_cost: float = 1e3,
     ):
         require_positive(seconds=seconds, rate=rate, controls=controls, substeps=substeps)
-        low, high = (np.broadcast_to(np.asarray(each, float), controls) for each in laboratory[:2])
+        low, high = (np.broadcast_to(np.asarray(each, float), controls) for each in hardware[:2])
         if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
             raise InputError(f"limits are {low} and {high}; expected finite ones, which actions in [-1, 1] span")
-        noise_of(laboratory, jax.random.key(0))
+        noise_of(hardware, jax.random.key(0))
         self._samples, self._failure_cost = round(seconds * rate), failure_cost
         self._key, self._place, self._seen = jax.random.key(0), None, np.zeros(0)
         step, revolute = integrated(field, 1 / rate, substeps=substeps), np.array(joints) == "revolute"
         turning, sliding = np.flatnonzero(revolute), np.flatnonzero(~revolute)
 
         def observe(x: Array, key: Array) -> Array:
-            y = measured(laboratory, x, key)
+            y = measured(hardware, x, key)
             angles, rates = y[turning], y[len(joints) :]
             return jnp.concatenate([y[sliding], jnp.cos(angles), jnp.sin(angles), rates])
 
@@ -83,19 +83,19 @@ class PlantEnvironment(gymnasium.Env[np.ndarray, np.ndarray]):
         @jax.jit
         def begin(key: Array) -> tuple[_Place, Array]:
             of_start, of_encoder = jax.random.split(jax.random.fold_in(key, 0))
-            place = _Place(start(of_start), jnp.zeros((laboratory.delay, controls)), jnp.asarray(1))
+            place = _Place(start(of_start), jnp.zeros((hardware.delay, controls)), jnp.asarray(1))
             return place, observe(place.x, of_encoder)
 
         @jax.jit
         def advance(key: Array, place: _Place, action: Array) -> tuple[_Place, Array, Array, Array]:
             of_control, of_encoder = jax.random.split(jax.random.fold_in(key, place.number))
             wanted = middle + half * action
-            u, waiting = delivered(laboratory, place.waiting, wanted, of_control)
+            u, waiting = delivered(hardware, place.waiting, wanted, of_control)
             after = _Place(step(place.x, u), waiting, place.number + 1)
             return after, observe(after.x, of_encoder), cost(place.x, u) / rate, u
 
         self._begin, self._advance = begin, advance
-        size = len(joints) + len(turning) + laboratory.sees_rates * len(joints)
+        size = len(joints) + len(turning) + hardware.sees_rates * len(joints)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (controls,), np.float32)
 

@@ -1,6 +1,6 @@
-"""Exploratory motions of a plant in its laboratory: an energy law from a rough model, plus smooth noise.
+"""Exploratory motions of a plant in its hardware: an energy law from a rough model, plus smooth noise.
 
-A recording holds what a laboratory measures: the encoders' readings and the commanded torques, before delay and noise.
+A recording holds what the hardware measures: the encoders' readings and the commanded torques, before delay and noise.
 `data.encoders` estimates rates and accelerations.
 """
 
@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Float
 
 from dln_jax.control.balance import Law
-from dln_jax.control.closed_loop import Controller, Laboratory, Run, simulate, with_differences
+from dln_jax.control.closed_loop import Controller, Hardware, Run, simulate, with_differences
 from dln_jax.control.desktop_plants import DesktopPlant
 from dln_jax.control.energy_shaping import EnergyGains, energy_shaping, parts_of, passive_energy
 from dln_jax.control.outcomes import hanging_starts
@@ -66,12 +66,12 @@ def with_noise(law: Law, noise: Any, *, rate: float, cutoff: float) -> Controlle
     return Controller((inner.start, noise), act)
 
 
-def commands(controller: Controller, run: Run, laboratory: Laboratory) -> Float[Array, "N m"]:
+def commands(controller: Controller, run: Run, hardware: Hardware) -> Float[Array, "N m"]:
     """Commands of the controller in a run, within the limits, recomputed from its measurements."""
 
     def ask(memory: Any, now: tuple[Array, Array]) -> tuple[Any, Array]:
         memory, wanted = controller.act(memory, *now)
-        return memory, jnp.clip(wanted, laboratory.least, laboratory.most)
+        return memory, jnp.clip(wanted, hardware.least, hardware.most)
 
     return jax.lax.scan(ask, controller.start, (run.t[:-1], run.y))[1]
 
@@ -86,10 +86,10 @@ def explore(
     """Returns a recording of t, q and the commanded torques, without rates, and the true runs for evaluation.
 
     Args:
-        plant: in its laboratory; the true plant, with friction that the rough model lacks.
+        plant: the true plant with its sensors and actuators, with friction that the rough model lacks.
         gains: of the energy law, whose goal is the upright pole.
         excitation: settings.
-        seed: of the rough model, the noise, the starts and the laboratory.
+        seed: of the rough model, the noise, the starts and the hardware.
 
     Raises:
         InputError: settings out of range.
@@ -99,10 +99,10 @@ def explore(
         seconds=excitation.seconds, episodes=excitation.episodes, bandwidth=excitation.bandwidth, share=excitation.share
     )
     random = np.random.default_rng([seed, 17])
-    needs, rate, lab = plant.scene.needs, plant.rate, plant.laboratory
+    needs, rate, lab = plant.scene.needs, plant.rate, plant.hardware
     B = np.asarray(needs.actuation)
     sizes = {name: size * (1 + excitation.wrong * random.choice([-1.0, 1.0])) for name, size in plant.sizes.items()}
-    rough = dynamics(plant.makers(**sizes).closed_form)
+    rough = dynamics(plant.nominal(**sizes).closed_form)
     parts = parts_of(B)
     lift = passive_energy(rough, parts, jnp.zeros(2))(jnp.array([0.0, np.pi]), jnp.zeros(2))
     surplus = -lift * jnp.linspace(*excitation.surplus, excitation.episodes)
@@ -120,7 +120,7 @@ def explore(
             lambda x: law(x[:2], x[2:]), excitation.noise * most * noise[:, None], rate=rate, cutoff=excitation.cutoff
         )
         run = simulate(
-            field, controller, x, seconds=samples / rate, rate=rate, controls=B.shape[1], laboratory=inside, key=key,
+            field, controller, x, seconds=samples / rate, rate=rate, controls=B.shape[1], hardware=inside, key=key,
             substeps=plant.substeps,
         )  # fmt: skip
         return run, commands(controller, run, inside)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control.closed_loop import Controller, Laboratory, Run, delivered, measured, noise_of
+from dln_jax.control.closed_loop import Controller, Hardware, Run, delivered, measured, noise_of
 from dln_jax.control.finite import where_finite
 from dln_jax.data.robots import quiet
 from dln_jax.types import InputError, require_positive
@@ -24,7 +24,7 @@ def simulate_in_mujoco(
     seconds: float,
     rate: float,
     actuation: Any = None,
-    laboratory: Laboratory = Laboratory(),  # noqa: B008
+    hardware: Hardware = Hardware(),  # noqa: B008
     key: Array | None = None,
 ) -> Run:
     """Simulates one run as `simulate` does, sample by sample, with MuJoCo's integrator and time step.
@@ -38,7 +38,7 @@ def simulate_in_mujoco(
         seconds: duration of the run.
         rate: of the samples, Hz; a sample is a whole number of MuJoCo's steps.
         actuation: matrix [actuators, m] in ctrl = actuation u; by default u is ctrl.
-        laboratory: limits, noise, delay; the model's own limits also apply.
+        hardware: limits, noise, delay; the model's own limits also apply.
         key: of the noise; required if there is any.
 
     Raises:
@@ -46,7 +46,7 @@ def simulate_in_mujoco(
             another size; a sample that is not a whole number of steps; settings as for `simulate`.
     """
     require_positive(seconds=seconds, rate=rate)
-    key = noise_of(laboratory, key)
+    key = noise_of(hardware, key)
     mujoco, model = _compiled(model)
     data, x = mujoco.MjData(model), np.asarray(x, float)
     if model.nq != model.nv or x.shape != (2 * model.nv,):
@@ -60,12 +60,12 @@ def simulate_in_mujoco(
     @jax.jit
     def sample(memory: Any, waiting: Array, x: Array, number: Array) -> tuple[Any, Array, Array, Array]:
         of_encoder, of_control = jax.random.split(jax.random.fold_in(key, number))
-        y = measured(laboratory, x, of_encoder)
+        y = measured(hardware, x, of_encoder)
         memory, wanted = controller.act(memory, number / rate, y)
-        u, waiting = delivered(laboratory, waiting, where_finite(wanted, y), of_control)
+        u, waiting = delivered(hardware, waiting, where_finite(wanted, y), of_control)
         return memory, waiting, u, y
 
-    memory, waiting = controller.start, jnp.zeros((laboratory.delay, B.shape[1]))
+    memory, waiting = controller.start, jnp.zeros((hardware.delay, B.shape[1]))
     states, controls, seen = [x], [], []
     for number in range(round(seconds * rate)):
         memory, waiting, u, y = sample(memory, waiting, jnp.asarray(states[-1]), jnp.asarray(number))

@@ -5,7 +5,7 @@
 The defect of a step, d_k = f(x_k, u_k) - x_{k+1}, vanishes only at the solution. A guess need not be a motion, and an
 unstable system does not multiply its errors over the horizon (Bock and Plitt 1984).
 
-Sequential quadratic programming: all steps are expanded at once, and `limited_horizon` solves for the changes of states
+Sequential quadratic programming: all steps are expanded at once, and `constrained_lq` solves for the changes of states
 and controls. They are shortened until cost + nu |defects|_1 falls enough, with nu above the multipliers (Nocedal and
 Wright 2006, section 18.3). A full step may instead lower the augmented Lagrangian, because near a solution the first
 merit function can refuse steps that lead there (Maratos). Negative curvature of the costs is dropped. Through steps
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from dln_jax.control.limited_horizon import Horizon, least_cost
+from dln_jax.control.constrained_lq import Horizon, least_cost
 from dln_jax.control.trajectories import FIRST_DAMPING, Plan, Problem
 from dln_jax.solvers.ending import Ending
 from dln_jax.solvers.lapack import symmetric_eigen
@@ -39,7 +39,7 @@ class Shooting(NamedTuple):
     """Result of multiple shooting."""
 
     plan: Plan
-    """Plan for `receding` and for feedback along it; its states are the knots, a motion to within the defect."""
+    """Plan for `mpc` and for feedback along it; its states are the knots, a motion to within the defect."""
     multipliers: Float[Array, "N n"]
     """Derivatives of the cost to go by the states at the ends of the steps."""
     defect: Float[Array, ""]

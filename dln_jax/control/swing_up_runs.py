@@ -1,4 +1,4 @@
-"""Swing-ups of a desktop plant in its laboratory, by any model of it: one run, or the outcomes of many."""
+"""Swing-ups of a desktop plant on its simulated hardware, by any model of it: one run, or the outcomes of many."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -37,15 +37,15 @@ def model_of_plant(plant: DesktopPlant) -> Dynamics:
     return dynamics(plant.scene.closed_form)
 
 
-def model_of_maker(plant: DesktopPlant) -> Dynamics:
+def nominal_model(plant: DesktopPlant) -> Dynamics:
     """Model with the manufacturer's sizes, without friction."""
-    return dynamics(plant.makers(**plant.sizes).closed_form)
+    return dynamics(plant.nominal(**plant.sizes).closed_form)
 
 
 def law_of(plant: DesktopPlant, model: Dynamics | PlainDynamics, numbers: SwingUpNumbers | None = None) -> SwingUp:
     """Returns the plant's swing-up by a model, with the plant's own numbers by default. Raises as `swing_up`."""
     angle = np.linspace(-np.pi, np.pi, POSTURES)
-    needs, lab = plant.scene.needs, plant.laboratory
+    needs, lab = plant.scene.needs, plant.hardware
     return swing_up(
         model, needs.actuation, needs.joints, np.zeros(2), plant.numbers if numbers is None else numbers,
         postures=np.stack([np.zeros(POSTURES), angle], axis=1), least=lab.least, most=lab.most,
@@ -67,7 +67,7 @@ def motion_of(
     def run(x: Array, key: Array) -> Run:
         return simulate(
             field, controller, x, seconds=seconds, rate=plant.rate, controls=B.shape[1],
-            laboratory=plant.laboratory, key=key, substeps=plant.substeps,
+            hardware=plant.hardware, key=key, substeps=plant.substeps,
         )  # fmt: skip
 
     return run

@@ -135,7 +135,7 @@ def optimise(problem: Problem, x: Any, u: Any, *, iterations: int = 200, toleran
     return last[1]._replace(ending=ending(*last))
 
 
-def receding(
+def mpc(
     problem: Problem, *, iterations: int = 1, step_lengths: Any = STEP_LENGTHS
 ) -> Callable[[Array, Plan], tuple[Array, Plan]]:
     """Model predictive control: (state, plan) -> (control, plan), with the plan shifted by one step and improved.

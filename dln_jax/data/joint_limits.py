@@ -12,7 +12,7 @@ import numpy as np
 
 from dln_jax.types import InputError
 
-REMEDY = "correct the file, or hold the joint"
+REMEDY = "correct the file, or lock the joint"
 LIMITED = {"range": "limited", "actuatorfrcrange": "actuatorfrclimited"}
 """Attributes of an MJCF joint that hold two numbers, and the attributes that disable them."""
 KINDS = {"range": "position", "actuatorfrcrange": "torque"}

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stretches import GAP, stretches
+from dln_jax.data.segments import GAP, segments
 from dln_jax.types import InputError
 
 DEGREE = 4
@@ -53,7 +53,7 @@ def smooth_locally(
         data: trajectories; only q and t enter the fit.
         points: neighbours of every sample, itself included (default: chosen per coordinate).
         degree: degree of the polynomials, at least 2.
-        gap: as for `data.stretches.stretches`.
+        gap: as for `data.segments.segments`.
 
     Raises:
         InputError: the degree is below 2, `points` is below degree + 2, or no segment is long enough.
@@ -64,9 +64,9 @@ def smooth_locally(
         raise InputError(f"degree is {degree}; expected at least 2, for an acceleration")
     if points is not None and points < least:
         raise InputError(f"points is {points}; expected at least {least} for polynomials of degree {degree}")
-    parts = [each for each in stretches(data.t, data.trajectory, gap=gap) if len(each) >= max(least, points or 0)]
+    parts = [each for each in segments(data.t, data.trajectory, gap=gap) if len(each) >= max(least, points or 0)]
     if not parts:
-        raise InputError(f"no stretch without a gap has {max(least, points or 0)} samples; record longer motions")
+        raise InputError(f"no segment without a gap has {max(least, points or 0)} samples; record longer motions")
     shortest = min(map(len, parts))
     kept = np.concatenate(parts)
     chosen, columns, noise = [], [], []
@@ -92,11 +92,11 @@ def _sizes(least: int, most: int) -> list[int]:
 
 
 def _over(parts: list[np.ndarray], t: np.ndarray, q: np.ndarray, size: int, degree: int) -> _Fits:
-    fits = [_stretch(t[part], q[part], size, degree) for part in parts]
+    fits = [_segment(t[part], q[part], size, degree) for part in parts]
     return _Fits(*(np.concatenate(arrays) for arrays in zip(*fits, strict=True)))
 
 
-def _stretch(t: np.ndarray, q: np.ndarray, size: int, degree: int) -> _Fits:
+def _segment(t: np.ndarray, q: np.ndarray, size: int, degree: int) -> _Fits:
     first = np.clip(np.arange(len(t)) - size // 2, 0, len(t) - size)
     around = first[:, None] + np.arange(size)
     unit = 0.5 * (t[-1] - t[0]) * size / len(t)

@@ -30,7 +30,7 @@ def write_robot(
     *,
     damping: Any = None,
     coulomb: Any = None,
-    hold: Mapping[str, float] | Sequence[str] = (),
+    lock: Mapping[str, float] | Sequence[str] = (),
     remarks: tuple[str, ...] = (),
 ) -> None:
     """Writes a copy of `original` with the inertias and friction of a tree, and its armature if the format has it.
@@ -41,7 +41,7 @@ def write_robot(
         tree: tree with the joints of that file, by name.
         damping: viscous friction of each joint [d], N m s or N s/m; by default unchanged.
         coulomb: dry friction [d], N m or N; by default unchanged.
-        hold: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
+        lock: joints that were locked when the tree was read, as for `read_robot`. The bodies behind a locked joint
             count towards the link before it, in the position in which the joint is locked.
         remarks: lines of the comment at the top of the file.
 
@@ -53,7 +53,7 @@ def write_robot(
     if path.exists() and original.exists() and path.samefile(original):
         raise InputError(f"{path} is the file that was read; give another name, so that it stays as it is")
     root = parsed(original)
-    _, model, held = opened(original, copy.deepcopy(root), hold)
+    _, model, held = opened(original, copy.deepcopy(root), lock)
     names = [name for name in joint_names(model) if name not in held]
     if list(tree.names) != names:
         raise InputError(f"{original} has the joints {', '.join(names)}; the tree has {', '.join(tree.names)}")

@@ -51,7 +51,7 @@ class _Link(NamedTuple):
     axis: np.ndarray
 
 
-def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = ()) -> Robot:
+def read_robot(path: str | Path, *, lock: Mapping[str, float] | Sequence[str] = ()) -> Robot:
     """Reads a robot from a URDF or MJCF file.
 
     URDF inertias are read as stated, even if they are not physically consistent.
@@ -70,7 +70,7 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
     try:
         stated = link_inertias(root) if root.tag == "robot" else None
         velocities = functools.partial(velocity_limits, root)
-        mujoco, model, held = opened(path, root, hold)
+        mujoco, model, held = opened(path, root, lock)
         robot = _robot(mujoco, model, held, stated)
         _require_numbers(robot)
         return robot._replace(velocity_limits=velocities(robot.tree.names)) if root.tag == "robot" else robot
@@ -79,7 +79,7 @@ def read_robot(path: str | Path, *, hold: Mapping[str, float] | Sequence[str] = 
 
 
 def opened(
-    path: Path, root: ET.Element, hold: Mapping[str, float] | Sequence[str]
+    path: Path, root: ET.Element, lock: Mapping[str, float] | Sequence[str]
 ) -> tuple[Any, Any, dict[str, float]]:
     """MuJoCo, its model of the file with this root element, and the positions of locked joints by name.
 
@@ -87,10 +87,10 @@ def opened(
     """
     if root.tag == "mujoco":
         mujoco, model = _compiled(path, root, ())
-        held = _matching(hold, joint_names(model))
+        held = _matching(lock, joint_names(model))
         check_limits(path, root, held)
         return mujoco, model, held
-    held = _matching(hold, [each.get("name", "") for each in root.findall("joint")])
+    held = _matching(lock, [each.get("name", "") for each in root.findall("joint")])
     check_limits(path, root, held)
     return (*_compiled(path, root, held), held)
 
@@ -100,14 +100,14 @@ def joint_names(model: Any) -> list[str]:
     return [model.joint(k).name or f"joint_{k}" for k in range(model.njnt)]
 
 
-def _matching(hold: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
+def _matching(lock: Mapping[str, float] | Sequence[str], names: Sequence[str]) -> dict[str, float]:
     """Positions of the locked joints by full name."""
-    positions = hold if isinstance(hold, Mapping) else dict.fromkeys(hold, 0.0)
+    positions = lock if isinstance(lock, Mapping) else dict.fromkeys(lock, 0.0)
     found: dict[str, float] = {}
     for pattern, position in positions.items():
         matching = fnmatch.filter(names, pattern)
         if not matching:
-            raise InputError(f"there is no joint '{pattern}' to hold; it has {', '.join(names)}")
+            raise InputError(f"there is no joint '{pattern}' to lock; it has {', '.join(names)}")
         found |= dict.fromkeys(matching, float(position))
     return found
 
@@ -148,7 +148,7 @@ def _model(mujoco: Any, path: Path, root: ET.Element, held: Collection[str]) -> 
             if joint.get("name") not in held:
                 raise InputError(
                     f"{path}: joint '{joint.get('name')}' follows another (mimic); expected joints that move freely: "
-                    "hold it, and the one that it follows"
+                    "lock it, and the one that it follows"
                 )
             joint.remove(mimic)
     return mujoco.MjModel.from_xml_string(ET.tostring(without_inertias(root), encoding="unicode"))
@@ -160,7 +160,7 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[st
     for name, kind in zip(names, map(int, model.jnt_type), strict=True):
         if kind in others and name not in held:
             raise InputError(
-                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: hold it, if so"
+                f"joint '{name}' is {others[kind]}; expected revolute and prismatic joints: lock it, if so"
             )
     moving = {k for k, name in enumerate(names) if name not in held}
     # Equality constraints and tendons between locked joints have no effect.
@@ -168,7 +168,7 @@ def _require_tree(mujoco: Any, model: Any, names: list[str], held: Collection[st
     tied = {int(k) for each in (model.eq_obj1id, model.eq_obj2id, model.wrap_objid) for k in each}
     if set(map(int, model.eq_type)) - {joints} or set(map(int, model.wrap_type)) - {over} or tied & moving:
         raise InputError(
-            "it has equality constraints or tendons, which close loops; expected a tree: hold the joints that they tie"
+            "it has equality constraints or tendons, which close loops; expected a tree: lock the joints that they tie"
         )
     if not 0 < len(moving) <= MOST_JOINTS:
         raise InputError(f"it has {len(moving)} joints; expected 1 to {MOST_JOINTS} that move")

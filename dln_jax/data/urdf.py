@@ -49,7 +49,7 @@ def require_joints(root: ET.Element, held: Collection[str], most: int) -> None:
         if joint.get("type") not in MOVING:
             raise InputError(
                 f"joint '{joint.get('name')}' is of type '{joint.get('type')}'; expected {', '.join(MOVING)} or fixed: "
-                "hold it, if so"
+                "lock it, if so"
             )
         for tag, keys in NUMBERS.items():
             element = joint.find(tag)

@@ -66,11 +66,11 @@ def write_frame_gif(
         InputError: no system, images that are not square, or another number of images than times.
     """
     require_positive(frames_per_second=frames_per_second)
-    _require_common_length(t, {name: pictures.shape[0] for name, pictures in frames.items()})
+    _require_common_length(t, {name: images.shape[0] for name, images in frames.items()})
     pixels = next(iter(frames.values())).shape[1]
     side = round(np.sqrt(pixels))
     if side * side != pixels:
-        raise InputError(f"pictures have {pixels} pixels; expected a square, row by row")
+        raise InputError(f"images have {pixels} pixels; expected a square, row by row")
     models = [name for name in frames if name != TRUTH] or [TRUTH]
     over = TRUTH in frames and models != [TRUTH]
     figure, axes = style.figure(1, len(models), width=2.4 * len(models), height=2.9 + 0.3 * over, dpi=DPI)

@@ -43,7 +43,7 @@ def torque_bands(
         axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
         largest = 1.1 * max(np.quantile(band, 0.98), np.quantile(np.abs(error[shown, joint]), 0.995)) / factor
         axis.set_ylim(-largest, largest)
-        for first, last in _stretches(outside[shown]):
+        for first, last in _segments(outside[shown]):
             axis.axvspan(first - 0.5, last + 0.5, color="0.5", alpha=0.25, linewidth=0)
         for start in starts:
             axis.axvline(start, color="0.75", linewidth=0.8, zorder=0)
@@ -66,7 +66,7 @@ def torque_bands(
     return figure
 
 
-def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
+def _segments(flags: np.ndarray) -> list[tuple[int, int]]:
     """First and last index of every run of true values."""
     edges = np.diff(np.r_[0, np.asarray(flags, int), 0])
     return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))

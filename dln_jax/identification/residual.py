@@ -20,7 +20,7 @@ from dln_jax.data.splits import Split
 from dln_jax.learning import dynamics
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
-from dln_jax.learning.growth import Trial, grow, stretches
+from dln_jax.learning.growth import Trial, grow, segments
 from dln_jax.learning.objectives import SCALED_TORQUE, arrays, residuals
 from dln_jax.models.model import Model, Parameters
 from dln_jax.models.residual import ResidualParameters, frozen, make_residual, make_with_residual
@@ -91,23 +91,23 @@ def fit_residual(
     began = time.perf_counter()
     with jax.enable_x64(True):
         scale = SCALED_TORQUE.scale(train)
-        stretch = stretches(validation)
+        segment = segments(validation)
         of_train, of_validation = (arrays(SCALED_TORQUE, data, jnp.float64) for data in (train, validation))
         judge = jax.jit(lambda system_of, batch: residuals(SCALED_TORQUE, system_of(), batch) / scale, static_argnums=0)
         left = np.asarray(judge(lambda: rigid.energies(parameters), of_train)) * np.asarray(scale)
         sizes = _sizes(train, left)
         sets = Split(train, validation, validation)
 
-        def errors(system_of: Any) -> Float[np.ndarray, " stretches"]:
+        def errors(system_of: Any) -> Float[np.ndarray, " segments"]:
             squares = np.sum(np.asarray(judge(system_of, of_validation)) ** 2, axis=1)
-            return np.bincount(stretch, squares) / np.bincount(stretch)
+            return np.bincount(segment, squares) / np.bincount(segment)
 
-        def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " stretches"]]:
+        def attempt(candidate: Candidate) -> tuple[Any, Float[np.ndarray, " segments"]]:
             if not candidate.terms:
                 return None, errors(lambda: rigid.energies(parameters))
             time_left = began + seconds - time.perf_counter()
             if time_left <= 0:
-                return None, np.full(stretch.max() + 1, np.inf)
+                return None, np.full(segment.max() + 1, np.inf)
             settings = {"terms": candidate.terms, "width": candidate.width, **sizes}
             both = make_with_residual(rigid, make_residual(needs, **settings))
             part = frozen(both, parameters)

@@ -66,7 +66,7 @@ def terms(
     step = rk4(lambda t, state: system.field.rates(*state))
     pairs = jnp.concatenate([windows[:, :-1], windows[:, 1:]], axis=2)
     q, p = jax.vmap(jax.vmap(system.encode))(pairs)
-    pictures = jax.vmap(jax.vmap(system.decode))(q, p)
+    images = jax.vmap(jax.vmap(system.decode))(q, p)
     t = jnp.arange(pairs.shape[1], dtype=q.dtype)
     moved = jax.vmap(lambda q, p: rollout(step, (q, p), t))(q[:, 0], p[:, 0])
     spread = [jnp.var(state) if relative else 1.0 for state in (q, p)]
@@ -74,7 +74,7 @@ def terms(
         jnp.mean((predicted - state)[:, 1:] ** 2) / size
         for predicted, state, size in zip(moved, (q, p), spread, strict=True)
     )
-    errors = pictures - pairs
+    errors = images - pairs
     return Terms(
         jnp.mean(errors**2) / (jnp.mean(jnp.var(pairs, axis=(0, 1))) if relative else 1.0),
         jnp.mean((p[:, :-1] - (q[:, 1:] - q[:, :-1])) ** 2) / spread[1],
@@ -118,7 +118,7 @@ def problem(
         InputError: settings are out of range, or trajectories are shorter than a window.
     """
     if matching.window < 2:
-        raise InputError(f"window is {matching.window}; expected at least 2 pictures, one to predict the other from")
+        raise InputError(f"window is {matching.window}; expected at least 2 images, one to predict the other from")
     fitted, held_out = (jnp.asarray(windows(frames, matching.window + 1)) for frames in (train, validation))
 
     def score(parameters: Parameters) -> tuple[Scalar, Scalar]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
 
-STRETCH = 0.5
+SEGMENT = 0.5
 """Length in s of a segment whose mean error counts as one measurement: neighbouring samples are not independent."""
 
 
@@ -79,7 +79,7 @@ def smallest_enough(trials: Sequence[Trial]) -> Trial:
     return next(trial for trial in trials if not significantly_better(lowest.errors, trial.errors))
 
 
-def stretches(data: Trajectories, seconds: float = STRETCH) -> Int[np.ndarray, " N"]:
+def segments(data: Trajectories, seconds: float = SEGMENT) -> Int[np.ndarray, " N"]:
     """Returns the index of every sample's time segment; segments end at the ends of trajectories."""
     within = np.floor(data.t / seconds).astype(int)
     within -= within.min()

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from dln_jax.data.encoders import smooth
 from dln_jax.data.magnitudes import on_device
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stretches import stretches
+from dln_jax.data.segments import segments
 from dln_jax.learning.engine.problem import Problem, mean_square, unmonitored
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.learning.weak_forms import FEWEST, OVERLAP, WINDOW, momentum_and_rest, window_weights
@@ -46,7 +46,7 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
         InputError: no segment is as long as a window.
     """
     require_positive(window=window)
-    pieces = stretches(data.t, data.trajectory)
+    pieces = segments(data.t, data.trajectory)
     dt = float(np.median(np.concatenate([np.diff(data.t[piece]) for piece in pieces])))
     steps = max(FEWEST, round(window / dt))
     rows = [
@@ -55,7 +55,7 @@ def cut_momentum_windows(data: Trajectories, *, window: float = WINDOW) -> Momen
         for first in range(0, len(piece) - steps, max(1, steps // OVERLAP))
     ]
     if not rows:
-        raise InputError(f"no stretch of the data is as long as a window of {window:g} s; give a shorter one")
+        raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
     chosen = np.stack(rows)
     w, _ = window_weights(steps, dt)
     return MomentumWindows(data.q[chosen], data.qd[chosen], np.einsum("s,wsd->wd", w, data.tau[chosen]), dt)

@@ -1,4 +1,4 @@
-"""Fits models to a laboratory recording of q and commanded torques: an identified model and a network.
+"""Fits models to a recording of q and commanded torques: an identified model and a network.
 
 1. Unless it is known, the delay of the torques is the one with the smallest residual of an identified model.
 2. q is smoothed (`data.encoders`), which also gives qd; torques are not filtered, and held between samples.

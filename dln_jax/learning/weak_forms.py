@@ -28,7 +28,7 @@ from jaxtyping import Float
 from dln_jax.compilation import quick_compilation
 from dln_jax.data.encoders.sampling import EVEN
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stretches import stretches
+from dln_jax.data.segments import segments
 from dln_jax.learning.objectives import torque_scale
 from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.mechanics.equations import dynamics
@@ -140,7 +140,7 @@ def _fit(
             )
         equations = list(_equations(model, unravel, zero, data, form, scale, window))
     if not equations:
-        raise InputError(f"no stretch of the data is as long as a window of {window:g} s; give a shorter one")
+        raise InputError(f"no segment of the data is as long as a window of {window:g} s; give a shorter one")
     weighted = ((_divided(A, unit).reshape(-1, zero.size), (b / unit).ravel()) for A, b, unit in equations)
     solution = least_squares.solve_chunks(weighted, **tolerances)
     squares = sum(float(np.sum((A @ solution.x - b) ** 2)) for A, b, _ in equations)
@@ -196,7 +196,7 @@ def _equations(
         return jax.vmap(pull_back)(jnp.eye(values.shape[0], dtype=values.dtype))[0]
 
     program = jax.jit(jax.vmap(columns), compiler_options=quick_compilation())
-    pieces = stretches(data.t, data.trajectory)
+    pieces = segments(data.t, data.trajectory)
     length = min(CHUNK, max(len(piece) for piece in pieces))
     for piece in pieces:
         if len(piece) <= FEWEST:

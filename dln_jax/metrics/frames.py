@@ -23,7 +23,7 @@ from dln_jax.metrics.phase_space import Motions, finite_or_infinite, predict, su
 from dln_jax.models.latent_phase import LatentModel
 from dln_jax.models.model import Parameters
 from dln_jax.precision import in_float64, with_float64
-from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, pictures, render, rod
+from dln_jax.scenes.datasets.pendulum_frames import FRAME_TIME, PIXELS, Frames, energy, images, render, rod
 from dln_jax.scenes.scene import closed_form_forward_dynamics
 from dln_jax.types import Hamiltonian, InputError, Scalar, Vector, require_positive
 
@@ -138,8 +138,8 @@ def frame_errors(model: LatentModel, parameters: Parameters, test: Frames) -> tu
     """
     pairs = test.pairs
     moved = predict_frames(model, parameters, pairs[:, 0], pairs.shape[1])
-    pictures = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))
-    return summary("energy_mse", energy_errors(moved.pairs, test)) | summary("frame_mse", pictures), moved
+    images = np.mean((moved.pairs - pairs) ** 2, axis=(1, 2))
+    return summary("energy_mse", energy_errors(moved.pairs, test)) | summary("frame_mse", images), moved
 
 
 @in_float64
@@ -213,7 +213,7 @@ def inject_energy(
     if not isinstance(field, Flow):
         raise InputError("the model has no energy to raise; give one whose latent field is a black-box-hnn")
     H = field.energy
-    still = np.tile(pictures(np.zeros(1))[0], 2)
+    still = np.tile(images(np.zeros(1))[0], 2)
     q, p = encoded(model, parameters, np.stack([pair, still]))
     ground = H(jnp.asarray(q[1]), jnp.asarray(p[1]))
     start = H(jnp.asarray(q[0]), jnp.asarray(p[0])) - ground

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stretches import GAP
+from dln_jax.data.segments import GAP
 from dln_jax.learning import motions, starts
 from dln_jax.learning.measured_motions import MeasuredWindows, motion
 from dln_jax.learning.starts import nearest
@@ -44,7 +44,7 @@ class Predictions(NamedTuple):
     """Energy drift relative to the largest kinetic energy; NaN for a model without energies."""
 
 
-def cut_stretches(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
+def cut_segments(data: Trajectories, samples: int, *, every: int) -> MeasuredWindows:
     """Cuts segments of `samples` samples to predict, which begin at every `every`-th sample of the trajectories.
 
     Raises:
@@ -128,7 +128,7 @@ def padded(motions: list[MeasuredWindows]) -> MeasuredWindows:
 def predict_measured(
     model: Model,
     parameters: Parameters,
-    stretches: MeasuredWindows,
+    segments: MeasuredWindows,
     *,
     fitted: int,
     torque: Torque = "interpolated",
@@ -140,7 +140,7 @@ def predict_measured(
     Args:
         model: of any energies, or of accelerations.
         parameters: its parameters.
-        stretches: segments to predict.
+        segments: segments to predict.
         fitted: number of samples that fit the initial state, at least 2.
         torque: between samples.
         substeps: RK4 steps between two samples.
@@ -149,18 +149,18 @@ def predict_measured(
     Raises:
         InputError: `fitted` is out of range.
     """
-    if not 2 <= fitted < stretches.t.shape[1]:
-        raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {stretches.t.shape[1]}")
-    spread = stretches.q.reshape(-1, stretches.q.shape[2]).std(axis=0)
+    if not 2 <= fitted < segments.t.shape[1]:
+        raise InputError(f"fitted is {fitted}; expected 2 samples or more, and fewer than the {segments.t.shape[1]}")
+    spread = segments.q.reshape(-1, segments.q.shape[2]).std(axis=0)
     scale = tuple(np.where(spread > 0, spread, 1.0).tolist())
-    arrays = (jnp.asarray(each) for each in stretches)
+    arrays = (jnp.asarray(each) for each in segments)
     known = {"scale": scale, "fitted": fitted, "torque": torque, "substeps": substeps, "momenta": momenta}
     found = _predict(model, parameters, *arrays, **known)
     return Predictions(*(np.asarray(each) for each in found))
 
 
 def valid_times(
-    stretches: MeasuredWindows,
+    segments: MeasuredWindows,
     predicted: Predictions,
     *,
     fitted: int,
@@ -168,11 +168,11 @@ def valid_times(
     threshold: float = 1e-2,
 ) -> Float[np.ndarray, " W"]:
     """Valid prediction times of the segments in s, from the last fitted sample on, at measured samples."""
-    measured = (stretches.weight > 0) & (np.arange(stretches.t.shape[1]) >= fitted - 1)
+    measured = (segments.weight > 0) & (np.arange(segments.t.shape[1]) >= fitted - 1)
     return np.array(
         [
             valid_prediction_time(q[kept], q_hat[kept], t[kept], variance, threshold=threshold)
-            for q, q_hat, t, kept in zip(stretches.q, predicted.q, stretches.t, measured, strict=True)
+            for q, q_hat, t, kept in zip(segments.q, predicted.q, segments.t, measured, strict=True)
         ]
     )
 
@@ -227,7 +227,7 @@ def _drift(system: Dynamics, states, t, tau, torque: Torque, substeps: int):
 
 
 def prediction_metrics(
-    stretches: MeasuredWindows,
+    segments: MeasuredWindows,
     predicted: Predictions,
     *,
     fitted: int,
@@ -239,13 +239,13 @@ def prediction_metrics(
     `vpt_seconds`, `vpt_median_seconds`, `predicted_seconds` (the duration), `vpt_lyapunov` (in Lyapunov times, if
     motions diverge) and `lyapunov_seconds`, by the model's own growth of small changes; `energy_drift`.
     """
-    times = valid_times(stretches, predicted, fitted=fitted, variance=variance, threshold=threshold)
+    times = valid_times(segments, predicted, fitted=fitted, variance=variance, threshold=threshold)
     growth = float(np.mean(predicted.growth))
     chaotic = {"vpt_lyapunov": float(np.mean(times)) * growth, "lyapunov_seconds": 1 / growth} if growth > 0 else {}
     return {
         "vpt_seconds": float(np.mean(times)),
         "vpt_median_seconds": float(np.median(times)),
-        "predicted_seconds": float(np.mean(stretches.t[:, -1] - stretches.t[:, fitted - 1])),
+        "predicted_seconds": float(np.mean(segments.t[:, -1] - segments.t[:, fitted - 1])),
         **chaotic,
         "energy_drift": float(np.mean(predicted.drift)),
     }

@@ -22,22 +22,22 @@ class Components(NamedTuple):
     """Share of the variance outside the basis."""
 
 
-def principal_components(pictures: Float[np.ndarray, "*samples n"], count: int) -> Components:
+def principal_components(images: Float[np.ndarray, "*samples n"], count: int) -> Components:
     """Returns the components with the largest variance.
 
     Raises:
         InputError: a count outside 1..n.
     """
-    n = pictures.shape[-1]
+    n = images.shape[-1]
     if not 1 <= count <= n:
-        raise InputError(f"components is {count}; expected 1 to {n}, the numbers of a picture")
-    flat = pictures.reshape(-1, n).astype(float)
+        raise InputError(f"components is {count}; expected 1 to {n}, the numbers of a image")
+    flat = images.reshape(-1, n).astype(float)
     mean = flat.mean(axis=0)
     variances, vectors = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
     kept = variances[-count:].sum()
     return Components(mean, vectors[:, ::-1][:, :count].T, float(np.sqrt(kept / count)), 1 - kept / variances.sum())
 
 
-def compress(components: Components, pictures: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
+def compress(components: Components, images: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples C"]:
     """Coefficients of images, in the dtype of the images."""
-    return ((pictures - components.mean) @ components.basis.T).astype(pictures.dtype)
+    return ((images - components.mean) @ components.basis.T).astype(images.dtype)

@@ -37,7 +37,7 @@ from dln_jax.nn.activations import Activation, tanh
 from dln_jax.sizes import require_network
 from dln_jax.types import InputError, Needs, ResidualTerm, require_positive
 from dln_jax.zoo.differential_network import make_differential_network
-from dln_jax.zoo.pictures import make_picture_model
+from dln_jax.zoo.images import make_image_model
 
 
 class Properties(NamedTuple):
@@ -227,7 +227,7 @@ CATALOGUE = {
     ),
     "helmholtz-hnn": Entry(with_friction_laws(make_helmholtz), Properties(energy=False, canonical=True), MOMENTUM),
     "differential-network": Entry(make_differential_network, Properties(energy=False)),
-    "latent-phase": Entry(make_picture_model, Properties(energy=False)),
+    "latent-phase": Entry(make_image_model, Properties(energy=False)),
 }
 """Every model that a command trains or a file names."""
 

@@ -22,12 +22,12 @@ from dln_jax.precision import data_type, require_double_precision
 from dln_jax.types import InputError, VectorLike
 from dln_jax.zoo.descriptions import OWN, Description, build
 from dln_jax.zoo.differential_network import Derivatives, FunctionModel
+from dln_jax.zoo.images import ImageModel
 from dln_jax.zoo.parameter_files import MODEL, REMEDY, load_manifest, load_tree, require_fitting, save_tree
-from dln_jax.zoo.pictures import PictureModel
 from dln_jax.zoo.uncertainty_files import discard_uncertainty, load_uncertainty
 
 Functions = TypeVar("Functions", bound=Dynamics | PlainDynamics | Flow | PlainFlow)
-AnyModel = Model | FunctionModel | PictureModel
+AnyModel = Model | FunctionModel | ImageModel
 
 
 # Not a NamedTuple: cached properties return the same function on every access, so it is compiled only once.
@@ -74,9 +74,9 @@ class Run:
         return _jitted(self._of("derivatives", FunctionModel).derivatives(self.parameters), self.dtype)
 
     @functools.cached_property
-    def pictures(self) -> LatentPhase:
+    def images(self) -> LatentPhase:
         """Encoder, decoder, and flow of the latent plane. Raises InputError unless the model is one of images."""
-        system = self._of("pictures", PictureModel).pictures(self.parameters)
+        system = self._of("images", ImageModel).images(self.parameters)
         encode, decode = (_jitted(function, self.dtype) for function in (system.encode, system.decode))
         return LatentPhase(encode, decode, compiled(system.field, self.dtype))
 
@@ -122,8 +122,8 @@ class Run:
     def _refusal(self, asked: str) -> InputError:
         if isinstance(self.model, FunctionModel):
             given = ".derivatives"
-        elif isinstance(self.model, PictureModel):
-            given = ".pictures"
+        elif isinstance(self.model, ImageModel):
+            given = ".images"
         else:
             plain = {PhaseRates: ".flow", InverseForward: ".dynamics"}
             given = plain.get(type(self.energies), ".dynamics or .flow")

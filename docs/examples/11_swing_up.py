@@ -54,11 +54,11 @@ print(f"the regulator holds what is below {region.level:.3g} of its value")
 
 swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
 law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, joints), region.level)
-laboratory = control.Laboratory(-LIMIT, LIMIT, delay=1)
+hardware = control.Hardware(-LIMIT, LIMIT, delay=1)
 starts = np.zeros((STARTS, 4))
 starts[:, 1] = np.pi + 0.2 * np.random.default_rng(0).normal(size=STARTS)
 runs = jax.jit(jax.vmap(lambda x: control.simulate(
-    field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, laboratory=laboratory
+    field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, hardware=hardware
 )))(starts)  # fmt: skip
 off = np.abs(jax.vmap(lambda x: control.error(x, goal, joints))(runs.x[:, -1])[:, 1])
 print(f"{np.sum(off < 0.05)} of {STARTS} starts are up after 4 s; largest torque {np.abs(runs.u).max():.3f} N m")

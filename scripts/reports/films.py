@@ -115,10 +115,8 @@ def swing_up(frames: int) -> Film:
     swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
     law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), 0.5)
     start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])
-    hardware = control.Laboratory(-limit, limit, delay=1)
-    run = control.simulate(
-        field, control.stateless(law), start, seconds=4.0, rate=500.0, controls=1, laboratory=hardware
-    )
+    hardware = control.Hardware(-limit, limit, delay=1)
+    run = control.simulate(field, control.stateless(law), start, seconds=4.0, rate=500.0, controls=1, hardware=hardware)
     q = sampled(run.x[:, :2], frames)
 
     def prepare(axis: Axes) -> Callable[[int], None]:

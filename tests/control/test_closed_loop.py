@@ -1,4 +1,4 @@
-"""The loop does to measurements and controls what the laboratory says, and hides no failure."""
+"""The loop does to measurements and controls what the hardware says, and hides no failure."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 from dln_jax.control import (
     Controller,
     Gains,
-    Laboratory,
+    Hardware,
     Reference,
     feed_forward,
     field_of,
@@ -34,27 +34,27 @@ def test_controls_are_held_and_integrated_exactly():
 
 
 def test_limits_and_delay():
-    run = simulate(FIELD, COUNTING, [0.0, 0.0], laboratory=Laboratory(most=5.0, delay=3), **SETTINGS)
+    run = simulate(FIELD, COUNTING, [0.0, 0.0], hardware=Hardware(most=5.0, delay=3), **SETTINGS)
     np.testing.assert_array_equal(run.u[:, 0], np.minimum(np.maximum(np.arange(20) - 2, 0), 5))
 
 
 def test_encoders_round_and_rates_come_from_differences():
     seen = with_differences(lambda x: x[1:], 1, rate=100.0, cutoff=1e6)
-    lab = Laboratory(encoder_step=1e-3, sees_rates=False)
-    coasting = simulate(lambda x, u: jnp.array([x[1], 0.0]), seen, [0.0, 0.37], laboratory=lab, **SETTINGS)
+    lab = Hardware(encoder_step=1e-3, sees_rates=False)
+    coasting = simulate(lambda x, u: jnp.array([x[1], 0.0]), seen, [0.0, 0.37], hardware=lab, **SETTINGS)
     assert coasting.y.shape == (20, 1)
     np.testing.assert_allclose(coasting.y / 1e-3, np.round(coasting.y / 1e-3), atol=1e-9)
     assert coasting.u[0, 0] == 0 and np.abs(coasting.u[1:, 0] - 0.37).max() <= 0.1 + 1e-9
 
 
 def test_noise_has_its_size_and_its_seed():
-    lab = Laboratory(encoder_noise=0.1, control_noise=0.5)
+    lab = Hardware(encoder_noise=0.1, control_noise=0.5)
     still = stateless(lambda y: jnp.zeros(1))
     run = lambda seed: simulate(  # noqa: E731
         lambda x, u: jnp.zeros(2),
         still,
         [0.0, 0.0],
-        laboratory=lab,
+        hardware=lab,
         key=jax.random.key(seed),
         seconds=40.0,
         rate=100.0,
@@ -65,12 +65,12 @@ def test_noise_has_its_size_and_its_seed():
     np.testing.assert_array_equal(first.u, run(0).u)
     assert not np.array_equal(first.u, run(1).u)
     with pytest.raises(InputError, match="give a key"):
-        simulate(FIELD, still, [0.0, 0.0], laboratory=lab, **SETTINGS)
+        simulate(FIELD, still, [0.0, 0.0], hardware=lab, **SETTINGS)
 
 
 def test_a_failure_stays_one():
     broken = Controller(jnp.zeros(()), lambda n, t, y: (n + 1, jnp.where(n == 5, jnp.nan, 0.0)[None]))
-    run = simulate(FIELD, broken, [0.0, 0.0], laboratory=Laboratory(-1.0, 1.0), **SETTINGS)
+    run = simulate(FIELD, broken, [0.0, 0.0], hardware=Hardware(-1.0, 1.0), **SETTINGS)
     assert np.isfinite(run.x[:6]).all() and not np.isfinite(run.x[6:]).any()
 
 
@@ -82,7 +82,7 @@ def test_many_runs_are_one_program():
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"), [({"rate": 0.0}, "rate is 0.0"), ({"laboratory": Laboratory(delay=-1)}, "delay is -1")]
+    ("settings", "message"), [({"rate": 0.0}, "rate is 0.0"), ({"hardware": Hardware(delay=-1)}, "delay is -1")]
 )
 def test_settings_out_of_range_are_one_line(settings, message):
     with pytest.raises(InputError, match=message):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from dln_jax.control import Controller, Laboratory, field_of, simulate
+from dln_jax.control import Controller, Hardware, field_of, simulate
 from dln_jax.control.environment import PlantEnvironment, register
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.cart_pole import cart_pole
@@ -17,7 +17,7 @@ from dln_jax.types import InputError
 
 SCENE = cart_pole()
 FIELD = field_of(dynamics(SCENE.energies), np.asarray(SCENE.needs.actuation))
-LAB = Laboratory(-4.0, 6.0, encoder_step=1e-3, delay=1)
+LAB = Hardware(-4.0, 6.0, encoder_step=1e-3, delay=1)
 
 
 def cost(x, u):
@@ -29,7 +29,7 @@ def hanging(key):
 
 
 def environment(field=FIELD):
-    return PlantEnvironment(field, cost, hanging, SCENE.needs.joints, seconds=0.2, rate=50.0, laboratory=LAB)
+    return PlantEnvironment(field, cost, hanging, SCENE.needs.joints, seconds=0.2, rate=50.0, hardware=LAB)
 
 
 @functools.cache
@@ -52,7 +52,7 @@ def test_an_episode_is_a_closed_loop():
     law = Controller(
         jnp.asarray(0), lambda number, t, y: (number + 1, 1.0 + 5.0 * jnp.asarray(actions.astype(float))[number])
     )
-    run = simulate(FIELD, law, start, seconds=0.2, rate=50.0, controls=1, laboratory=LAB)
+    run = simulate(FIELD, law, start, seconds=0.2, rate=50.0, controls=1, hardware=LAB)
     np.testing.assert_allclose([step[4]["x"] for step in steps], run.x[1:], rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(
         [step[1] for step in steps], [-cost(*each) / 50 for each in zip(run.x, run.u, strict=False)]
@@ -73,6 +73,6 @@ def test_a_failure_is_one():
 
 def test_mistakes_are_one_line():
     with pytest.raises(InputError, match="expected finite ones"):
-        PlantEnvironment(FIELD, cost, hanging, SCENE.needs.joints, seconds=1.0, rate=50.0, laboratory=Laboratory())
+        PlantEnvironment(FIELD, cost, hanging, SCENE.needs.joints, seconds=1.0, rate=50.0, hardware=Hardware())
     with pytest.raises(InputError, match="call reset before step"):
         environment().step(np.zeros(1, np.float32))

@@ -1,4 +1,4 @@
-"""Exploration keeps to the limits, records what a laboratory has, and finds motions all around."""
+"""Exploration keeps to the limits, records what the hardware has, and finds motions all around."""
 
 import numpy as np
 import pytest
@@ -14,14 +14,14 @@ EXCITATION = Excitation(seconds=3.0, episodes=2)
 
 @pytest.fixture(scope="module")
 def explored():
-    quiet = PLANT._replace(laboratory=PLANT.laboratory._replace(control_noise=0.0))
+    quiet = PLANT._replace(hardware=PLANT.hardware._replace(control_noise=0.0))
     return explore(quiet, PLANT.numbers.gains, EXCITATION, seed=1)
 
 
 def test_torques_keep_to_the_limits_and_are_those_that_arrive_late(explored):
     data, runs = explored
     asked = data.tau[:, 0].reshape(2, -1)
-    assert np.abs(asked).max() <= EXCITATION.share * PLANT.laboratory.most
+    assert np.abs(asked).max() <= EXCITATION.share * PLANT.hardware.most
     assert (data.tau[:, 1] == 0).all()
     np.testing.assert_allclose(runs.u[:, 1:, 0], asked[:, :-1], atol=1e-12)
     assert (runs.u[:, 0] == 0).all()
@@ -29,9 +29,9 @@ def test_torques_keep_to_the_limits_and_are_those_that_arrive_late(explored):
 
 def test_what_is_recorded_is_a_file_of_encoders_readings(explored, tmp_path):
     data, runs = explored
-    steps = data.q / PLANT.laboratory.encoder_step
+    steps = data.q / PLANT.hardware.encoder_step
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-    assert np.abs(data.q - runs.x[:, :-1, :2].reshape(-1, 2)).max() <= PLANT.laboratory.encoder_step.max()
+    assert np.abs(data.q - runs.x[:, :-1, :2].reshape(-1, 2)).max() <= PLANT.hardware.encoder_step.max()
     schema.save(tmp_path / "data.npz", data)
     read = schema.load(tmp_path / "data.npz")
     assert read.estimated == ("qd", "qdd") and read.needs == PLANT.scene.needs and len(read.t) == 1500

@@ -8,7 +8,7 @@ import pytest
 from dln_jax.control import (
     EnergyGains,
     Gains,
-    Laboratory,
+    Hardware,
     Problem,
     Reference,
     computed_torque,
@@ -19,9 +19,9 @@ from dln_jax.control import (
     limited,
     linearise,
     lqr,
+    mpc,
     partial_linearisation,
     parts_of,
-    receding,
     regulated,
     simulate,
     stateless,
@@ -52,7 +52,7 @@ def laws():
     trackers = {make.__name__: make(PLANT, Gains(np.zeros(2), np.zeros(2))) for make in TRACKERS}
     first, otherwise = trackers["computed_torque"], trackers["feed_forward"]
     problem = Problem(lambda x, u: x + 0.01 * FIELD(x, u), lambda x, u: x @ x + u @ u, lambda x: x @ x, -0.05, 0.05)
-    plan, act = first_plan(problem, GOAL, np.zeros((3, 1))), receding(problem)
+    plan, act = first_plan(problem, GOAL, np.zeros((3, 1))), mpc(problem)
     differences = with_differences(far, 2, rate=500.0, cutoff=50.0)
 
     def seen_twice(x):
@@ -67,10 +67,10 @@ def laws():
         "partial_linearisation": lambda x: partial_linearisation(PLANT, PARTS)(x[:2], x[2:], jnp.ones(1)),
         "switched": switched(far, near, cost, 0.1),
         "switched to itself": switched(lambda x: jnp.ones(1), lambda x: jnp.ones(1), cost, 0.1),
-        "receding": lambda x: act(x, plan)[0],
+        "mpc": lambda x: act(x, plan)[0],
         "with_differences": seen_twice,
         "in a loop": lambda x: simulate(
-            FIELD, stateless(near), x, seconds=0.002, rate=500.0, controls=1, laboratory=Laboratory(-0.05, 0.05)
+            FIELD, stateless(near), x, seconds=0.002, rate=500.0, controls=1, hardware=Hardware(-0.05, 0.05)
         ).u[0],
     }
 

@@ -35,8 +35,8 @@ def test_it_does_no_work_at_rest_and_is_friction_s_share_away_from_it():
 
 
 def test_what_is_left_without_friction_is_the_frictionless_plant():
-    makers = desktop_cart_pole()
-    bare = dynamics(makers.makers(**makers.sizes).closed_form)
+    nominal = desktop_cart_pole()
+    bare = dynamics(nominal.nominal(**nominal.sizes).closed_form)
     state = jnp.array([0.1, 2.0]), jnp.array([0.4, -3.0]), jnp.array([0.5, 0.2])
     left = without_friction(PLANT)
     np.testing.assert_allclose(jax.jit(left.inverse_dynamics)(*state), bare.inverse_dynamics(*state), rtol=1e-10)

@@ -1,4 +1,4 @@
-"""MuJoCo, which shares no equation with ours, gives the same closed loop, with the same laboratory."""
+"""MuJoCo, which shares no equation with ours, gives the same closed loop, with the same hardware."""
 
 import functools
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Laboratory, field_of, simulate, stateless
+from dln_jax.control import Hardware, field_of, simulate, stateless
 from dln_jax.control.mujoco_loop import simulate_in_mujoco
 from dln_jax.data.mjcf import mjcf
 from dln_jax.data.robots import Robot
@@ -34,14 +34,14 @@ def model():
 
 
 LAW = stateless(lambda y: jnp.array([8.0 * y[1] + 2.0 * y[3] + y[0]]))
-LAB = Laboratory(-3.0, 2.0, encoder_step=1e-3, delay=2)
+LAB = Hardware(-3.0, 2.0, encoder_step=1e-3, delay=2)
 
 
 def test_both_plants_give_the_same_run():
-    found = simulate_in_mujoco(model(), LAW, START, seconds=1.0, rate=100.0, actuation=B, laboratory=LAB)
+    found = simulate_in_mujoco(model(), LAW, START, seconds=1.0, rate=100.0, actuation=B, hardware=LAB)
     field = field_of(dynamics(tree_system(cart_pole().tree)), B)
     expected = jax.jit(lambda: simulate(
-        field, LAW, START, seconds=1.0, rate=100.0, controls=1, laboratory=LAB, substeps=5
+        field, LAW, START, seconds=1.0, rate=100.0, controls=1, hardware=LAB, substeps=5
     ))()  # fmt: skip
     for ours, theirs in zip(expected, found, strict=True):
         np.testing.assert_allclose(theirs, ours, atol=1e-7)

@@ -7,7 +7,7 @@ import pytest
 
 from dln_jax.control import (
     EnergyGains,
-    Laboratory,
+    Hardware,
     energy_shaping,
     error,
     field_of,
@@ -88,9 +88,9 @@ def test_it_swings_up_from_every_start(scene, gains, Q, R, most, level):
     starts = np.zeros((16, 4))
     starts[:, 1] = np.pi + random.normal(size=16) * 0.1
     starts[:, 0] = 0.1 * random.normal(size=16)
-    lab = Laboratory(-most, most)
+    lab = Hardware(-most, most)
     run = jax.jit(jax.vmap(lambda x: simulate(
-        field, stateless(law), x, seconds=10.0, rate=200.0, controls=1, laboratory=lab
+        field, stateless(law), x, seconds=10.0, rate=200.0, controls=1, hardware=lab
     )))(starts)  # fmt: skip
     assert np.abs(run.u).max() <= most
     off = jax.vmap(lambda x: error(x, goal, scene.needs.joints))(run.x[:, -1])

@@ -8,20 +8,20 @@ import pytest
 from dln_jax.control.desktop_plants import desktop_plant
 from dln_jax.control.outcomes import hanging_starts, outcomes
 from dln_jax.control.swing_up import nearest_equilibrium, swing_up
-from dln_jax.control.swing_up_runs import law_of, model_of_maker, model_of_plant, try_starts
+from dln_jax.control.swing_up_runs import law_of, model_of_plant, nominal_model, try_starts
 from dln_jax.mechanics.dynamics import PlainDynamics
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.lagrangian import LagrangianSystem
 from dln_jax.types import InputError
 
 PLANT = desktop_plant("rotary-pendulum")
-MAKERS = model_of_maker(PLANT)
+NOMINAL = nominal_model(PLANT)
 ANGLES = np.stack([np.zeros(9), np.linspace(-np.pi, np.pi, 9)], axis=1)
 
 
 def with_potential(extra):
-    """The maker's model with another energy added."""
-    L = PLANT.makers(**PLANT.sizes).lagrangian
+    """the nominal model with another energy added."""
+    L = PLANT.nominal(**PLANT.sizes).lagrangian
     return dynamics(LagrangianSystem(lambda q, qd: L(q, qd) - extra(q)))
 
 
@@ -30,12 +30,12 @@ def test_dry_friction_holds_no_pole_down():
     tried = try_starts(PLANT, model_of_plant(PLANT), starts=8, seed=5, seconds=3.0)
     assert tried.outcomes.share == 1 and tried.outcomes.worst < 3.0
     # Exactly at rest, where the energy law asks for nothing.
-    law = jax.jit(law_of(PLANT, MAKERS).law)
+    law = jax.jit(law_of(PLANT, NOMINAL).law)
     assert float(jnp.abs(law(jnp.array([0.0, np.pi, 0.0, 0.0]))[0])) == pytest.approx(PLANT.numbers.kick)
 
 
 def test_a_state_that_is_no_number_has_no_control():
-    law = jax.jit(law_of(PLANT, MAKERS).law)
+    law = jax.jit(law_of(PLANT, NOMINAL).law)
     for place in range(4):
         assert not np.isfinite(law(jnp.array([0.1, 3.0, 0.2, 0.3]).at[place].set(jnp.nan))).any()
 
@@ -48,7 +48,7 @@ def test_the_model_s_own_equilibrium_is_found():
 
 
 def build(model, **changed):
-    lab = PLANT.laboratory
+    lab = PLANT.hardware
     keywords = {"postures": ANGLES, "least": lab.least, "most": lab.most, **changed}
     needs = PLANT.scene.needs
     return swing_up(model, needs.actuation, needs.joints, np.zeros(2), PLANT.numbers, **keywords)
@@ -57,7 +57,7 @@ def build(model, **changed):
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (PlainDynamics(MAKERS.inverse_dynamics, MAKERS.forward_dynamics, MAKERS.decompose), "has no energy"),
+        (PlainDynamics(NOMINAL.inverse_dynamics, NOMINAL.forward_dynamics, NOMINAL.decompose), "has no energy"),
         (dynamics(LagrangianSystem(lambda q, qd: 0.5 * qd[0] ** 2 - 0.5 * qd[1] ** 2)), "not positive definite"),
         (with_potential(lambda q: 0.1 * q[1]), "no equilibrium near the goal"),
         (with_potential(lambda q: 0.2 * q[0]), "do not hold the goal"),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control import Problem, field_of, first_plan, improve, optimise, receding, time_varying_lqr
+from dln_jax.control import Problem, field_of, first_plan, improve, mpc, optimise, time_varying_lqr
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.integrators import CLASSICAL, runge_kutta
 from dln_jax.scenes.cart_pole import cart_pole
@@ -82,13 +82,13 @@ DOWN = np.array([0.0, np.pi, 0.0, 0.0])
 
 
 @pytest.mark.slow
-def test_a_cart_pole_swings_up_within_its_limits_and_receding_plans_hold_it():
+def test_a_cart_pole_swings_up_within_its_limits_and_predictive_plans_hold_it():
     problem = cart_pole_problem(0.04)
     u = 0.5 * np.sin(np.linspace(0, 6, 75))[:, None]
     plan = jax.jit(lambda u: optimise(problem, DOWN, u))(u)
     off = np.abs(np.arctan2(np.sin(plan.x[-1, 1]), np.cos(plan.x[-1, 1])))
     assert off < 0.05 and np.abs(plan.u).max() <= 10.0
-    act = jax.jit(receding(problem))
+    act = jax.jit(mpc(problem))
     x = jnp.asarray(DOWN)
     for _ in range(75):
         u, plan = act(x, plan)

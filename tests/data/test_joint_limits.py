@@ -66,6 +66,6 @@ def test_switched_off_range_and_held_joint_are_accepted(tmp_path):
     swapped = URDF.format("revolute", 'lower="2" upper="-2"')
     other = swapped.replace("elbow", "wrist").replace('"arm"', '"hand"').replace('"base"', '"arm"')
     two = swapped.replace('upper="-2"', 'upper="3"').replace("</robot>", other.partition('<link name="arm"/>')[2])
-    assert read(tmp_path, two, hold=["wrist"]).tree.names == ("elbow",)
+    assert read(tmp_path, two, lock=["wrist"]).tree.names == ("elbow",)
     with pytest.raises(InputError, match="joint 'wrist' has limits of position 2, -2"):
         read(tmp_path, two)

@@ -170,7 +170,7 @@ def forces(robot):
 
 
 def test_a_joint_that_is_held_is_fixed(tmp_path):
-    held = read_robot(written(tmp_path, "arm.urdf", ARM), hold=["elb*"])
+    held = read_robot(written(tmp_path, "arm.urdf", ARM), lock=["elb*"])
     fixed = ARM.replace('"elbow" type="continuous"', '"elbow" type="fixed"')
     robot = read_robot(written(tmp_path, "fixed.urdf", fixed))
     assert held.tree.names == robot.tree.names == ("shoulder", "slide")
@@ -185,20 +185,20 @@ FREE = (
 
 def test_a_base_that_is_free_can_be_held(tmp_path):
     path = written(tmp_path, "free.xml", f"<mujoco><worldbody><body>{FREE}</body></worldbody></mujoco>")
-    assert read_robot(path, hold=["root"]).tree.names == ("a",)
+    assert read_robot(path, lock=["root"]).tree.names == ("a",)
 
 
-HELD = {"turned": ("branched.xml", {"x": 0.7, "w": -0.4}), "moved": ("arm.urdf", {"slide": 0.2})}
+LOCKED = {"turned": ("branched.xml", {"x": 0.7, "w": -0.4}), "moved": ("arm.urdf", {"slide": 0.2})}
 
 
-@pytest.mark.parametrize("name", HELD)
+@pytest.mark.parametrize("name", LOCKED)
 def test_joints_are_held_where_it_is_asked_for(name, tmp_path):
-    file, hold = HELD[name]
+    file, lock = LOCKED[name]
     path = written(tmp_path, file, FILES[file])
-    free, held = read_robot(path), read_robot(path, hold=hold)
+    free, held = read_robot(path), read_robot(path, lock=hold)
     place = np.array([free.tree.names.index(name) for name in held.tree.names])
     q, qd, qdd = np.zeros((3, free.tree.degrees_of_freedom))
-    for joint, position in hold.items():
+    for joint, position in lock.items():
         q[free.tree.names.index(joint)] = position
     q[place], qd[place], qdd[place] = np.random.default_rng(0).normal(size=(3, len(place)))
     every = jax.jit(dynamics(tree_system(free.tree)).inverse_dynamics)(q, qd, qdd)
@@ -211,9 +211,9 @@ def test_a_gripper_whose_fingers_are_tied_can_be_held(tmp_path):
     path = written(tmp_path, "arm.urdf", tied)
     with pytest.raises(InputError, match="joint 'slide' follows another"):
         read_robot(path)
-    assert read_robot(path, hold=["slide"]).tree.names == ("shoulder", "elbow")
-    with pytest.raises(InputError, match=r"there is no joint 'finger\*' to hold; it has shoulder, elbow, slide"):
-        read_robot(path, hold=["finger*"])
+    assert read_robot(path, lock=["slide"]).tree.names == ("shoulder", "elbow")
+    with pytest.raises(InputError, match=r"there is no joint 'finger\*' to lock; it has shoulder, elbow, slide"):
+        read_robot(path, lock=["finger*"])
 
 
 def test_inertias_that_no_body_has_are_read_as_they_are(tmp_path):

@@ -9,7 +9,7 @@ from planar_arm import ARM
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
 from dln_jax.identification.residual import Candidate, fit_residual
-from dln_jax.learning.growth import stretches
+from dln_jax.learning.growth import segments
 from dln_jax.learning.linear import fit_linear
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.residual import Residual, with_residual
@@ -58,10 +58,10 @@ def test_a_network_is_added_only_where_it_helps(stiffness, added):
         assert found.model is rigid
 
 
-def test_stretches_stay_within_trajectories():
+def test_segments_stay_within_trajectories():
     data = log(0.0)
-    numbers = stretches(data, 1.0)
-    assert len(set(numbers)) == 6 * 4  # the last sample, at 3 s, begins a stretch of its own
+    numbers = segments(data, 1.0)
+    assert len(set(numbers)) == 6 * 4  # the last sample, at 3 s, begins a segment of its own
     assert all(len(set(data.trajectory[numbers == each])) == 1 for each in set(numbers))
 
 

@@ -18,7 +18,7 @@ from dln_jax.learning.engine.problem import Problem, loss_of
 from dln_jax.learning.measured_motions import Gauge, Noise, cut_measured_windows, motion
 from dln_jax.learning.torques_beside_motions import cut_torque_windows, with_torques
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, prediction_metrics
+from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, prediction_metrics
 from dln_jax.models.hamiltonian import make_structured_hamiltonian
 from dln_jax.models.planar_chain import PlanarChainParameters, make_planar_chain
 from dln_jax.models.trigonometric import make_trigonometric
@@ -91,9 +91,9 @@ def passive():
 
 def predicted_for(model, parameters, data, *, momenta=False):
     """Valid prediction time on the test motion, and more."""
-    stretches = cut_stretches(parts(data)[2], LENGTH, every=LENGTH)
-    predicted = predict_measured(model, parameters, stretches, fitted=WINDOW, substeps=2, momenta=momenta)
-    return prediction_metrics(stretches, predicted, fitted=WINDOW, variance=data.q.var(axis=0))
+    segments = cut_segments(parts(data)[2], LENGTH, every=LENGTH)
+    predicted = predict_measured(model, parameters, segments, fitted=WINDOW, substeps=2, momenta=momenta)
+    return prediction_metrics(segments, predicted, fitted=WINDOW, variance=data.q.var(axis=0))
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_mistakes_are_named(passive):
             task = measured_motions.problem(CHAIN, start, windows, windows, **known)
             task.residual(start, *(array[0] for array in task.arrays))
     with pytest.raises(InputError, match="has 200 samples to predict"):
-        cut_stretches(data, 200, every=10)
+        cut_segments(data, 200, every=10)
 
 
 def test_torques_beside_motions_add_their_squares(passive):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.stretches import stretches
+from dln_jax.data.segments import segments
 from dln_jax.learning.engine.fit import fit
 from dln_jax.learning.engine.optimisers import GaussNewton
 from dln_jax.learning.motions import Weights, cut_windows, problem, take
@@ -29,8 +29,8 @@ def test_windows_never_cross_a_gap():
     t = np.concatenate([np.arange(7), 7.4 + np.arange(5), 20.0 + np.arange(2)]) / 6
     data = motion_of(t)
     # 1.4 steps are no gap, 8.6 are one.
-    assert [len(stretch) for stretch in stretches(data.t, data.trajectory)] == [12, 2]
-    assert [len(stretch) for stretch in stretches(data.t, data.trajectory, gap=1.3)] == [7, 5, 2]
+    assert [len(segment) for segment in segments(data.t, data.trajectory)] == [12, 2]
+    assert [len(segment) for segment in segments(data.t, data.trajectory, gap=1.3)] == [7, 5, 2]
     windows = cut_windows(data, 4)
     steps = np.diff(windows.t, axis=1)
     assert steps.max() <= 1.5 * np.median(np.diff(t)) and steps.min() == 0
@@ -43,7 +43,7 @@ def test_windows_never_cross_a_gap():
 
 def test_windows_never_cross_trajectories():
     data = motion_of([0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 1, 1])
-    assert [stretch.tolist() for stretch in stretches(data.t, data.trajectory)] == [[0, 1, 2], [3, 4, 5]]
+    assert [segment.tolist() for segment in segments(data.t, data.trajectory)] == [[0, 1, 2], [3, 4, 5]]
     assert (cut_windows(data, 6).weight.sum(axis=1) == 3).all()
 
 
@@ -115,8 +115,8 @@ def test_mistakes_are_named():
     refused = [
         (lambda: cut_windows(data, 1), "length is 1"),
         (lambda: cut_windows(data._replace(p=None), 4), "no p"),
-        (lambda: stretches(data.t, data.trajectory, gap=0.9), "gap is 0.9"),
-        (lambda: stretches(np.zeros(2), np.array([0, 1])), "no trajectory has two samples"),
+        (lambda: segments(data.t, data.trajectory, gap=0.9), "gap is 0.9"),
+        (lambda: segments(np.zeros(2), np.array([0, 1])), "no trajectory has two samples"),
         (lambda: problem(damped(), start, windows, take(windows, []), weights=weights), "0 to validate"),
         (lambda: problem(damped(), start, windows, windows, substeps=0, weights=weights), "substeps is 0"),
         (lambda: problem(damped(), start, windows, windows, weights=Weights(0.0)), "state_weight is 0"),

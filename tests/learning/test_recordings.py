@@ -29,7 +29,7 @@ def prepared(recording):
 
 
 def test_the_delay_is_found_and_the_truth_leaves_noise_alone(prepared):
-    assert prepared.delay == PLANT.laboratory.delay
+    assert prepared.delay == PLANT.hardware.delay
     assert len(np.unique(prepared.train.trajectory)) == 2 and len(np.unique(prepared.validation.trajectory)) == 1
     left = deviations(TRUTH, cut_momentum_windows(prepared.train))
     assert (left < 0.02 * prepared.train.tau[:, 0].std()).all()

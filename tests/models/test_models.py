@@ -18,7 +18,7 @@ from dln_jax.models.lagrangian import make_black_box_lagrangian, make_delan
 from dln_jax.types import InputError, Needs
 from dln_jax.zoo.run import compiled
 
-MAKERS = [make_structured_hamiltonian, make_black_box_hamiltonian, make_black_box_lagrangian, make_feed_forward]
+NOMINAL = [make_structured_hamiltonian, make_black_box_hamiltonian, make_black_box_lagrangian, make_feed_forward]
 MIXED = Needs(("prismatic", "revolute"), friction=True)
 SMALL = {"width": 5, "depth": 1, "dtype": jnp.float64}
 
@@ -155,7 +155,7 @@ def test_absent_terms_cost_nothing():
     assert frictionless_parameters - weightless_parameters == 4 * 5 + 5 + 5 + 1
 
 
-@pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", NOMINAL, ids=lambda make: make.__name__)
 def test_the_type_of_the_parameters_is_that_of_the_answers(make):
     model = make(MIXED, width=3, depth=1)
     shapes = jax.eval_shape(model.init, jax.random.key(0))

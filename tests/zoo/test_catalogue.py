@@ -83,7 +83,7 @@ def answer(name, run):
     if name == "differential-network":
         return run.derivatives([0.1, 0.2]).hessian.sum()
     if name == "latent-phase":
-        return sum(run.pictures.encode(np.linspace(0, 1, 12)))[0]
+        return sum(run.images.encode(np.linspace(0, 1, 12)))[0]
     if CATALOGUE[name].properties.canonical and name != "pairwise-hnn":
         return run.flow.rates(q, q)[1].sum()
     return run.dynamics.inverse_dynamics(q, q, q).sum()
@@ -151,9 +151,9 @@ def test_what_a_model_cannot_give_is_refused_with_what_it_can(tmp_path):
     refused = [
         ("phase-network", "dynamics", "a phase-network has no dynamics; ask for .flow"),
         ("feed-forward", "flow", "a feed-forward has no flow; ask for .dynamics"),
-        ("structured-delan", "pictures", "a structured-delan has no pictures; ask for .dynamics or .flow"),
+        ("structured-delan", "images", "a structured-delan has no images; ask for .dynamics or .flow"),
         ("differential-network", "energies", "a differential-network has no energies; ask for .derivatives"),
-        ("latent-phase", "derivatives", "a latent-phase has no derivatives; ask for .pictures"),
+        ("latent-phase", "derivatives", "a latent-phase has no derivatives; ask for .images"),
     ]
     for name, asked, message in refused:
         stored(tmp_path, name)

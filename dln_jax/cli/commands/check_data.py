@@ -2,7 +2,7 @@
 
 Looks at rates, gaps and the order of times, units, signs, qd and qdd against q, delay between q and tau, saturation,
 steps of encoders, noise, unexcited joints and friction; with --robot also at gravity, gears, the order and limits of
-joints, and how well the motions determine the robot's parameters. Prints one page; the folder gets it as page.txt, the
+joints, and how well the motions determine the robot's parameters. Prints a report, and writes it as report.txt, the
 findings as findings.json, and a figure: spectra and cut-off, delay, and torque against velocity. The exit status is 1
 if an error was found, and 0 if there are only warnings and notes.
 """
@@ -17,7 +17,7 @@ from dln_jax.cli.arguments import Unstated, names_listed, refuse_given
 from dln_jax.cli.encoders import Logged
 from dln_jax.cli.options import Drawn, Folder
 from dln_jax.cli.running import command_folder
-from dln_jax.data.checks import Examination, examine, page, read
+from dln_jax.data.checks import Examination, examine, read, report
 from dln_jax.data.robots import read_robot
 from dln_jax.figures.logs import log_figure
 from dln_jax.files import write_bytes, write_figure, write_json
@@ -31,7 +31,7 @@ class Arguments(Folder, Drawn, Logged):
     """Log as npz or CSV: t and q, and tau, qd, qdd and trajectory where there are any."""
     robot: Unstated[Path] = None
     """URDF or MJCF of the robot (needs MuJoCo)."""
-    hold: Unstated[str] = None
+    lock: Unstated[str] = None
     """Joints of the robot that do not move, such as those of a gripper, comma separated; "*finger*" names all with
     finger in their name (default: all joints move)."""
 
@@ -40,13 +40,13 @@ def main(given: Arguments) -> None:
     """Examines, prints and writes; exits with status 1 if an error was found."""
     recording = read(given.data, rate=given.rate, units=given.units)
     if given.robot is None:
-        refuse_given(given, ["hold"], "for joints of --robot")
-    robot = None if given.robot is None else read_robot(given.robot, hold=names_listed(given.hold))
+        refuse_given(given, ["lock"], "for joints of --robot")
+    robot = None if given.robot is None else read_robot(given.robot, lock=names_listed(given.lock))
     examined = examine(recording, robot)
-    lines = page(examined, str(given.data))
+    lines = report(examined, str(given.data))
     with command_folder(given, "check_data") as folder:
         print("\n".join(lines))
-        write_bytes(folder / "page.txt", ("\n".join(lines) + "\n").encode())
+        write_bytes(folder / "report.txt", ("\n".join(lines) + "\n").encode())
         write_json(folder / "findings.json", {"findings": [each._asdict() for each in examined.findings]})
         write_json(folder / "metrics.json", metrics(examined))
         if given.figures:
@@ -57,7 +57,7 @@ def main(given: Arguments) -> None:
 
 
 def metrics(examined: Examination) -> dict[str, Any]:
-    """Numbers of the page."""
+    """Numbers of the report."""
     counted = {f"{kind}s": sum(each.severity == kind for each in examined.findings) for kind in ("error", "warning")}
     smoothed, regression, on_tree = examined.smoothed, examined.regression, examined.on_tree
     numbers: dict[str, Any] = dict(counted)

@@ -56,7 +56,7 @@ LARGEST_SIZE = 10.0
 """Length in m above which a mesh is probably in millimetres."""
 ALL = "all"
 GALLERY = (0, 3, 2, 1, 4)
-"""Order of the scenes in the picture of all."""
+"""Order of the scenes in the figure of all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Arguments(Folder, Drawn):
     """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
-    """What to simulate; all: each in a folder of its own, with one picture of them."""
+    """What to simulate; all: each in a folder of its own, with one figure of them."""
     integrator: Literal["backward-euler", "bdf2", "midpoint"] = "backward-euler"
     """backward-euler damps, bdf2 (second order) damps little, midpoint (second order) does not damp."""
     dt: Unstated[float] = None
@@ -105,7 +105,7 @@ class Prepared(NamedTuple):
 
 
 def main(given: Arguments) -> None:
-    """Simulates one scene into the run folder, or all, each into a folder of its own, with one picture of them."""
+    """Simulates one scene into the run folder, or all, each into a folder of its own, with one figure of them."""
     several = given.scene == ALL
     prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
     with run_folder(given.out, "simulate") as folder:
@@ -136,7 +136,7 @@ def prepare(given: Arguments) -> Prepared:
 
 
 def simulate(prepared: Prepared, folder: Path) -> Moments:
-    """Simulates one scene and writes its folder; gives its picture."""
+    """Simulates one scene and writes its folder; returns its figure."""
     given, example, _, dt, steps = prepared
     write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh

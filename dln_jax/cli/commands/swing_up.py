@@ -2,7 +2,7 @@
 
 Plants are simulated as they stand on a desk: dry friction, limits, encoders, noise, torques a sample late, at 500 Hz.
 A rough model explores; q and the torques asked for are all that is recorded. Models: delan (a structured deep
-Lagrangian network with friction), identified (linear in its parameters), analytic (the maker's sizes, no friction),
+Lagrangian network with friction), identified (linear in its parameters), analytic (the nominal sizes, no friction),
 known (the plant itself). Each gets the same energy law, regulator and friction compensation, with the same gains. A run
 folder gets data.npz, the model, metrics.json, config.json, and a figure and a film of the runs.
 """

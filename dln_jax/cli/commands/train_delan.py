@@ -3,8 +3,8 @@
 Models: structured-delan (a deep Lagrangian network, M = L Lᵀ), black-box-delan (a network is the Lagrangian),
 trigonometric (linear in its parameters, one least-squares problem), trigonometric-kernel (the same energies of six or
 seven joints, as a Gaussian process), learned-tree (an arm's bodies and joint frames, found from random starts),
-feed-forward (no physics), and auto, the default for --data: a ladder of those that the data allow, from the tree of
---robot to a network, of which the first that no other betters on validation motions is kept. Data are an npz or CSV
+feed-forward (no physics), and auto, the default for --data: model selection among those that the data allow, from the
+tree of --robot to a network, which keeps the first that no other betters on validation motions. Data are an npz or CSV
 file with t, q and tau; joints have friction unless --needs or the file says otherwise. Without --data it trains on
 the embedded set: the tip of a two-link arm writes 20 letters, of which e, q and v are the test. A run folder gets
 config.json, metrics.json, model.safetensors and model.json (load them with dln_jax.load), a checkpoint to --resume

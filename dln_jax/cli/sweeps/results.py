@@ -16,7 +16,7 @@ ERRORS = ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_
 SECONDS = ("train_seconds", "learning_seconds", "identify_seconds")
 """Names of metrics, of which a command has one of each; the first that there is counts."""
 PROBLEM = (
-    "creature", "data", "function", "goal", "hold", "needs", "objective", "plant", "robot", "scene", "task", "test",
+    "creature", "data", "function", "goal", "lock", "needs", "objective", "plant", "robot", "scene", "task", "test",
 )  # fmt: skip
 """Options that state a problem: errors of different ones are not compared."""
 

@@ -2,7 +2,6 @@
 
 from dln_jax.control.optimal import action_costs
 from dln_jax.control.optimal.action_costs import ActionCost
-from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.fitted import Fitted, Iteration, fit_value, fit_values
 from dln_jax.control.optimal.grid import GridValue, extrapolated, lookahead, solve_on_grid
 from dln_jax.control.optimal.grid_interpolation import Grid, interpolated
@@ -20,6 +19,7 @@ from dln_jax.control.optimal.problem import (
 )
 from dln_jax.control.optimal.residual import ResidualFit, Stage, discounts_down_to, fit_residual
 from dln_jax.control.optimal.value_networks import ValueNetwork, value_network
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 
 __all__ = [
     "ActionCost",
@@ -34,7 +34,6 @@ __all__ = [
     "Stage",
     "ValueNetwork",
     "action_costs",
-    "adversary",
     "at_goal",
     "checked",
     "discounts_down_to",
@@ -52,4 +51,5 @@ __all__ = [
     "rates",
     "solve_on_grid",
     "value_network",
+    "worst_disturbance",
 ]

@@ -25,11 +25,11 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.iteration import Iteration, Subject, iterate, score
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.scale.mesh import local, program
 from dln_jax.types import InputError, require_positive
 
@@ -79,7 +79,7 @@ def fit_value(
         numbers: of the iteration.
         parameters: initial ones; random by default.
         double: whether to compute in float64, which takes twice as long.
-        disturbance: of an adversary, for a robust value.
+        disturbance: of the worst case, for a robust value.
         mesh: devices that share the states from which the policy is followed; all devices do the whole fits.
         report: called after every iteration.
 

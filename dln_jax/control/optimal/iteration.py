@@ -11,11 +11,11 @@ import optax
 from jax import Array
 from jax.sharding import Mesh
 
-from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.boxes import drawn
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.targets import Targets, greedy, targets
 from dln_jax.control.optimal.value_networks import ValueNetwork
+from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.scale.mesh import spread
 
 

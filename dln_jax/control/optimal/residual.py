@@ -20,9 +20,9 @@ from jax import Array
 from jax.sharding import Mesh
 
 from dln_jax.compilation import quick_compilation
-from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.boxes import uniform
 from dln_jax.control.optimal.problem import ControlProblem, checked, hjb_residual, optimal_control
+from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.scale.mesh import local, of_first_process, program
 from dln_jax.solvers import levenberg_marquardt
 from dln_jax.types import InputError, require_positive
@@ -96,7 +96,7 @@ def fit_residual(
         iterations: largest number of Levenberg-Marquardt iterations per draw of samples.
         rounds: largest number of draws at the last discount.
         patience: the fit ends after this many rounds without a lower validation.
-        disturbance: of an adversary, for a robust value function.
+        disturbance: of the worst case, for a robust value function.
         mesh: devices that share the samples of a fit.
         report: called after every draw.
 

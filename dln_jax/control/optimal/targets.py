@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from dln_jax.control.optimal.adversaries import Disturbance
 from dln_jax.control.optimal.flow import Flow, flow
 from dln_jax.control.optimal.problem import ControlProblem, ValueAndGradient, optimal_control
+from dln_jax.control.optimal.worst_case import Disturbance
 from dln_jax.types import Scalar
 
 
@@ -26,7 +26,7 @@ class Targets(NamedTuple):
 def greedy(
     problem: ControlProblem, value: ValueAndGradient, dt: float, disturbance: Disturbance | None = None
 ) -> Callable[[Array], tuple[Array, Scalar]]:
-    """x -> the state after a step under the value's policy, against an adversary if any, and the step's cost."""
+    """x -> the state after a step under the value's policy, with the worst disturbance if any, and the step's cost."""
     step: Flow = flow(problem, dt, clipped=True)
 
     def closed(x: Array) -> tuple[Array, Scalar]:
@@ -56,7 +56,7 @@ def targets(
         steps: N.
         dt: s.
         memory: of the weights, s.
-        disturbance: of an adversary, held over a step like the controls.
+        disturbance: worst disturbance, held over a step like the controls.
     """
     closed = greedy(problem, value, dt, disturbance)
     share, discount = jnp.exp(-dt / jnp.asarray(memory, x.dtype)), math.exp(-problem.discount * dt)

@@ -31,7 +31,7 @@ class Finding(NamedTuple):
         return f"{self.severity}: {self.said}; {self.remedy}"
 
 
-def told(findings: Iterable[Finding]) -> list[Finding]:
+def by_severity(findings: Iterable[Finding]) -> list[Finding]:
     """Sorts findings by severity."""
     return sorted(findings, key=lambda each: SEVERITIES.index(each.severity))
 

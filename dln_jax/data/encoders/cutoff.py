@@ -174,7 +174,7 @@ def spectra(
 
     parts = [part for part in np.split(values, np.flatnonzero(np.diff(trajectory)) + 1) if len(part) >= 16]
     if not parts:
-        raise InputError("no stretch has 16 samples; a spectrum takes longer motions: record some, or give a cut-off")
+        raise InputError("no segment has 16 samples; a spectrum takes longer motions: record some, or give a cut-off")
     length = min(max(len(part) for part in parts) - 2, max(14, round(SEGMENT * rate)))
     total, weight = 0.0, 0
     f = np.zeros(0)

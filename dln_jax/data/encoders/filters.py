@@ -82,7 +82,7 @@ def bent(values: Float[np.ndarray, "n k"], near: int) -> Float[np.ndarray, "n k"
     near = max(near, 2 * END_DEGREE)
     if len(values) < 2 * near:
         return np.zeros_like(values)
-    x = np.linspace(0.0, 1.0, len(values))  # along the stretch
+    x = np.linspace(0.0, 1.0, len(values))  # along the segment
     powers = range(6)
     conditions, found = [], []
     for samples, end in ((slice(None, near), 0.0), (slice(-near, None), 1.0)):
@@ -113,7 +113,7 @@ def derivatives(
     """
     require_positive(rate=rate)
     if len(q) < 6:
-        raise InputError(f"a stretch has {len(q)} samples; its rates take at least 6: record longer motions")
+        raise InputError(f"a segment has {len(q)} samples; its rates take at least 6: record longer motions")
     from scipy.interpolate import make_interp_spline
 
     t = np.arange(len(q)) / rate

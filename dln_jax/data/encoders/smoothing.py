@@ -24,7 +24,7 @@ from dln_jax.data.encoders.filters import ORDER, derivatives, low_pass
 from dln_jax.data.encoders.noise import noise_of
 from dln_jax.data.encoders.repeats import Repeats, without_repeats
 from dln_jax.data.schema import Trajectories
-from dln_jax.data.stretches import stretches
+from dln_jax.data.segments import segments
 from dln_jax.types import InputError, require_positive
 
 SHORTEST = 4.0
@@ -101,8 +101,8 @@ def smooth(
         # Rounding removes the rounding errors of time differences.
         rate = float(f"{sampling.timing(data.t, data.trajectory).rate:.9g}")
     require_positive(rate=rate)
-    pieces = stretches(data.t, data.trajectory, gap=bridged)
-    gaps = len(stretches(data.t, data.trajectory)) - len(pieces)
+    pieces = segments(data.t, data.trajectory, gap=bridged)
+    gaps = len(segments(data.t, data.trajectory)) - len(pieces)
     uniform = _Uniform.of(data, pieces, rate)
     noise_q, noise_tau = (noise_of(values, uniform.part) for values in (uniform.q, uniform.tau))
     choice = None
@@ -122,7 +122,7 @@ def smooth(
     kept = [index for index in range(len(pieces)) if np.sum(uniform.part == index) >= shortest]
     if not kept:
         raise InputError(
-            f"no stretch without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
+            f"no segment without a gap has {shortest} samples, four periods of the cut-off at {rate:g} Hz; record "
             "longer motions, or give a higher cut-off"
         )
     smoothed = _filtered(data, pieces, uniform, kept, rate, cutoff, order, filtered, trim, decimate)

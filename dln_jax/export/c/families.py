@@ -53,7 +53,7 @@ from dln_jax.types import InputError
 from dln_jax.zoo.catalogue import CATALOGUE
 from dln_jax.zoo.descriptions import build
 from dln_jax.zoo.differential_network import FunctionModel
-from dln_jax.zoo.pictures import PictureModel
+from dln_jax.zoo.images import ImageModel
 from dln_jax.zoo.run import Run
 
 Function = Callable[..., Mapping[str, Array]]
@@ -145,8 +145,8 @@ def _of_run(run: Run, precision: str, iterations: int) -> Functions:
     if isinstance(model, FunctionModel):
         functions = _of_layers(parameters, activation(description["activation"]))
         return _with_examples(functions, dtype, description["sizes"][0])
-    if isinstance(model, PictureModel):
-        functions = _of_pictures(model.pictures(parameters), iterations)
+    if isinstance(model, ImageModel):
+        functions = _of_images(model.images(parameters), iterations)
         return _with_examples(functions, dtype, 1, frames=(2 * description["pixels"],))
     if description.get("needs") is None:
         raise InputError("the model states no needs; export functions_of_system of its energies")
@@ -237,7 +237,7 @@ def _of_flow(system: Flow | PlainFlow, iterations: int) -> Named:
     return functions
 
 
-def _of_pictures(system: LatentPhase, iterations: int) -> Named:
+def _of_images(system: LatentPhase, iterations: int) -> Named:
     networks = {"encode": _named(system.encode, "q", "p"), "decode": _named(system.decode, "frames")}
     return networks | _of_flow(system.field, iterations)
 

@@ -31,12 +31,14 @@ def random_frames(d: int, random: np.random.Generator) -> Frames:
     return Frames(rotations, REACH * random.normal(size=(d, 3)))
 
 
-def rough_frames(sketch: Frames, random: np.random.Generator, *, angle: float, length: float) -> Frames:
+def rough_frames(kinematic_prior: Frames, random: np.random.Generator, *, angle: float, length: float) -> Frames:
     """Perturbs prior frames: rotates them by `angle`, rad, about random axes, and moves them by `length`, m."""
-    directions = random.normal(size=(2, *np.shape(sketch.positions)))
+    directions = random.normal(size=(2, *np.shape(kinematic_prior.positions)))
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     turns = np.asarray(jax.vmap(rotation)(jnp.asarray(angle * directions[0])))
-    return Frames(np.asarray(sketch.rotations) @ turns, np.asarray(sketch.positions) + length * directions[1])
+    return Frames(
+        np.asarray(kinematic_prior.rotations) @ turns, np.asarray(kinematic_prior.positions) + length * directions[1]
+    )
 
 
 def free_directions(parents: Sequence[int], joints: Sequence[JointKind]) -> np.ndarray:

@@ -41,11 +41,11 @@ class Search(NamedTuple):
     seed: int = 0
     """Seed of the starts and of the samples."""
     threads: int = 2
-    sketch: Frames | None = None
+    kinematic_prior: Frames | None = None
     """Kinematic prior: frames near which to start, for example from a drawing with link lengths and rough axes."""
-    sketch_angle: float = 0.5
+    prior_angle: float = 0.5
     """Deviation of the prior's axes, rad."""
-    sketch_length: float = 0.05
+    prior_length: float = 0.05
     """Deviation of the prior's positions, m."""
 
 
@@ -65,7 +65,7 @@ def search(
         InputError: a setting out of range.
     """
     counts = {name: getattr(settings, name) for name in ("starts", "agreement", "iterations", "seconds", "threads")}
-    require_positive(**counts, sketch_angle=settings.sketch_angle, sketch_length=settings.sketch_length)
+    require_positive(**counts, prior_angle=settings.prior_angle, prior_length=settings.prior_length)
     require_seed(settings.seed)
     until = time.perf_counter() + settings.seconds
     end = functools.partial(
@@ -98,9 +98,9 @@ def _waves(structure: Structure, settings: Search) -> Iterator[list[Frames]]:
 
 def _start(structure: Structure, settings: Search, index: int) -> Frames:
     random = np.random.default_rng([settings.seed, index])
-    if settings.sketch is None:
+    if settings.kinematic_prior is None:
         return random_frames(len(structure.joints), random)
-    return rough_frames(settings.sketch, random, angle=settings.sketch_angle, length=settings.sketch_length)
+    return rough_frames(settings.kinematic_prior, random, angle=settings.prior_angle, length=settings.prior_length)
 
 
 def _turns(structure: Structure, frames: Frames, joints: int) -> Iterable[Frames]:

@@ -99,13 +99,13 @@ def swinging_rod(seed: int = 0, *, trajectories: int = TRAJECTORIES, frames: int
     qd = random.uniform(-LARGEST_VELOCITY, LARGEST_VELOCITY, (trajectories, 1))
     t = FRAME_TIME * np.arange(frames)
     q, qd = (state[..., 0] for state in rollouts(rod(), q, qd, t))
-    return Frames(t, q, qd, pictures(q))
+    return Frames(t, q, qd, images(q))
 
 
-def pictures(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]:
+def images(q: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape pixels"]:
     """Frames for angles of any shape, each as one row of 784 pixels, float32."""
     with jax.enable_x64(True):
-        drawn = _pictures(jnp.asarray(q, float).ravel())
+        drawn = _images(jnp.asarray(q, float).ravel())
     return np.asarray(drawn).reshape(*np.shape(q), PIXELS)
 
 
@@ -134,5 +134,5 @@ def choose(data: Frames, indices: np.ndarray) -> Frames:
 
 
 @jax.jit
-def _pictures(q: Vector) -> Float[Array, "d pixels"]:
+def _images(q: Vector) -> Float[Array, "d pixels"]:
     return jax.lax.map(lambda angle: render(angle).ravel(), q, batch_size=256).astype(jnp.float32)

@@ -19,8 +19,8 @@ from dln_jax.files import write_json
 from dln_jax.identification.identify import identify, parameters_of
 from dln_jax.identification.residual import fit_residual
 from dln_jax.learning.engine.problem import Training
-from dln_jax.learning.ladder import Climb, Fitted, Rung, Step, climb
 from dln_jax.learning.linear import MOST_PARAMETERS, parameters_of_degree
+from dln_jax.learning.model_selection import Assessment, Candidate, FittedModel, Selection, select_model
 from dln_jax.learning.objectives import SCALED_TORQUE
 from dln_jax.mechanics.trees import tree_to_json
 from dln_jax.models.model import Model, Parameters
@@ -37,7 +37,7 @@ from dln_jax.training.identification.additions import with_network
 from dln_jax.training.identification.task import Case, Sets, with_description, with_shapes
 from dln_jax.zoo.descriptions import Description, build, describe
 
-LADDER_SECONDS, RUNG_SECONDS = 300.0, 120.0
+SELECTION_SECONDS, CANDIDATE_SECONDS = 300.0, 120.0
 """Default time limits, s: for the whole selection, and for one search or network in it."""
 MOST_SAMPLES = 4_000
 """Largest number of samples to which residual networks are fitted."""
@@ -46,8 +46,8 @@ BESIDE = "-residual"
 """Suffix of the name of a model with a residual network."""
 
 
-def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
-    """Trains the model selected by validation; prints all candidates and writes them to `ladder.json`.
+def train_selected(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
+    """Trains the model selected by validation; prints all candidates and writes them to `model_selection.json`.
 
     The devices of a mesh share the final network; all other candidates are fitted on one device.
 
@@ -62,20 +62,20 @@ def climb_ladder(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | 
         recorded = recorded._replace(needs=needs._replace(friction=False, joint_friction=laws))
         print(f"friction of every model: {', '.join(laws)} in each joint")
     noise = noise_of(train_set.tau, train_set.trajectory)
-    found = climb(
-        _rungs(given, recorded, folder, mesh),
+    found = select_model(
+        _candidates(given, recorded, folder, mesh),
         train_set,
         validation,
         noise=noise if np.isfinite(noise).all() and noise.all() else None,
-        seconds=LADDER_SECONDS if given.seconds is None else seconds_left(deadline(given.seconds)),
+        seconds=SELECTION_SECONDS if given.seconds is None else seconds_left(deadline(given.seconds)),
         report=report,
     )
-    print_ladder(found)
-    write_json(folder / "ladder.json", as_json(found))
+    print_selection(found)
+    write_json(folder / "model_selection.json", as_json(found))
     return found.fitted.outcome
 
 
-def report(step: Step) -> None:
+def report(step: Assessment) -> None:
     """Prints the result of a candidate as soon as it is available."""
     if not step.tried:
         return
@@ -86,9 +86,9 @@ def report(step: Step) -> None:
         print(f"{step.name}: validation nMSE {step.nmse.mean():.3g}, {worst}, {step.seconds:.1f} s")
 
 
-def print_ladder(found: Climb) -> None:
+def print_selection(found: Selection) -> None:
     """Prints a table of all candidates, and why the selection ended."""
-    title = "the ladder, by errors on validation motions"
+    title = "candidates, by errors on validation motions"
     table = Table("model", "nMSE, mean", "nMSE, worst joint", "s", "", title=title)
     for step in found.steps:
         numbers = ["", "", ""] if step.nmse is None else [f"{each:.2e}" for each in (step.nmse.mean(), step.nmse.max())]
@@ -101,29 +101,34 @@ def print_ladder(found: Climb) -> None:
         print(f"no further model was tried: {found.ended}")
 
 
-def as_json(found: Climb) -> dict[str, Any]:
-    """Contents of `ladder.json`."""
-    rungs = []
+def as_json(found: Selection) -> dict[str, Any]:
+    """Contents of `model_selection.json`."""
+    candidates = []
     for step in found.steps:
         mean = None if step.nmse is None else float(step.nmse.mean())
         joints = None if step.nmse is None else step.nmse.tolist()
         errors = {"validation_nmse": mean, "validation_nmse_joints": joints}
-        rungs.append({"name": step.name, "tried": step.tried, **errors, "seconds": step.seconds, "reason": step.reason})
-    return {"kept": found.chosen.name, "ended": found.ended, "rungs": rungs}
+        candidates.append(
+            {"name": step.name, "tried": step.tried, **errors, "seconds": step.seconds, "reason": step.reason}
+        )
+    return {"kept": found.chosen.name, "ended": found.ended, "candidates": candidates}
 
 
-def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Rung]:
+def _candidates(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) -> list[Candidate]:
     """The candidates, from the strongest prior knowledge to the weakest."""
-    bases: dict[str, Fitted] = {}
+    bases: dict[str, FittedModel] = {}
 
-    def both(name: str, fit: Callable[[float], Fitted]) -> list[Rung]:
-        def base(left: float) -> Fitted:
+    def both(name: str, fit: Callable[[float], FittedModel]) -> list[Candidate]:
+        def base(left: float) -> FittedModel:
             bases[name] = fit(left)
             return bases[name]
 
-        return [Rung(name, base), Rung(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left))]
+        return [
+            Candidate(name, base),
+            Candidate(name + BESIDE, lambda left: _with_network(recorded, bases.get(name), left)),
+        ]
 
-    def by_name(name: str) -> Callable[[float], Fitted]:
+    def by_name(name: str) -> Callable[[float], FittedModel]:
         return lambda left: _by_name(name, given, recorded, folder, mesh, left)
 
     robot = recorded.robot
@@ -135,12 +140,16 @@ def _rungs(given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None) 
     explicit = (
         both(EXPLICIT, by_name(EXPLICIT))
         if first is not None and first <= MOST_PARAMETERS
-        else [Rung(EXPLICIT, _too_large(first))]
+        else [Candidate(EXPLICIT, _too_large(first))]
     )
     kernel = [] if small else both(KERNEL, by_name(KERNEL))
     order = [known, explicit, learned, kernel] if small else [known, learned, explicit, kernel]
-    direct = [rungs[0] for rungs in order if rungs]
-    return [*direct, *(rung for rungs in order for rung in rungs[1:]), Rung(NETWORK, by_name(NETWORK))]
+    direct = [candidates[0] for candidates in order if candidates]
+    return [
+        *direct,
+        *(candidate for candidates in order for candidate in candidates[1:]),
+        Candidate(NETWORK, by_name(NETWORK)),
+    ]
 
 
 def _too_large(size: int | None) -> Callable[[float], str]:
@@ -149,15 +158,17 @@ def _too_large(size: int | None) -> Callable[[float], str]:
     return lambda left: f"its basis has {number} coefficients; at most {MOST_PARAMETERS:,} are tried"
 
 
-def _by_name(name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float) -> Fitted:
+def _by_name(
+    name: str, given: Options, recorded: Recorded, folder: Path, mesh: Mesh | None, left: float
+) -> FittedModel:
     """Trains a model as `--model NAME` would."""
-    limit = min(left, RUNG_SECONDS if given.seconds is None else math.inf)
+    limit = min(left, CANDIDATE_SECONDS if given.seconds is None else math.inf)
     own, method = dataclasses.replace(given, model=name), METHODS[name]
     task, training = method.fit(planned(method, own, name, recorded, time.perf_counter() + limit), own, folder, mesh)
-    return Fitted(build(task.description), training.parameters, (task, training))
+    return FittedModel(build(task.description), training.parameters, (task, training))
 
 
-def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
+def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> FittedModel:
     """Identifies the robot's tree as the command `identify` does."""
     needs = recorded.needs
     train_set, validation, _ = recorded.sets
@@ -173,7 +184,7 @@ def _rigid_tree(given: Options, recorded: Recorded, robot: Robot) -> Fitted:
     return _as_training(recorded, case.description, case.model, kept, time.perf_counter() - began)
 
 
-def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitted | str:
+def _with_network(recorded: Recorded, base: FittedModel | None, left: float) -> FittedModel | str:
     """Adds a residual network to a model if held-out motions justify it."""
     if base is None:
         return "there is no model to add a network to"
@@ -188,7 +199,7 @@ def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitte
         recorded.needs,
         every(train_set, thin),
         validation,
-        seconds=min(left, RUNG_SECONDS),
+        seconds=min(left, CANDIDATE_SECONDS),
     )
     if not added.settings:
         return "no network makes it better on validation motions"
@@ -196,7 +207,7 @@ def _with_network(recorded: Recorded, base: Fitted | None, left: float) -> Fitte
     return _as_training(recorded, description, added.model, added.parameters, time.perf_counter() - began)
 
 
-def _as_rigid(learned: Fitted, recorded: Recorded) -> Fitted:
+def _as_rigid(learned: FittedModel, recorded: Recorded) -> FittedModel:
     """Converts a learned tree to a tree with known frames."""
     task: Task = learned.outcome[0]
     needs, given, found = needs_of_tree(recorded.needs), task.description, learned.parameters
@@ -215,7 +226,7 @@ def _as_rigid(learned: Fitted, recorded: Recorded) -> Fitted:
 
 def _as_training(
     recorded: Recorded, description: Description, model: Model, parameters: Parameters, seconds: float
-) -> Fitted:
+) -> FittedModel:
     """Wraps a fit as a task and its training, as for models trained by name."""
     task = Task(recorded, description["name"], description, SCALED_TORQUE, None, 0, math.inf)
-    return Fitted(model, parameters, (task, training_of(task, parameters, float("nan"), seconds)))
+    return FittedModel(model, parameters, (task, training_of(task, parameters, float("nan"), seconds)))

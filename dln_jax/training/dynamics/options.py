@@ -86,13 +86,13 @@ class ArmOptions(Options):
     """What to train on, how, and where the results go, where it may be an arm."""
 
     robot: Unstated[Path] = None
-    """auto: URDF or MJCF file, whose kinematics is the first rung of the ladder."""
-    hold: Unstated[str] = None
+    """auto: URDF or MJCF file, whose kinematics is the first candidate of model selection."""
+    lock: Unstated[str] = None
     """Joints of --robot that do not move, comma separated; "*finger*" names all with finger in their name."""
     parents: Unstated[str] = None
     """auto and learned-tree: the joint that each one hangs on, counted from 1, with 0 for the ground, for example
     0,1,2,1 (default: one after the other)."""
-    sketch: Unstated[Path] = None
+    kinematic_prior: Unstated[Path] = None
     """auto and learned-tree: JSON file with a rough description of the arm, which the search starts near: axes and
     points of the joints at q = 0, or Denavit-Hartenberg rows."""
     velocity_scale: Unstated[float] = None
@@ -134,6 +134,6 @@ def check_arm_options(given: ArmOptions, kind: str) -> None:
     require_positive_if_given(given, ["velocity_scale"])
     if given.model == AUTO:
         return
-    refuse_given(given, ["robot", "hold"], "for --model auto (python -m scripts.identify fits a robot of a file)")
+    refuse_given(given, ["robot", "lock"], "for --model auto (python -m scripts.identify fits a robot of a file)")
     if not CATALOGUE[kind].properties.searched:
-        refuse_given(given, ["parents", "sketch"], "for --model auto and learned-tree")
+        refuse_given(given, ["parents", "kinematic_prior"], "for --model auto and learned-tree")

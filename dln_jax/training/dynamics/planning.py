@@ -26,7 +26,7 @@ def check_options(given: Options, kind: str) -> None:
             "--objective is for one model, and --model auto compares several by their torques; choose a --model "
             "with an energy, such as structured-delan, trigonometric or learned-tree, or leave --objective out"
         )
-    check_direct_options(given, ("degree", "precision", "samples"), "the ladder", "chooses by validation")
+    check_direct_options(given, ("degree", "precision", "samples"), "model selection", "chooses by validation")
 
 
 def task_of(given: Options, recorded: Recorded) -> Task:

@@ -14,7 +14,7 @@ from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.splits import BLOCKS, LEAST_TRAJECTORIES, Split, in_blocks, split
 from dln_jax.files import read_json
-from dln_jax.learning.kinematics.sketch import Sketch, sketch_from_json
+from dln_jax.learning.kinematics.kinematic_prior import KinematicPrior, kinematic_prior_from_json
 from dln_jax.models.rigid_tree import USUAL
 from dln_jax.scenes.datasets.default_data import CHARACTERS_TEST, default_data
 from dln_jax.scenes.registry import scene_named
@@ -44,7 +44,7 @@ class Recorded(NamedTuple):
     """The robot that moved, if its file was stated."""
     parents: tuple[int, ...] | None
     """Parent link of every link, if stated."""
-    sketch: Sketch | None
+    kinematic_prior: KinematicPrior | None
     torque: str = "measured torques"
     """The torques that models are fitted to and uncertainty bands refer to."""
 
@@ -106,7 +106,7 @@ def read(given: Options) -> Recorded:
         cutoff=None if filtered is None else filtered.cutoff,
         robot=robot,
         parents=parents,
-        sketch=sketch_of(given, needs.degrees_of_freedom, parents),
+        kinematic_prior=kinematic_prior_of(given, needs.degrees_of_freedom, parents),
         torque=fitted_torque(filtered),
     )
 
@@ -145,9 +145,9 @@ def robot_of(given: Options) -> Robot | None:
     """Reads the robot of --robot."""
     if not isinstance(given, ArmOptions) or given.robot is None:
         if isinstance(given, ArmOptions):
-            refuse_given(given, ["hold"], "for joints of --robot")
+            refuse_given(given, ["lock"], "for joints of --robot")
         return None
-    return read_robot(given.robot, hold=names_listed(given.hold))
+    return read_robot(given.robot, lock=names_listed(given.lock))
 
 
 def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
@@ -166,12 +166,12 @@ def parents_of(given: Options, d: int) -> tuple[int, ...] | None:
     return found
 
 
-def sketch_of(given: Options, d: int, parents: tuple[int, ...] | None) -> Sketch | None:
-    """Reads the kinematic prior of --sketch."""
-    if not isinstance(given, ArmOptions) or given.sketch is None:
+def kinematic_prior_of(given: Options, d: int, parents: tuple[int, ...] | None) -> KinematicPrior | None:
+    """Reads the kinematic prior of --kinematic-prior."""
+    if not isinstance(given, ArmOptions) or given.kinematic_prior is None:
         return None
     try:
-        return sketch_from_json(read_json(given.sketch, remedy="see --help"), d, parents)
+        return kinematic_prior_from_json(read_json(given.kinematic_prior, remedy="see --help"), d, parents)
     except InputError as error:
         text = str(error)
-        raise InputError(text if str(given.sketch) in text else f"{given.sketch}: {text}") from None
+        raise InputError(text if str(given.kinematic_prior) in text else f"{given.kinematic_prior}: {text}") from None

@@ -15,7 +15,7 @@ from dln_jax.learning.engine.problem import Training
 from dln_jax.learning.objectives import SCALED_TORQUE, require_scales, torque_scale
 from dln_jax.scale.devices import device_lines
 from dln_jax.training.dynamics.methods import METHODS
-from dln_jax.training.dynamics.model_selection import climb_ladder
+from dln_jax.training.dynamics.model_selection import train_selected
 from dln_jax.training.dynamics.options import AUTO, Options, with_model
 from dln_jax.training.dynamics.planning import check_options, task_of
 from dln_jax.training.dynamics.programs import programs_ahead, programs_of
@@ -49,7 +49,7 @@ def run(given: Options, command: str) -> None:
     with command_folder(given, command) as folder:
         announce(recorded, chosen_for)
         if chosen is None:
-            task, training = climb_ladder(given, recorded, folder, mesh)
+            task, training = train_selected(given, recorded, folder, mesh)
             programs = programs_of(task, mesh)
         else:
             announce_model(chosen)

@@ -116,10 +116,12 @@ def searched(
             return None, numbers
     if agreeing < agreement:
         reason = f"only {agreeing} of {len(losses)} descents reached the lowest loss, so a lower one may exist"
-        remedy = "try another --seed, more --seconds or a --sketch of the arm"
+        remedy = "try another --seed, more --seconds or a --kinematic-prior of the arm"
         return Verdict("doubtful", reason, remedy), numbers
     if above is not None and above > FAR_FROM_NOISE:
         reason = f"held-out errors are {above:.2g} times the noise, though {agreeing} descents agree"
-        remedy = "record more and different motions, or add a --sketch; friction that the tree lacks looks the same"
+        remedy = (
+            "record more and different motions, or add a --kinematic-prior; friction that the tree lacks looks the same"
+        )
         return Verdict("doubtful", reason, remedy), numbers
     return None, numbers

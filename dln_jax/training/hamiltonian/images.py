@@ -15,7 +15,7 @@ from dln_jax.models.latent_phase import Field
 from dln_jax.training.hamiltonian import pixels as pixel_task
 from dln_jax.training.results import OF_LOSSES, losses
 from dln_jax.types import require_seed
-from dln_jax.zoo.pictures import with_components
+from dln_jax.zoo.images import with_components
 from dln_jax.zoo.run import save
 
 
@@ -50,7 +50,7 @@ def run(given: Options, command: str) -> None:
                 checkpoint=Checkpoint(folder, known, given.resume),
                 report=lambda at: show(at.step, losses(at)),
             )
-        description = pixel_task.picture_description(kind, seen.components)
+        description = pixel_task.image_description(kind, seen.components)
         save(folder, description, with_components(seen.components, seen.parameters))
         write_json(folder / "metrics.json", {key: value for key, value in numbers.items() if np.isfinite(value)})
         if given.figures:

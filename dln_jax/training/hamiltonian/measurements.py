@@ -13,8 +13,8 @@ from dln_jax.data.bodies import find_bodies
 from dln_jax.data.local_polynomials import DEGREE, smooth_locally
 from dln_jax.data.magnitudes import spread
 from dln_jax.data.schema import Trajectories, column, time_derivative
+from dln_jax.data.segments import segments
 from dln_jax.data.splits import PER_SAMPLE, label_indices, require_no_copies, select
-from dln_jax.data.stretches import stretches
 from dln_jax.learning.measured_motions import MeasuredWindows, Noise
 from dln_jax.learning.motions import Weights
 from dln_jax.metrics.measured_predictions import cut_recordings, grid_places
@@ -154,11 +154,11 @@ def trust_of(data: Trajectories, noise: tuple[float, ...] | None) -> Trust | Non
     if noise is not None and len(noise) not in ((1, d, 2 * d) if own else (1, d)):
         more = f", or {2 * d} of q and then p" if own else ""
         raise InputError(f"noise has {len(noise)} numbers; expected one, or one for each of {d} coordinates{more}")
-    parts = stretches(data.t, data.trajectory)
+    parts = segments(data.t, data.trajectory)
     if max(map(len, parts)) < DEGREE + 2:
         if noise is None:
             return None
-        raise InputError(f"--noise is for motions, but no stretch without a gap has {DEGREE + 2} samples; leave it out")
+        raise InputError(f"--noise is for motions, but no segment without a gap has {DEGREE + 2} samples; leave it out")
     order = np.random.default_rng(0).permutation(len(parts))
     count = int(np.searchsorted(np.cumsum([len(parts[index]) for index in order]), SURVEYED)) + 1
     surveyed = samples_of(data, np.concatenate([parts[index] for index in sorted(order[:count])]))
@@ -191,7 +191,7 @@ def _at_least(noise: np.ndarray, values: np.ndarray) -> tuple[float, ...]:
 
 def to_predict(test: Trajectories) -> MeasuredWindows | None:
     """Recordings cut to at most `HORIZON_WINDOWS` windows, across gaps; `None` if no segment exceeds one."""
-    parts = stretches(test.t, test.trajectory)
+    parts = segments(test.t, test.trajectory)
     if max(map(len, parts)) <= WINDOW[MEASURED]:
         return None
     longest = max(int(grid_places(test.t[test.trajectory == index])[-1]) + 1 for index in np.unique(test.trajectory))
@@ -200,7 +200,7 @@ def to_predict(test: Trajectories) -> MeasuredWindows | None:
 
 def gap_count(test: Trajectories) -> int:
     """Number of gaps within trajectories."""
-    return len(stretches(test.t, test.trajectory)) - len(np.unique(test.trajectory))
+    return len(segments(test.t, test.trajectory)) - len(np.unique(test.trajectory))
 
 
 def motion_of(test: Trajectories) -> Motions:
@@ -221,7 +221,7 @@ def pieces(data: Trajectories, length: int) -> Trajectories:
     """Segments cut to the length of two windows, as trajectories of their own, so that some can be held out."""
     parts = [
         each[at : at + 2 * length]
-        for each in stretches(data.t, data.trajectory)
+        for each in segments(data.t, data.trajectory)
         for at in range(0, len(each), 2 * length)
     ]
     index = np.arange(len(parts))

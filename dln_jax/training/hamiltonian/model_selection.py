@@ -229,7 +229,7 @@ def validation_errors(
     errors = np.sum(np.asarray(left) ** 2, axis=1)
     if not in_velocities(problem, description):
         return errors
-    numbers = growth.stretches(parts[1])
+    numbers = growth.segments(parts[1])
     return np.bincount(numbers, errors) / np.bincount(numbers)
 
 

@@ -61,13 +61,13 @@ class SeenFrames(NamedTuple):
     history: list[Progress]
 
 
-def picture_description(field: Field, components: Components) -> Description:
+def image_description(field: Field, components: Components) -> Description:
     """Description of a model of images by their components."""
     count, pixels = components.basis.shape
     return describe("latent-phase", field=field, pixels=pixels, components=count, precision="f32")
 
 
-def picture_models(description: Description, components: Components) -> tuple[LatentModel, LatentModel]:
+def image_models(description: Description, components: Components) -> tuple[LatentModel, LatentModel]:
     """The model of the components' coefficients, and the same model, with the same parameters, of images."""
     inner = build(description).of_coefficients(components.scale)
     return inner, through_components(inner, components)
@@ -96,7 +96,7 @@ def measure_pixels(
 ) -> tuple[dict[str, float], SeenFrames]:
     """Trains a model; returns its test errors and times, and what figures need."""
     components = principal_components(data.train.frames, COMPONENTS)
-    inner, model = picture_models(picture_description(kind, components), components)
+    inner, model = image_models(image_description(kind, components), components)
     fitted, held_out, tested = (compress(components, part.frames) for part in data)
     problem = learning_frames.problem(inner, fitted, held_out, MATCHING, seed=seed)
     training = fit(problem, optimiser_of(steps), checkpoint=checkpoint, report=report)

@@ -100,7 +100,7 @@ def announce(problem: Problem, description: dict[str, Any], said: list[str]) -> 
     trajectories = len(np.unique(data.trajectory))
     needs = needs_from_json(description["needs"])
     terms = " and ".join(name for name in ("gravity", "friction") if getattr(needs, name)) or "no potential"
-    print(f"{problem.name}: {len(data.t)} samples of {trajectories} stretches for training and validation")
+    print(f"{problem.name}: {len(data.t)} samples of {trajectories} segments for training and validation")
     print(f"{'-'.join(needs.joints)} with {terms}; {description['name']}, f64")
     unused = ("qdd",) if problem.noise is None else ("p", "pd")
     missing = [key for key in data.estimated if key not in ("tau", *unused)]

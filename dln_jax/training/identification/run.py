@@ -170,7 +170,7 @@ def write_file(folder: Path, given: Options, case: Case, found: Identification, 
         pairs = ", ".join(f"{joint} {value!r}" for joint, value in zip(case.names, values.tolist(), strict=True))
         remarks.append(f"Of friction, for which there is no place, {name}: {pairs}.")
     try:
-        write_robot(path, given.robot, tree, **friction, hold=case.held, remarks=tuple(remarks))
+        write_robot(path, given.robot, tree, **friction, lock=case.held, remarks=tuple(remarks))
     except InputError as error:
         return [f"no {path.name}: {error}"]
     lacks = " without armature, for which URDF has no place (a comment in it states it)" * (path.suffix == ".urdf")

@@ -55,7 +55,7 @@ class Options(Folder, Drawn, Filtered):
     test: Unstated[str] = None
     """Labels of the held-out trajectories, comma separated (default: the third of every five; of one trajectory, of ten
     blocks of time)."""
-    hold: Unstated[str] = None
+    lock: Unstated[str] = None
     """Joints of the file that do not move, such as those of a gripper, comma separated; "*finger*" names all with
     finger in their name (default: all joints move)."""
     friction: Annotated[str, choice((*IDENTIFIED, NO_FRICTION), several=True)] = ",".join(USUAL)
@@ -113,8 +113,8 @@ class Case(NamedTuple):
 
 def prepare(given: Options) -> Case:
     """Reads and checks everything that the options name, before anything is written."""
-    held = names_listed(given.hold)
-    robot = read_robot(given.robot, hold=held)
+    held = names_listed(given.lock)
+    robot = read_robot(given.robot, lock=held)
     laws = () if given.friction == NO_FRICTION else tuple(names_in("--friction", given.friction, IDENTIFIED))
     require_laws(laws, "--friction")
     require_positive_if_given(given, ["velocity_scale"])

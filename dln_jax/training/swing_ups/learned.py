@@ -12,7 +12,7 @@ from dln_jax.control.closed_loop import Run
 from dln_jax.control.desktop_plants import DesktopPlant
 from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.state_space import field_of
-from dln_jax.control.swing_up_runs import model_of_maker, model_of_plant
+from dln_jax.control.swing_up_runs import model_of_plant, nominal_model
 from dln_jax.data.schema import Trajectories
 from dln_jax.learning.engine.problem import Report, silent
 from dln_jax.learning.recordings import Fitted, Prepared, identified, learned, prepare
@@ -20,7 +20,7 @@ from dln_jax.mechanics.dynamics import Dynamics
 from dln_jax.types import InputError
 
 MODELS = ("delan", "identified", "analytic", "known")
-"""Learned; linear in its parameters; the maker's dimensions without friction; the plant itself."""
+"""Learned; linear in its parameters; the nominal dimensions without friction; the plant itself."""
 TEST_SEED = 500
 """Offset of the seed for test motions."""
 
@@ -47,7 +47,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
     """The model with this name.
 
     Args:
-        plant: the plant; only "analytic" and "known" use its maker's model and friction.
+        plant: the plant; only "analytic" and "known" use its nominal model and friction.
         model: one of `MODELS`.
         recording: data from which the other two models are learned.
         seed: seed of the network's initial parameters.
@@ -56,7 +56,7 @@ def obtain(plant: DesktopPlant, model: str, recording: Trajectories, *, seed: in
     Raises:
         InputError: an unknown name.
     """
-    known: Mapping[str, Callable[[DesktopPlant], Dynamics]] = {"analytic": model_of_maker, "known": model_of_plant}
+    known: Mapping[str, Callable[[DesktopPlant], Dynamics]] = {"analytic": nominal_model, "known": model_of_plant}
     if model not in MODELS:
         raise InputError(f"model is {model!r:.40}; choose from {', '.join(MODELS)}")
     if model in known:

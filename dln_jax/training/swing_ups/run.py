@@ -130,7 +130,7 @@ def say(given: Asked, got: Obtained, metrics: dict[str, float]) -> None:
 
 def draw(given: Asked, model: Dynamics, folder: Path) -> None:
     """Writes a figure of some runs, and an animation of the first."""
-    plant, lab = given.plant, given.plant.laboratory
+    plant, lab = given.plant, given.plant.hardware
     runs = some_runs(plant, model, min(given.starts, MOST_SHOWN), given.seed)
     unit, limits = UNITS[given.name], (lab.least, lab.most)
     energy = passive_energy(without_friction(model), parts_of(plant.scene.needs.actuation), np.zeros(2))

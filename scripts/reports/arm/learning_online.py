@@ -19,7 +19,7 @@ from jax import Array
 
 from dln_jax.control import (
     Gains,
-    Laboratory,
+    Hardware,
     Reference,
     Run,
     Tracker,
@@ -189,7 +189,7 @@ def closed_loop(law: Law, condition: Condition) -> Loop:
     """The exact arm under a law, compiled: all parameters and letters share the program."""
     gains = Gains(condition.gains * GAINS.proportional, condition.gains**0.5 * GAINS.derivative)
     noisy = condition.encoder_noise > 0
-    laboratory = Laboratory(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
+    hardware = Hardware(-LIMITS, LIMITS, encoder_noise=condition.encoder_noise, sees_rates=not noisy)
     arm = two_link_arm()
     assert arm.tip is not None
     field, tip = field_of(dynamics(arm.closed_form)), jax.vmap(arm.tip)
@@ -200,7 +200,7 @@ def closed_loop(law: Law, condition: Condition) -> Loop:
         if noisy:
             controller = with_differences(controller, 2, rate=RATE, cutoff=CUTOFF)
         start = jnp.concatenate([wanted.q[0], wanted.qd[0]])
-        seconds, about = len(wanted.q) / RATE, {"rate": RATE, "controls": 2, "laboratory": laboratory, "key": key}
+        seconds, about = len(wanted.q) / RATE, {"rate": RATE, "controls": 2, "hardware": hardware, "key": key}
         done = simulate(field, controller, start, seconds=seconds, **about)
         x = done.x[:-1]
         return Driven(done, jax.vmap(field)(x, done.u)[:, 2:], tip(x[:, :2]), tip(wanted.q))

@@ -14,7 +14,7 @@ from scripts.reports.case import measure_and_publish
 from scripts.reports.control.cases import cases
 
 SUBJECTS = (
-    "swing-up", "starts", "board", "learned", "equation", "value", "tracking", "robustness", "laws", "receding",
+    "swing-up", "starts", "board", "learned", "equation", "value", "tracking", "robustness", "laws", "mpc",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or in our own equations, and its laboratory.
+"""The closed loop of the seven-axis arm at 1 kHz, in MuJoCo or in our own equations, and its hardware.
 
 Torques are limited and a sample late; angles alone are read, by encoders of 14 bits on the motors' side of a gear of
 100, and rates are their differences through a low-pass.
@@ -86,7 +86,7 @@ def friction_of(robot: Robot) -> Any:
 
 
 def track(plant: Plant, law: Tracker | Callable[..., Any], wanted: Motion, samples: int | None = None) -> Tracked:
-    """A closed loop along a motion, in the laboratory of the head of this file."""
+    """A closed loop along a motion, on the hardware of the head of this file."""
 
     @jax.jit
     def asked(q: Any, qd: Any, now: Reference) -> Any:

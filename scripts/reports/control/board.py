@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Laboratory, Run, field_of, simulate
+from dln_jax.control import Controller, Hardware, Run, field_of, simulate
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.scene import Scene
 from dln_jax.scenes.two_link_pendulum import Links, two_link_pendulum
@@ -55,9 +55,9 @@ def play(motor: Motor, controller: Controller) -> Run:
     """The closed loop as the board runs it."""
     scene, B = plant(motor)
     field = field_of(dynamics(scene.energies), B)
-    lab = Laboratory(-LIMIT, LIMIT)
+    lab = Hardware(-LIMIT, LIMIT)
     return jax.jit(
-        lambda: simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, laboratory=lab)
+        lambda: simulate(field, controller, np.zeros(4), seconds=SECONDS, rate=RATE, controls=1, hardware=lab)
     )()
 
 

@@ -12,7 +12,7 @@ from dln_jax.precision import in_float64
 from dln_jax.scenes.cart_pole import cart_pole
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from scripts.reports.case import Case, Findings
-from scripts.reports.control import energy_laws, laws_in_c, learned, pictures, receding_report, robustness, tracking
+from scripts.reports.control import energy_laws, laws_in_c, learned, mpc_report, robustness, traces, tracking
 from scripts.reports.control.board import Motor, criteria, plant, play
 from scripts.reports.control.energy_laws import SwingUp, rows_of_criteria, rows_of_outcomes, success
 from scripts.reports.control.planned import Weights, follower, search
@@ -53,9 +53,9 @@ WEIGHTS = (Weights(), Weights(torque=0.3, velocity=0.01, slope=3e-3))
 def swing_up(name: str, quick: bool) -> Findings:
     """Share of starts that are up after ten seconds, and when."""
     found = success(SWING_UPS[name], 50 if quick else STARTS)
-    words = f"of {len(found.seconds)} starts near hanging, in a laboratory"
+    words = f"of {len(found.seconds)} starts near hanging, on simulated hardware"
     rows = rows_of_outcomes(f"swing-up/{name}/known", found, words, SUCCESS)
-    return Findings(rows, pictures.traces(SWING_UPS[name]))
+    return Findings(rows, traces.traces(SWING_UPS[name]))
 
 
 def by_plan(motor: Motor, quick: bool) -> Findings:
@@ -78,7 +78,7 @@ def cases(*, quick: bool = False) -> list[Case]:
     """All, named SUBJECT/NAME, in float64."""
     measures: dict[str, Callable[[bool], Findings]] = {
         **{f"swing-up/{name}": functools.partial(swing_up, name) for name in SWING_UPS},
-        **{f"starts/{name}-starts": functools.partial(pictures.from_anywhere, SWING_UPS[name]) for name in SWING_UPS},
+        **{f"starts/{name}-starts": functools.partial(traces.from_anywhere, SWING_UPS[name]) for name in SWING_UPS},
         "board/acrobot-energy": functools.partial(by_energy, "elbow"),
         "board/pendubot-energy": functools.partial(by_energy, "shoulder"),
         "board/acrobot-planned": functools.partial(by_plan, "elbow"),
@@ -89,10 +89,10 @@ def cases(*, quick: bool = False) -> list[Case]:
         "robustness/acrobot": functools.partial(robustness.robust, "elbow"),
         "robustness/pendubot": functools.partial(robustness.robust, "shoulder"),
         "laws/in-c": laws_in_c.laws,
-        "receding/cart-pole": receding_report.mpc,
+        "mpc/cart-pole": mpc_report.mpc,
     }
     found = {name: functools.partial(measure, quick) for name, measure in measures.items()} | learned.cases(quick)
-    drawn = {**pictures.DRAWN, "robustness": robustness.draw}
+    drawn = {**traces.DRAWN, "robustness": robustness.draw}
 
     def drawing(name: str) -> Callable[..., Any] | None:
         return fits.DRAWINGS.get(name, drawn.get(name.split("/")[0]))

@@ -20,7 +20,7 @@ from jax import Array
 from dln_jax.control import (
     Controller,
     EnergyGains,
-    Laboratory,
+    Hardware,
     Run,
     energy_shaping,
     field_of,
@@ -117,8 +117,8 @@ def runs_by_energy(motor: Motor) -> Callable[[Law], Run]:
     """A law's numbers -> its closed loop on the board."""
     scene, B = plant(motor)
     field, controller = field_of(dynamics(scene.energies), B), controllers_by_energy(motor)
-    lab, settings = Laboratory(-LIMIT, LIMIT), {"seconds": SECONDS, "rate": RATE, "controls": 1}
-    return lambda numbers: simulate(field, controller(numbers), np.zeros(4), laboratory=lab, **settings)
+    lab, settings = Hardware(-LIMIT, LIMIT), {"seconds": SECONDS, "rate": RATE, "controls": 1}
+    return lambda numbers: simulate(field, controller(numbers), np.zeros(4), hardware=lab, **settings)
 
 
 def runs_of_drawn_laws(motor: Motor, draws: int) -> list[Criteria]:
@@ -169,8 +169,8 @@ class SwingUp(NamedTuple):
 
 
 def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Run]:
-    """Start [4] -> run in a laboratory: encoders alone are read at 500 Hz, rates are differences of theirs, and torques
-    come a sample late."""
+    """Start [4] -> run on simulated hardware: only encoders are read, at 500 Hz; rates are their differences,
+    and torques act one sample late."""
     scene, rate = case.scene, RATE
     system, B, joints = dynamics(scene.energies), np.asarray(scene.needs.actuation), scene.needs.joints
     field, goal = field_of(system, B), jnp.zeros(4)
@@ -180,8 +180,8 @@ def closed_loop(case: SwingUp, *, seconds: float = 10.0) -> Callable[[Array], Ru
     near = regulated(regulator, goal, at.u, joints)
     law = switched(lambda x: swing(x[:2], x[2:]), near, value(regulator, goal, joints), case.level)
     controller = with_differences(law, 2, rate=rate, cutoff=50.0)
-    lab = Laboratory(-case.limit, case.limit, encoder_step=np.array(case.encoder_step), delay=1, sees_rates=False)
-    return lambda start: simulate(field, controller, start, seconds=seconds, rate=rate, controls=1, laboratory=lab)
+    lab = Hardware(-case.limit, case.limit, encoder_step=np.array(case.encoder_step), delay=1, sees_rates=False)
+    return lambda start: simulate(field, controller, start, seconds=seconds, rate=rate, controls=1, hardware=lab)
 
 
 def success(case: SwingUp, starts: int, seed: int = 0, *, seconds: float = 10.0) -> Outcomes:

@@ -38,7 +38,7 @@ from dln_jax.scenes.chain import chain
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
 from dln_jax.zoo.descriptions import build, describe
 from scripts.reports.case import Findings
-from scripts.reports.control.receding_calls import STACK, first_state, one_call
+from scripts.reports.control.mpc_calls import STACK, first_state, one_call
 from scripts.reports.control.values.laws import drawn_law
 from scripts.reports.robots.arm import DAMPING, STIFFNESS, D, arm
 from scripts.reports.speed.calls_in_c import Times, compiled, evicting, programs, timed
@@ -100,7 +100,7 @@ def value_policy() -> Law:
 
 
 def one_iteration() -> Law:
-    """A call of `receding` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
+    """A call of `mpc` with one iteration, a cart-pole over 0.8 s: (x, plan) -> (u, plan)."""
     return Law(one_call(STEPS), tuple(map(np.asarray, first_state(STEPS))), 1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Swing-ups by models that were learned from at most thirty seconds of a laboratory's motions, over several seeds."""
+"""Swing-ups by models that were learned from at most thirty seconds of the hardware's motions, over several seeds."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import numpy as np
 from dln_jax.control.desktop_plants import PLANTS, DesktopPlant, desktop_plant
 from dln_jax.control.exploration import Excitation, explore
 from dln_jax.control.outcomes import Outcomes
-from dln_jax.control.swing_up_runs import Tried, law_of, model_of_maker, try_starts
+from dln_jax.control.swing_up_runs import Tried, law_of, nominal_model, try_starts
 from dln_jax.metrics.report import Row, expect
 from dln_jax.training.swing_ups.learned import Obtained, errors_along, obtain, test_motions
 from dln_jax.types import InputError
@@ -46,16 +46,16 @@ def by_model(name: str, model: str, quick: bool) -> Findings:
     return Findings(rows)
 
 
-def by_maker(name: str, quick: bool) -> Findings:
-    """The same by the maker's model, which knows no friction, and learns nothing."""
-    plant, model = desktop_plant(name), model_of_maker(desktop_plant(name))
+def by_nominal(name: str, quick: bool) -> Findings:
+    """The same by the nominal model, which knows no friction, and learns nothing."""
+    plant, model = desktop_plant(name), nominal_model(desktop_plant(name))
     tries = [
         try_starts(plant, model, starts=50 if quick else STARTS, seed=seed + TRY_SEED)
         for seed in (SEEDS[:1] if quick else SEEDS)
     ]
     case = f"learned/{name}/analytic"
     errors = errors_along(plant, model, test_motions(plant, seed=0))
-    rows = _of_tries(case, tries, "likewise, by the maker's sizes", None)
+    rows = _of_tries(case, tries, "likewise, by the nominal sizes", None)
     rows += [Row(case, f"{key}_median", value) for key, value in errors._asdict().items()]
     return Findings(rows)
 
@@ -94,5 +94,5 @@ def cases(quick: bool) -> dict[str, Callable[[], Findings]]:
     for name in PLANTS:
         for model in LEARNED:
             found[f"learned/{name}-{model}"] = functools.partial(by_model, name, model, quick)
-        found[f"learned/{name}-analytic"] = functools.partial(by_maker, name, quick)
+        found[f"learned/{name}-analytic"] = functools.partial(by_nominal, name, quick)
     return found

@@ -1,6 +1,6 @@
 """How the gains of the desktop plants' swing-ups were chosen: drawn at random, by the analytic model alone.
 
-Each draw swings the plant up by two models, the analytic one with friction and the maker's without; kept are those that
+Each draw swings the plant up by two models, the analytic one with friction and the nominal without; kept are those that
 come up from every start by both, and the best of these from more starts. Starts and noise have seeds that no report
 uses, and what comes out is the same for every model, learned ones too.
 """
@@ -16,7 +16,7 @@ from dln_jax.control import EnergyGains
 from dln_jax.control.desktop_plants import DesktopPlant
 from dln_jax.control.outcomes import Outcomes, hanging_starts, outcomes
 from dln_jax.control.swing_up import SwingUpNumbers
-from dln_jax.control.swing_up_runs import model_of_maker, model_of_plant, motion_of
+from dln_jax.control.swing_up_runs import model_of_plant, motion_of, nominal_model
 from dln_jax.mechanics.dynamics import Dynamics
 
 SEED = 1_000_000
@@ -60,7 +60,7 @@ def _rank(candidate: Candidate, farthest: float) -> tuple[float, float, float]:
 
 
 def _tried(plant: DesktopPlant, numbers: list[SwingUpNumbers], starts: int, seed: int) -> list[Candidate]:
-    models = (model_of_plant(plant), model_of_maker(plant))
+    models = (model_of_plant(plant), nominal_model(plant))
     results = [_of_model(plant, model, numbers, starts, seed) for model in models]
     return [
         Candidate(

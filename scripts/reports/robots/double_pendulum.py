@@ -15,7 +15,7 @@ import numpy as np
 from dln_jax.data.encoders import smooth
 from dln_jax.data.schema import Trajectories, load
 from dln_jax.mechanics.equations import dynamics
-from dln_jax.metrics.measured_predictions import cut_stretches, predict_measured, valid_times
+from dln_jax.metrics.measured_predictions import cut_segments, predict_measured, valid_times
 from dln_jax.metrics.report import Row
 from scripts.reports.robots.double_pendulum_fits import (
     CUTOFF,
@@ -37,7 +37,7 @@ FINE, BASE = 30.0, 500.0
 TRIM = 0.3
 """s, that are left out at both ends of a recording."""
 HORIZON, EVERY = 2.2, 0.5
-"""s: predicted stretches, and from one start to the next."""
+"""s: predicted segments, and from one start to the next."""
 HELD_OUT = (("02", "11"), ("00", "12"), ("04", "13"), ("01", "05"), ("03", "13"))
 """Recordings of each split."""
 WAYS = ("least-squares", "chosen-scale", "low-passed", "stacked", "motions", "both")
@@ -99,9 +99,9 @@ def judged(found: Fitted, held: Logs, every: Logs) -> Numbers:
         parts = [filtered(off[data.trajectory == index]) for index in np.unique(data.trajectory)]
         return float(np.mean(np.concatenate(parts) ** 2 / variance))
 
-    stretches = cut_stretches(held.fine, round(HORIZON * RATE), every=round(EVERY * RATE))
-    predicted = predict_measured(*found, stretches, fitted=WINDOW)
-    times = valid_times(stretches, predicted, fitted=WINDOW, variance=every.fine.q.var(axis=0))
+    segments = cut_segments(held.fine, round(HORIZON * RATE), every=round(EVERY * RATE))
+    predicted = predict_measured(*found, segments, fitted=WINDOW)
+    times = valid_times(segments, predicted, fitted=WINDOW, variance=every.fine.q.var(axis=0))
     numbers = (
         error(held.coarse, lambda off: off),
         error(held.fine, low_passed),

@@ -42,7 +42,7 @@ def test_a_log_is_examined(log, tmp_path, capsys):
     assert "1600 samples of 4 trajectories, 1 joints" in said and "warning: accelerations by differences" in said
     folder = tmp_path / "check"
     assert (folder / "log.png").stat().st_size > 10_000
-    assert (folder / "page.txt").read_text().strip() in said
+    assert (folder / "report.txt").read_text().strip() in said
     findings = json.loads((folder / "findings.json").read_text())["findings"]
     assert [each["check"] for each in findings] == ["raw-differences"]
     assert 3 < json.loads((folder / "metrics.json").read_text())["cutoff_hz"] < 30
@@ -55,7 +55,7 @@ def test_a_log_with_an_error_ends_with_status_1_and_a_whole_page(log, tmp_path, 
     with pytest.raises(SystemExit) as exit_:
         command(check_data, "--data", tmp_path / "degrees.npz", "--out", tmp_path / "check")
     assert exit_.value.code == 1
-    assert "error: q of joint 1 goes to" in (tmp_path / "check" / "page.txt").read_text()
+    assert "error: q of joint 1 goes to" in (tmp_path / "check" / "report.txt").read_text()
     assert {each.name for each in (tmp_path / "check").iterdir()} >= {"findings.json", "metrics.json", "log.png"}
 
 
@@ -103,10 +103,10 @@ def test_joints_of_a_gripper_are_held(log, tmp_path, capsys):
     robot = tmp_path / "robot.urdf"
     robot.write_text(f'<robot name="robot"><link name="ground"/>{links}{joints}</robot>')
     given = ["--data", log, "--robot", robot, "--no-figures"]
-    assert "--hold NAME,NAME" in refused(capsys, check_data, *given, "--out", tmp_path / "all")
-    command(check_data, *given, "--hold", "*finger*", "--out", tmp_path / "held")
+    assert "--lock NAME,NAME" in refused(capsys, check_data, *given, "--out", tmp_path / "all")
+    command(check_data, *given, "--lock", "*finger*", "--out", tmp_path / "held")
     assert "robot: the motions determine" in capsys.readouterr().out
-    assert "--hold is for joints of --robot" in refused(capsys, check_data, "--data", log, "--hold", "finger")
+    assert "--lock is for joints of --robot" in refused(capsys, check_data, "--data", log, "--lock", "finger")
 
 
 @pytest.mark.parametrize(

@@ -17,5 +17,5 @@ def test_every_subject_has_cases():
     assert {case.name.split("/")[0] for case in cases()} == set(control_report.SUBJECTS)
 
 
-def test_poles_come_up_in_a_laboratory_from_encoders_alone():
+def test_poles_come_up_on_hardware_from_encoders_alone():
     assert success(SWING_UPS["rotary-pendulum"], 8, seconds=3.0).share == 1

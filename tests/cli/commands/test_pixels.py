@@ -163,13 +163,13 @@ def test_loss_by_hand(relative):
     found = terms(oscillator(scale), {"factor": jnp.array([factor])}, jnp.asarray(frames), relative)
     x, following = frames[:, :-1, 0], frames[:, 1:, 0]
     q, p = scale * x, scale * factor * (following - x)
-    picture = (0 + ((q + 1.5 * p) / scale - following) ** 2) / 2
+    image = (0 + ((q + 1.5 * p) / scale - following) ** 2) / 2
     angle = 0.2 * np.arange(4)
     moved = q[:, :1] * np.cos(angle) + p[:, :1] * np.sin(angle) / 0.2
     pushed = p[:, :1] * np.cos(angle) - 0.2 * q[:, :1] * np.sin(angle)
     change = p[:, :-1] - np.diff(q, axis=1)
     sizes = (np.mean([x.var(), following.var()]), q.var(), p.var()) if relative else (1.0, 1.0, 1.0)
-    np.testing.assert_allclose(found.autoencoder, picture.mean() / sizes[0], rtol=1e-9)
+    np.testing.assert_allclose(found.autoencoder, image.mean() / sizes[0], rtol=1e-9)
     np.testing.assert_allclose(found.coordinate, np.mean(change**2) / sizes[2], rtol=1e-9)
     by_hand = np.mean((moved - q)[:, 1:] ** 2) / sizes[1] + np.mean((pushed - p)[:, 1:] ** 2) / sizes[2]
     np.testing.assert_allclose(found.field, by_hand / 2, rtol=1e-4)
@@ -178,14 +178,14 @@ def test_loss_by_hand(relative):
     np.testing.assert_allclose(total, 2 * found[0] + 3 * found[1] + 5 * found[2], rtol=1e-9)
 
 
-def test_windows_are_stretches_of_one_trajectory():
+def test_windows_are_segments_of_one_trajectory():
     frames = np.arange(2 * 7).reshape(2, 7, 1).astype(np.float32)
     np.testing.assert_array_equal(windows(frames, 3)[..., 0], [[0, 1, 2], [3, 4, 5], [7, 8, 9], [10, 11, 12]])
 
 
 @pytest.fixture(scope="module")
 def untrained(data):
-    """A small network for pictures of the data, and its parameters."""
+    """A small network for images of the data, and its parameters."""
     field = latent_field("black-box-hnn", width=6, depth=1)
     model = make_latent_phase(field, np.tile(data.frames.mean((0, 1)), 2), framewise=True, width=6)
     return model, jax.jit(model.init)(jax.random.key(0))
@@ -214,7 +214,7 @@ def test_autoencoders_read_two_frames(data, framewise):
         assert abs(q_moved - q) > 1e-6 and abs(q_swapped - q - p) > 1e-6
 
 
-def test_components_keep_the_pictures(data):
+def test_components_keep_the_images(data):
     components = principal_components(data.frames, 12)
     np.testing.assert_allclose(components.basis @ components.basis.T, np.eye(12), atol=1e-12)
     coefficients = compress(components, data.frames)
@@ -296,8 +296,8 @@ def test_end_to_end_with_a_tiny_budget(tmp_path, monkeypatch):
     (written,) = pixel_task.draw_pixels({"phase-network": seen}, data, tmp_path)
     assert written.name == "pixels.gif" and written.stat().st_size > 1000
     # The other kind has the same autoencoder, and an energy.
-    descriptions = (pixel_task.picture_description(name, seen.components) for name in pixel_task.MODELS[::-1])
-    same, energetic = (pixel_task.picture_models(each, seen.components)[0] for each in descriptions)
+    descriptions = (pixel_task.image_description(name, seen.components) for name in pixel_task.MODELS[::-1])
+    same, energetic = (pixel_task.image_models(each, seen.components)[0] for each in descriptions)
     shapes = [jax.tree.map(jnp.shape, jax.eval_shape(model.init, jax.random.key(0))) for model in (same, energetic)]
     assert shapes[0]["decoder"] == shapes[1]["decoder"] and shapes[0]["encoder"] == shapes[1]["encoder"]
 
@@ -319,7 +319,7 @@ def test_a_run_resumes_and_loads(tmp_path, monkeypatch, capsys):
     (tmp_path / "run" / "model.safetensors").unlink()
     command(train_hnn_pixels, "--out", str(tmp_path / "run"), "--resume", "--no-figures")
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == stored
-    system = load(tmp_path / "run").pictures
+    system = load(tmp_path / "run").images
     pair = pixel_task.pixel_data().test.pairs[0, 0]
     q, p = system.encode(pair)
     assert system.decode(q, p).shape == pair.shape and isinstance(system.field, PlainFlow)
@@ -373,7 +373,7 @@ def test_mistakes_are_named(data, untrained, tmp_path):
         ),
         (
             lambda: animations.write_frame_gif(tmp_path / "a.gif", {"hnn": frames[0, :2, :5]}, np.zeros(2)),
-            "pictures have 5 pixels",
+            "images have 5 pixels",
         ),
     ]
     for call, message in refused:

@@ -17,7 +17,7 @@ from dln_jax.mechanics.friction import joint_dissipation
 from dln_jax.mechanics.residual import Residual, with_residual
 from dln_jax.mechanics.trees import dh_frames, inertial_parameters, serial, tree_system
 from dln_jax.training.dynamics.methods import learned_tree
-from dln_jax.training.dynamics.model_selection import climb_ladder
+from dln_jax.training.dynamics.model_selection import train_selected
 from dln_jax.training.dynamics.planning import check_options
 from dln_jax.training.dynamics.recorded import read
 from dln_jax.types import InputError
@@ -61,14 +61,14 @@ def sprung_states():
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory):
-    """Logs of the arm with and without the spring, its file with other masses, and a sketch of it."""
-    folder = tmp_path_factory.mktemp("ladder")
+    """Logs of the arm with and without the spring, its file with other masses, and a kinematic prior of it."""
+    folder = tmp_path_factory.mktemp("selection")
     np.savez(folder / "rigid.npz", **motions())
     np.savez(folder / "spring.npz", **sprung_states())
     free = np.tile([-np.inf, np.inf], (2, 1))
     rough = ARM._replace(inertias=0.8 * ARM.inertias)
     (folder / "arm.xml").write_text(mjcf(Robot(rough, np.zeros(2), np.zeros(2), free, free)))
-    (folder / "sketch.json").write_text(json.dumps({"dh_rows": ROWS, "angle_degrees": 10}))
+    (folder / "prior.json").write_text(json.dumps({"dh_rows": ROWS, "angle_degrees": 10}))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield folder
@@ -77,10 +77,10 @@ def workplace(tmp_path_factory):
 def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workplace, capsys):
     pytest.importorskip("mujoco")
     given = train_delan.Arguments(model="auto", data=Path("rigid.npz"), robot=Path("arm.xml"), velocity_scale=0.01)
-    task, training = climb_ladder(given, read(given), workplace, mesh=None)
-    said, stored = capsys.readouterr().out, json.loads((workplace / "ladder.json").read_text())
+    task, training = train_selected(given, read(given), workplace, mesh=None)
+    said, stored = capsys.readouterr().out, json.loads((workplace / "model_selection.json").read_text())
     assert stored["kept"] == task.kind == "rigid-tree" and "are the noise" in stored["ended"]
-    assert "│ rigid-tree " in said and [rung["tried"] for rung in stored["rungs"]].count(True) == 1
+    assert "│ rigid-tree " in said and [candidate["tried"] for candidate in stored["candidates"]].count(True) == 1
     found = dynamics(build(task.description).energies(training.parameters))
     state = (np.array([0.3, -0.5]), np.array([0.7, 0.4]), np.array([1.0, -2.0]))
     np.testing.assert_allclose(found.inverse_dynamics(*state), dynamics(RUBBED).inverse_dynamics(*state), atol=0.05)
@@ -90,27 +90,42 @@ def test_the_tree_of_a_robot_is_kept_where_it_explains_all_but_the_noise(workpla
 def test_a_potential_of_no_rigid_body_is_found_by_the_basis_that_has_it(workplace, capsys):
     needs = ("--needs", PLAIN)
     command(train_delan, "--model", "auto", "--data", "spring.npz", *needs, "--out", "spring", *QUIET)
-    stored = json.loads((workplace / "spring" / "ladder.json").read_text())
+    stored = json.loads((workplace / "spring" / "model_selection.json").read_text())
     assert stored["kept"] == "trigonometric" and stored["ended"] == "trigonometric is exact"
-    assert len(stored["rungs"][0]["validation_nmse_joints"]) == 2
+    assert len(stored["candidates"][0]["validation_nmse_joints"]) == 2
     assert "trigonometric: validation nMSE" in capsys.readouterr().out
     config = json.loads((workplace / "spring" / "config.json").read_text())
     assert len(config["chosen"]["validation_units"]) == 2 and config["model"] == "auto"
     assert load(workplace / "spring").description["name"] == "trigonometric"
 
 
-def test_a_sketch_and_parents_reach_the_search(workplace, capsys, monkeypatch):
+def test_a_kinematic_prior_and_parents_reach_the_search(workplace, capsys, monkeypatch):
     seen = {}
 
     def searched(*data, parents, settings, velocity_scale, **others):
-        seen.update(parents=tuple(parents), sketch=settings.sketch, angle=settings.sketch_angle, scale=velocity_scale)
+        seen.update(
+            parents=tuple(parents),
+            kinematic_prior=settings.kinematic_prior,
+            angle=settings.prior_angle,
+            scale=velocity_scale,
+        )
         raise InputError("seen")
 
     monkeypatch.setattr(learned_tree, "fit_tree", searched)
-    options = (*TREE, "--needs", PLAIN, "--velocity-scale", "0.02", "--sketch", "sketch.json", "--parents", "0,1")
-    assert "seen" in refused(capsys, train_delan, *options, "--out", "sketched")
+    options = (
+        *TREE,
+        "--needs",
+        PLAIN,
+        "--velocity-scale",
+        "0.02",
+        "--kinematic-prior",
+        "prior.json",
+        "--parents",
+        "0,1",
+    )
+    assert "seen" in refused(capsys, train_delan, *options, "--out", "near")
     assert seen["parents"] == (-1, 0) and seen["scale"] == 0.02
-    np.testing.assert_allclose(seen["sketch"].rotations, ARM.rotations, atol=1e-12)
+    np.testing.assert_allclose(seen["kinematic_prior"].rotations, ARM.rotations, atol=1e-12)
     assert seen["angle"] == pytest.approx(np.radians(10))
 
 
@@ -126,9 +141,9 @@ def test_one_trajectory_is_cut_into_blocks_of_time(workplace):
 
 
 MISTAKES = {
-    "width": ((*AUTO, "--width", "4"), "the ladder chooses by validation"),
-    "degree": ((*AUTO, "--degree", "2"), "the ladder chooses by validation"),
-    "hold": ((*AUTO, "--hold", "x"), "--hold is for joints of --robot"),
+    "width": ((*AUTO, "--width", "4"), "model selection chooses by validation"),
+    "degree": ((*AUTO, "--degree", "2"), "model selection chooses by validation"),
+    "lock": ((*AUTO, "--lock", "x"), "--lock is for joints of --robot"),
     "robot of a network": (
         ("--model", "structured-delan", "--data", "rigid.npz", "--robot", "arm.xml"),
         "--robot is for --model auto",
@@ -139,8 +154,8 @@ MISTAKES = {
         ("--data", "rigid.npz", "--width", "4", "--parents", "0,1"),
         "--parents is for --model auto",
     ),
-    "sketch that is not there": ((*TREE, "--sketch", "none.json"), "none.json: no such file"),
-    "sketch of something else": ((*TREE, "--sketch", "wrong.json"), "wrong.json: expected"),
+    "kinematic prior that is not there": ((*TREE, "--kinematic-prior", "none.json"), "none.json: no such file"),
+    "kinematic prior of something else": ((*TREE, "--kinematic-prior", "wrong.json"), "wrong.json: expected"),
     "scale": ((*AUTO, "--velocity-scale", "-1"), "velocity_scale is -1"),
     "scale without friction": (
         (*TREE, "--velocity-scale", "0.1", "--needs", '{"joints": ["revolute", "revolute"]}'),

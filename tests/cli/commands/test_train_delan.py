@@ -229,7 +229,7 @@ MISTAKES = {
     ),
     "mark that has a square": (arrays(tau=marked(9.96921e36)), [], "up to 1.0e+37 where half are below"),
     "tiny torque": (arrays(tau=np.full((20, 2), 1e-170)), [], "squares vanish"),
-    "degree": (arrays(), ["--degree", "2"], "the ladder chooses by validation"),
+    "degree": (arrays(), ["--degree", "2"], "model selection chooses by validation"),
     "degree of a network": (
         arrays(),
         ["--model", "structured-delan", "--degree", "2"],
@@ -244,7 +244,7 @@ MISTAKES = {
         ["--model", "feed-forward", "--objective", "forward"],
         "feed-forward model has no energy",
     ),
-    "objective of the ladder": (
+    "objective of model selection": (
         arrays(),
         ["--model", "auto", "--objective", "both"],
         "choose a --model",

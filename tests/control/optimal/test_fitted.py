@@ -7,13 +7,13 @@ import pytest
 
 from dln_jax.control import lqr
 from dln_jax.control.optimal.action_costs import limited_atan, quadratic
-from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.boxes import drawn, widened
 from dln_jax.control.optimal.fitted import Iteration, fit_value, fit_values
 from dln_jax.control.optimal.flow import flow
 from dln_jax.control.optimal.problem import ControlProblem, optimal_control
 from dln_jax.control.optimal.targets import targets
 from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.types import InputError
 
 PENDULUM = ControlProblem(
@@ -70,7 +70,7 @@ def test_the_value_of_a_line_and_of_the_worst_of_lines(share):
     """dx/dt = p x + u with p off by a share: the worst is always the larger p."""
     numbers = Iteration(iterations=25, starts=64, seconds=0.5, dt=0.025, steps=40, batch=64, kept=2, learning_rate=0.05)
     network = value_network(LINE, widths=())
-    worst = adversary(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share))
+    worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=share))
     found = fit_value(LINE, network, numbers=numbers, double=True, disturbance=worst if share else None)
     S = lqr([[0.9 + share]], [[1.0]], [[0.5]], [[0.5]]).S[0, 0]
     V, slope = network.value_and_gradient(found.parameters, jnp.array([1.5]))

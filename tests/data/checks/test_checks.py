@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dln_jax.data import schema
-from dln_jax.data.checks import as_recording, examine, page, quick, read
+from dln_jax.data.checks import as_recording, examine, quick, read, report
 from dln_jax.data.checks.energies import OF_BODY, STRONGEST, WEAKEST, covariances
 from dln_jax.data.checks.evidence import Explanation
 from dln_jax.data.checks.hypotheses import decisive
@@ -221,7 +221,7 @@ def test_a_clean_log_suits_its_robot(clean):
     assert abs(on_tree.torques.likely_delay) < 0.2
     assert on_tree.torques.coulomb == pytest.approx([0.8, 0.8, 0.15], rel=0.15)
     assert 0 < on_tree.rank < on_tree.parameters and 1 < on_tree.condition < 1000
-    assert "nothing was found" in page(examined, "log.npz")
+    assert "nothing was found" in report(examined, "log.npz")
 
 
 @pytest.mark.parametrize("name", TREE_FAULTS)

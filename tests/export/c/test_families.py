@@ -272,13 +272,11 @@ def test_pictures_have_their_networks_and_the_steps_of_their_latent_phase():
     functions = {name: jax.jit(function) for name, (function, _) in functions_of_run(run, precision="f64").items()}
     frames, dt = jnp.linspace(0, 1, 12), jnp.array(DT)
     q, p = functions["encode"](frames).values()
-    np.testing.assert_allclose((q, p), run.pictures.encode(frames))
-    np.testing.assert_allclose(functions["decode"](q, p)["frames"], run.pictures.decode(q, p))
-    np.testing.assert_allclose([*functions["rates"](q, p).values()], run.pictures.field.rates(q, p))
+    np.testing.assert_allclose((q, p), run.images.encode(frames))
+    np.testing.assert_allclose(functions["decode"](q, p)["frames"], run.images.decode(q, p))
+    np.testing.assert_allclose([*functions["rates"](q, p).values()], run.images.field.rates(q, p))
     got = functions["phase_step_rk4"](q, p, dt)
-    for key, wanted in zip(
-        got, integrators.rk4(lambda t, x: run.pictures.field.rates(*x))(0.0, (q, p), dt), strict=True
-    ):
+    for key, wanted in zip(got, integrators.rk4(lambda t, x: run.images.field.rates(*x))(0.0, (q, p), dt), strict=True):
         np.testing.assert_allclose(got[key], wanted, rtol=1e-12)
 
 

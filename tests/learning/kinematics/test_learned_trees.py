@@ -53,11 +53,13 @@ def test_an_arm_is_found_down_to_the_noise():
 
 
 @pytest.mark.slow
-def test_from_a_sketch_a_sliding_arm_is_found():
+def test_from_a_kinematic_prior_a_sliding_arm_is_found():
     data = lip_trajectories(SLIDING, noise=NOISE, every=60)
     exact = Frames(SLIDING.tree.rotations, SLIDING.tree.positions)
-    sketch = rough_frames(exact, np.random.default_rng(0), angle=0.3, length=0.02)
-    fit = fit_tree(data.needs, data, settings=SETTINGS._replace(sketch=sketch, sketch_angle=0.2), **SHARP)
+    kinematic_prior = rough_frames(exact, np.random.default_rng(0), angle=0.3, length=0.02)
+    fit = fit_tree(
+        data.needs, data, settings=SETTINGS._replace(kinematic_prior=kinematic_prior, prior_angle=0.2), **SHARP
+    )
     assert np.sqrt(fit.joint_mse).max() < 1.2 * NOISE
     assert np.isnan(fit.validation_error)
     assert root_mean_square(SLIDING, fit, data.needs) < NOISE

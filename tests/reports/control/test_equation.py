@@ -16,7 +16,7 @@ def test_a_limit_that_is_far_away_does_not_count():
     assert limited_value(5.0) > 3 * THETA[0] * 25
 
 
-def test_the_adversary_moves_the_published_pendulum():
+def test_the_worst_disturbance_moves_the_published_pendulum():
     problem, x, u = PLANTS["pendulum"]().problem, jnp.array([0.3, -1.0]), jnp.array([0.8])
     of_model, itself = jax.jit(lambda x, u: (rates(problem)(x, u), rod(x, u, jnp.ones(2))))(x, u)
     np.testing.assert_allclose(itself, of_model, rtol=1e-12)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from dln_jax.control import Gains, Problem, Reference, feed_forward, first_plan
-from dln_jax.control import receding as predicting
+from dln_jax.control import mpc as predicting
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.scenes.rotary_pendulum import rotary_pendulum
-from scripts.reports.control import arm_loop, laws_in_c, receding, tracking
+from scripts.reports.control import arm_loop, laws_in_c, mpc, tracking
 from scripts.reports.robots.arm import Motion
 
 
@@ -39,11 +39,11 @@ def test_laws_agree(tmp_path):
 
 
 def test_the_carts_friction_is_that_of_each_joint():
-    scene, qd = receding.scene(), jnp.array([2.0, 3.0])
+    scene, qd = mpc.scene(), jnp.array([2.0, 3.0])
     friction = dynamics(scene.energies).friction(jnp.zeros(2), qd)
     np.testing.assert_allclose(friction, [0.1 * 2.0, 1e-3 * 3.0], rtol=1e-12)
-    drawn = receding.starts(2000)
-    np.testing.assert_allclose(drawn.mean(axis=0), receding.HANGING, atol=0.02)
+    drawn = mpc.starts(2000)
+    np.testing.assert_allclose(drawn.mean(axis=0), mpc.HANGING, atol=0.02)
     np.testing.assert_allclose(drawn.var(axis=0), [1e-3, 5e-2, 1e-6, 1e-6], rtol=0.15)
 
 

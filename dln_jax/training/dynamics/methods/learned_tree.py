@@ -42,11 +42,15 @@ def plan(given: Options, kind: str, recorded: Recorded, objective: Objective) ->
 
 def fit(task: Task, given: Options, folder: Path, mesh: Mesh | None) -> tuple[Task, Training]:
     """Joint frames by Gauss-Newton from random starts, or near the stated kinematics; all else by elimination."""
-    needs, sketch = needs_of_tree(task.needs), task.recorded.sketch
+    needs, kinematic_prior = needs_of_tree(task.needs), task.recorded.kinematic_prior
     near = (
         {}
-        if sketch is None
-        else {"sketch": sketch.frames, "sketch_angle": sketch.angle, "sketch_length": sketch.length}
+        if kinematic_prior is None
+        else {
+            "kinematic_prior": kinematic_prior.frames,
+            "prior_angle": kinematic_prior.angle,
+            "prior_length": kinematic_prior.length,
+        }
     )
     solution = fit_tree(
         needs,

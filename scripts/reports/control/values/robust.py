@@ -1,4 +1,4 @@
-"""What a value that is trained against an adversary gains on plants that are not the model, and what that costs."""
+"""Gains and costs of training a value against the worst disturbance, on plants that differ from the model."""
 
 import jax
 import jax.numpy as jnp
@@ -6,18 +6,18 @@ import numpy as np
 from jax import Array
 
 from dln_jax.control.balance import Law
-from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.evaluation import Returns, evaluate, starts
 from dln_jax.control.optimal.plants import PLANTS
 from dln_jax.control.optimal.policy import hjb_policy
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.residual import fit_residual
 from dln_jax.control.optimal.value_networks import value_network
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.metrics.report import Row
 from scripts.reports.case import Findings
 
 SHARE = 0.15
-"""Of mass and length, by which the adversary moves them."""
+"""Of mass and length, by which the worst disturbance moves them."""
 FACTORS = {"model": (1.0, 1.0), "heavy_and_long": (1.15, 1.15), "far": (1.3, 1.15)}
 """On mass and length, of the plants that are tried; the last is beyond what was trained for."""
 
@@ -29,7 +29,7 @@ def rod(x: Array, u: Array, p: Array) -> Array:
 
 
 def pendulum(quick: bool) -> Findings:
-    """Returns and successes of downward starts on other pendulums, by the equation with an adversary and without."""
+    """Returns and successes of downward starts on other pendulums, with and without the worst disturbance."""
     case, seeds, plant = "equation/robust", 1 if quick else 3, PLANTS["pendulum"]()
     x, rows = starts(plant, "down", 20 if quick else 100), []
     for name, share in (("trusting", 0.0), ("robust", SHARE)):
@@ -41,13 +41,13 @@ def pendulum(quick: bool) -> Findings:
 
 
 def trained(problem: ControlProblem, share: float, seed: int, quick: bool) -> Law:
-    """The law of a value from the equation, against an adversary that moves mass and length by a share."""
+    """The law of a value from the equation, against the worst disturbance that moves mass and length by a share."""
     network = value_network(problem, widths=(8, 8) if quick else (16, 16), scale=30.0)
     of_parameters, of_samples = jax.random.split(jax.random.key(seed))
     fit = fit_residual(
         problem, network.value_and_gradient, network.init(of_parameters), of_samples,
         samples=512 if quick else 2048, iterations=5 if quick else 15, rounds=6,
-        disturbance=adversary(rod, [1.0, 1.0], Bounds(parameters=share)) if share else None,
+        disturbance=worst_disturbance(rod, [1.0, 1.0], Bounds(parameters=share)) if share else None,
     )  # fmt: skip
     return hjb_policy(lambda x: network.value_and_gradient(fit.parameters, x), problem)
 

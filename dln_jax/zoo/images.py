@@ -25,18 +25,18 @@ MOST_NUMBERS = 10**8
 """Largest number of entries in the basis of principal components."""
 
 
-class PictureModel(NamedTuple):
+class ImageModel(NamedTuple):
     """A parametric model of images and their latent plane."""
 
     init: Callable[[Array], Any]
     """Random key -> {"parameters": of the networks, "components": mean, basis and scale of the components}."""
-    pictures: Callable[[Any], LatentPhase]
+    images: Callable[[Any], LatentPhase]
     """Parameters -> functions of two successive images [2 n]."""
     of_coefficients: Callable[[float], LatentModel]
     """Typical coefficient -> the model of the components' coefficients, which is the one trained."""
 
 
-def make_picture_model(
+def make_image_model(
     *,
     field: Field,
     pixels: int,
@@ -48,7 +48,7 @@ def make_picture_model(
     activation: Activation = silu,
     momentum_scale: float = 0.2,
     dtype: DTypeLike = jnp.float32,
-) -> PictureModel:
+) -> ImageModel:
     """Makes a model of images that encodes each frame by its principal components.
 
     Args:
@@ -83,7 +83,7 @@ def make_picture_model(
         arrays = {name: jnp.ones(shape, dtype) for name, shape in shapes.items()}
         return {"parameters": unit.init(key), "components": arrays}
 
-    def pictures(parameters: Any) -> LatentPhase:
+    def images(parameters: Any) -> LatentPhase:
         stored = parameters["components"]
         scale = stored["scale"]
 
@@ -103,10 +103,10 @@ def make_picture_model(
             system.field,
         )
 
-    return PictureModel(init, pictures, of_coefficients)
+    return ImageModel(init, images, of_coefficients)
 
 
 def with_components(components: Components, parameters: Any, dtype: DTypeLike = jnp.float32) -> Any:
-    """The parameters of a `PictureModel`, from those of the model of its coefficients."""
+    """The parameters of a `ImageModel`, from those of the model of its coefficients."""
     arrays = {"mean": components.mean, "basis": components.basis, "scale": components.scale}
     return {"parameters": parameters, "components": {name: jnp.asarray(each, dtype) for name, each in arrays.items()}}

@@ -20,7 +20,7 @@ from jax import Array
 from dln_jax.types import InputError
 
 Disturbance = Callable[[Array, Array, Array], Array]
-"""(x, V_x, u) -> the change of dx/dt [n] due to an adversary."""
+"""(x, V_x, u) -> the change of dx/dt [n] due to the worst disturbance."""
 
 
 class Bounds(NamedTuple):
@@ -36,7 +36,7 @@ class Bounds(NamedTuple):
     """|xi_p| / |p|."""
 
 
-def adversary(
+def worst_disturbance(
     plant: Callable[[Array, Array, Array], Array],
     parameters: Any,
     bounds: Bounds,

@@ -6,7 +6,7 @@ import numpy as np
 
 from dln_jax.data.checks.channels import check_channels
 from dln_jax.data.checks.derivatives import check_derivatives
-from dln_jax.data.checks.findings import Finding, told
+from dln_jax.data.checks.findings import Finding, by_severity
 from dln_jax.data.checks.hypotheses import Torques, examine_torques
 from dln_jax.data.checks.recording import Recording, as_recording
 from dln_jax.data.checks.repaired import any_energy
@@ -76,8 +76,8 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         joints = robot.tree.joints
         if len(joints) != d:
             raise InputError(
-                f"the robot has {len(joints)} joints, but the data have {d}; hold those that do not move: "
-                "--hold NAME,NAME"
+                f"the robot has {len(joints)} joints, but the data have {d}; lock those that do not move: "
+                "--lock NAME,NAME"
             )
     findings = [*recording.repaired, *check_times(data)]
     data, repeats = without_repeats(data)
@@ -105,7 +105,7 @@ def examine(recording: Recording, robot: Robot | None = None, *, equations: int 
         farthest = 0 if even is None else _farthest(even)
         on_tree = against_tree(samples, robot, recording.names, driven=driven, farthest=farthest, equations=equations)
         findings += on_tree.findings
-    return Examination(told(findings), recording, even, regression, on_tree, step_of(recording.data.q))
+    return Examination(by_severity(findings), recording, even, regression, on_tree, step_of(recording.data.q))
 
 
 def plain(data: Trajectories) -> bool:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dln_jax.control.limited_horizon import Horizon, least_cost
+from dln_jax.control.constrained_lq import Horizon, least_cost
 
 N, n, m = 6, 3, 2
 RANDOM = np.random.default_rng(0)

@@ -10,7 +10,7 @@ GAP = 1.5
 """A step longer than this multiple of its trajectory's median step is a gap."""
 
 
-def stretches(
+def segments(
     t: Float[np.ndarray, " N"], trajectory: Int[np.ndarray, " N"], *, gap: float = GAP
 ) -> list[Int[np.ndarray, " n"]]:
     """Sample indices of the segments of all trajectories, cut at steps longer than `gap` times the median step.
@@ -42,9 +42,9 @@ def window_indices(data: Trajectories, length: int, *, gap: float = GAP) -> tupl
     if length < 2:
         raise InputError(f"length is {length}; expected a window of at least 2 samples")
     pieces = [
-        stretch[first : first + length]
-        for stretch in stretches(data.t, data.trajectory, gap=gap)
-        for first in range(0, len(stretch) - 1, length - 1)
+        segment[first : first + length]
+        for segment in segments(data.t, data.trajectory, gap=gap)
+        for first in range(0, len(segment) - 1, length - 1)
     ]
     if not pieces:
         raise InputError("there are no two samples without a gap between them; record longer motions")

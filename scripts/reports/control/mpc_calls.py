@@ -18,13 +18,13 @@ import jax
 import numpy as np
 
 from dln_jax.cli.running import run
-from dln_jax.control import first_plan, receding
+from dln_jax.control import first_plan, mpc
 from dln_jax.export.c.load import load_c
 from dln_jax.export.c.source import export_c
 from dln_jax.export.low_latency import enable_low_latency
 from dln_jax.mechanics.integrators import CLASSICAL, advance, runge_kutta
 from dln_jax.types import InputError
-from scripts.reports.control.receding import HANGING, RATE, cart_pole_problem, field, starts
+from scripts.reports.control.mpc import HANGING, RATE, cart_pole_problem, field, starts
 
 ROOT = Path(__file__).parents[3]
 """Where the package is, which the process is to import."""
@@ -81,7 +81,7 @@ def main(given: Arguments) -> None:
 
 def one_call(steps: int) -> Callable[..., Any]:
     """(x, u, states, K, damping) -> the control and the next four."""
-    act = receding(cart_pole_problem())
+    act = mpc(cart_pole_problem())
     plan = first_plan(cart_pole_problem(), HANGING, np.zeros((steps, 1)))
 
     def call(x: Any, u: Any, about: Any, K: Any, damping: Any) -> Any:
@@ -121,7 +121,7 @@ def timed(act: Callable[..., Any], first: tuple[Any, ...], loops: int, compile_s
 
 def calls_in_a_process(steps: int, loops: int) -> dict[str, Calls]:
     """What `main` prints, by "jax" and "c"; InputError where the process fails."""
-    command = [sys.executable, "-m", "scripts.reports.control.receding_calls"]
+    command = [sys.executable, "-m", "scripts.reports.control.mpc_calls"]
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD}"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip(), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -135,4 +135,4 @@ def calls_in_a_process(steps: int, loops: int) -> dict[str, Calls]:
 
 
 if __name__ == "__main__":
-    run(main, Arguments, prog="python -m scripts.reports.control.receding_calls")
+    run(main, Arguments, prog="python -m scripts.reports.control.mpc_calls")

@@ -1,4 +1,4 @@
-"""The ladder chooses the first rung that no other betters on validation motions, with every joint counted alike."""
+"""Model selection keeps the first candidate that no other betters on validation motions; every joint counts alike."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 
 from dln_jax.data.schema import from_arrays
 from dln_jax.data.splits import select
-from dln_jax.learning.ladder import Fitted, Rung, climb
+from dln_jax.learning.model_selection import Candidate, FittedModel, select_model
 from dln_jax.mechanics.natural import NaturalSystem
 from dln_jax.models.model import Model
 from dln_jax.types import InputError
@@ -23,9 +23,9 @@ TRAIN, VALIDATION = (select(from_arrays({**ARRAYS, **TIMES, "tau": TAU}), [index
 MASSES = Model(lambda key: jnp.ones(2), lambda masses: NaturalSystem(lambda q: jnp.diag(jnp.sqrt(masses))))
 
 
-def rung(name, *shares):
+def candidate(name, *shares):
     """Masses that are wrong by these factors."""
-    return Rung(name, lambda left: Fitted(MASSES, jnp.asarray(UNIT * shares)))
+    return Candidate(name, lambda left: FittedModel(MASSES, jnp.asarray(UNIT * shares)))
 
 
 def names(found, **wanted):
@@ -37,7 +37,7 @@ def refuse(left):
 
 
 def test_a_small_joint_counts_as_much_as_a_large_one():
-    found = climb([rung("large joint", 1.0, 3.0), rung("both, nearly", 1.1, 1.1)], TRAIN, VALIDATION)
+    found = select_model([candidate("large joint", 1.0, 3.0), candidate("both, nearly", 1.1, 1.1)], TRAIN, VALIDATION)
     assert found.chosen.name == "both, nearly"
     share = (NOISE**2 + (0.1 * UNIT) ** 2 * ARRAYS["qdd"][N:].var(axis=0)) / TAU[:N].var(axis=0)
     assert found.chosen.nmse is not None
@@ -45,36 +45,46 @@ def test_a_small_joint_counts_as_much_as_a_large_one():
 
 
 def test_of_equals_the_first_is_chosen_and_what_cannot_be_built_says_why():
-    rungs = [Rung("refused", refuse), Rung("absent", lambda left: "no arm"), rung("true", 1, 1), rung("same", 1.001, 1)]
+    candidates = [
+        Candidate("refused", refuse),
+        Candidate("absent", lambda left: "no arm"),
+        candidate("true", 1, 1),
+        candidate("same", 1.001, 1),
+    ]
     told = []
-    found = climb(rungs, TRAIN, VALIDATION, report=told.append)
+    found = select_model(candidates, TRAIN, VALIDATION, report=told.append)
     assert found.chosen.name == "true" and found.ended == "" and list(found.steps) == told
     assert [step.reason for step in found.steps] == ["too large a basis", "no arm", "", ""]
 
 
-def test_the_climb_ends_at_the_noise_and_not_where_that_is_overestimated():
-    rungs = [rung("wrong", 2, 2), rung("true", 1, 1), rung("further", 1, 1)]
-    found = climb(rungs, TRAIN, VALIDATION, noise=NOISE)
+def test_the_search_ends_at_the_noise_and_not_where_that_is_overestimated():
+    candidates = [candidate("wrong", 2, 2), candidate("true", 1, 1), candidate("further", 1, 1)]
+    found = select_model(candidates, TRAIN, VALIDATION, noise=NOISE)
     assert "true" in found.ended and names(found, tried=False) == ["further"]
-    assert not climb(rungs, TRAIN, VALIDATION, noise=3 * NOISE).ended
+    assert not select_model(candidates, TRAIN, VALIDATION, noise=3 * NOISE).ended
     exact = VALIDATION._replace(tau=UNIT * VALIDATION.qdd)
-    assert climb(rungs, TRAIN, exact).ended == "true is exact"
+    assert select_model(candidates, TRAIN, exact).ended == "true is exact"
 
 
 def test_out_of_time_the_first_that_can_be_fitted_is_kept():
-    found = climb([Rung("refused", refuse), rung("first", 1, 1), rung("second", 1, 1)], TRAIN, VALIDATION, seconds=1e-9)
+    found = select_model(
+        [Candidate("refused", refuse), candidate("first", 1, 1), candidate("second", 1, 1)],
+        TRAIN,
+        VALIDATION,
+        seconds=1e-9,
+    )
     assert found.chosen.name == "first" and found.ended == "time is out"
     assert found.steps[-1].reason == "time is out" and not found.steps[-1].tried
 
 
 @pytest.mark.parametrize(
-    ("rungs", "seconds", "message"),
+    ("candidates", "seconds", "message"),
     [
-        ([Rung("refused", refuse)], 1.0, "no model could be fitted: refused: too large a basis"),
-        ([rung("infinite", np.inf, 1)], 1.0, "not finite on validation motions"),
-        ([rung("true", 1, 1)], 0.0, "seconds is 0.0"),
+        ([Candidate("refused", refuse)], 1.0, "no model could be fitted: refused: too large a basis"),
+        ([candidate("infinite", np.inf, 1)], 1.0, "not finite on validation motions"),
+        ([candidate("true", 1, 1)], 0.0, "seconds is 0.0"),
     ],
 )
-def test_what_cannot_be_climbed_is_refused(rungs, seconds, message):
+def test_what_cannot_be_fitted_is_refused(candidates, seconds, message):
     with pytest.raises(InputError, match=message):
-        climb(rungs, TRAIN, VALIDATION, seconds=seconds)
+        select_model(candidates, TRAIN, VALIDATION, seconds=seconds)

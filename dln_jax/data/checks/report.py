@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from dln_jax.data.checks.doctor import Examination
+from dln_jax.data.checks.validation import Examination
 from dln_jax.data.encoders import sampling
 
 WIDTH = 10
 
 
-def page(examined: Examination, name: str) -> list[str]:
+def report(examined: Examination, name: str) -> list[str]:
     """Lines of text; findings come last, most severe first."""
     data = examined.recording.data
     count = len(np.unique(data.trajectory))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from dln_jax.control import Controller, Laboratory, Plan, Problem, error, first_plan, receding, simulate
+from dln_jax.control import Controller, Hardware, Plan, Problem, error, first_plan, mpc, simulate
 from dln_jax.control.state_space import Field, field_of
 from dln_jax.mechanics.equations import dynamics
 from dln_jax.mechanics.friction import joint_dissipation
@@ -82,7 +82,7 @@ def starts(count: int, seed: int = 0) -> np.ndarray:
 
 def controller(problem: Problem, steps: int) -> Controller:
     """Of the whole state; the plan is its memory, and first that of no force."""
-    act = receding(problem)
+    act = mpc(problem)
     waiting = first_plan(problem, HANGING, np.zeros((steps, 1)))
 
     def sample(plan: Plan, t: Array, y: Array) -> tuple[Plan, Array]:
@@ -95,10 +95,10 @@ def controller(problem: Problem, steps: int) -> Controller:
 def swing_ups(steps: int, count: int, seed: int = 0) -> np.ndarray:
     """Time from which on the pole is up and the cart on its rail, s, infinite where it is not, by start."""
     joints, plant, law = scene().needs.joints, field(), controller(cart_pole_problem(), steps)
-    lab = Laboratory(-LIMIT, LIMIT)
+    lab = Hardware(-LIMIT, LIMIT)
 
     def up(x: Array) -> Array:
-        run = simulate(plant, law, x, seconds=SECONDS, rate=RATE, controls=1, laboratory=lab, substeps=4)
+        run = simulate(plant, law, x, seconds=SECONDS, rate=RATE, controls=1, hardware=lab, substeps=4)
         off = jax.vmap(lambda x: error(x, np.zeros(4), joints)[1])(run.x)
         return (jnp.abs(off) < UP) & (jnp.max(jnp.abs(run.x[:, 0])) <= RAIL)
 

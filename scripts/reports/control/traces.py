@@ -57,7 +57,7 @@ def from_anywhere(case: SwingUp, quick: bool) -> Findings:
     x = np.zeros((50 if quick else ANYWHERE, 4))
     x[:, 1], x[:, 3] = random.uniform(-np.pi, np.pi, len(x)), random.uniform(-FASTEST, FASTEST, len(x))
     found = tried(case, x)
-    words = f"of {len(x)} starts at any angle of the pole and |rate| <= {FASTEST:g} rad/s, in a laboratory"
+    words = f"of {len(x)} starts at any angle of the pole and |rate| <= {FASTEST:g} rad/s, on simulated hardware"
     rows = rows_of_outcomes(f"starts/{case.scene.name}/known", found, words)
     return Findings(rows, {"angle": x[:, 1].tolist(), "rate": x[:, 3].tolist(), "seconds": found.seconds.tolist()})
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from dln_jax.metrics.report import Row, expect
 from scripts.reports.case import Findings
-from scripts.reports.control.receding import HORIZONS, RATE, swing_ups
-from scripts.reports.control.receding_calls import calls_in_a_process
+from scripts.reports.control.mpc import HORIZONS, RATE, swing_ups
+from scripts.reports.control.mpc_calls import calls_in_a_process
 
 STARTS, LOOPS = 30, 10
 """Of swing-ups, and of those whose calls are timed."""
@@ -18,7 +18,7 @@ def mpc(quick: bool) -> Findings:
     rows: list[Row] = []
     for seconds in HORIZONS[:1] if quick else HORIZONS:
         steps = round(seconds * RATE)
-        case, times = f"receding/{seconds:g}-s", swing_ups(steps, 2 if quick else STARTS)
+        case, times = f"mpc/{seconds:g}-s", swing_ups(steps, 2 if quick else STARTS)
         words, reached = f"of {len(times)} starts", times[np.isfinite(times)]
         rows.append(Row(case, "success_share", float(np.isfinite(times).mean()), expected=words))
         for quantity, of in (("median", np.median), ("worst", np.max)):

@@ -1,4 +1,4 @@
-"""No disturbance within its bounds makes the cost rise faster than the adversary's."""
+"""No disturbance within its bounds makes the cost rise faster than the worst disturbance's."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dln_jax.control.optimal.action_costs import quadratic
-from dln_jax.control.optimal.adversaries import Bounds, adversary
 from dln_jax.control.optimal.problem import ControlProblem
 from dln_jax.control.optimal.residual import fit_residual
+from dln_jax.control.optimal.worst_case import Bounds, worst_disturbance
 from dln_jax.types import InputError
 
 A, B = np.array([[0.0, 1.0], [2.0, -0.3]]), np.array([[0.0, 0.5], [1.5, 0.0]])
@@ -24,7 +24,7 @@ def plant(x, u, p):
 @pytest.mark.parametrize("slope", ([1.0, 2.0], [-0.3, 0.1], [0.0, -4.0]))
 def test_it_is_the_worst(slope):
     slope = jnp.asarray(slope)
-    worst = float(slope @ adversary(plant, P, BOUNDS)(X, slope, U))
+    worst = float(slope @ worst_disturbance(plant, P, BOUNDS)(X, slope, U))
     turns = np.linspace(0, 2 * np.pi, 400)
     directions = np.stack([np.cos(turns), np.sin(turns)])
     signs = np.abs(P)[:, None] * [[1, 1, -1, -1], [1, -1, 1, -1]]
@@ -37,15 +37,15 @@ def test_it_is_the_worst(slope):
 
 
 def test_without_a_slope_or_a_bound_it_does_nothing():
-    assert not np.any(adversary(plant, P, BOUNDS)(X, jnp.zeros(2), U))
-    assert not np.any(adversary(plant, P, Bounds())(X, jnp.ones(2), U))
+    assert not np.any(worst_disturbance(plant, P, BOUNDS)(X, jnp.zeros(2), U))
+    assert not np.any(worst_disturbance(plant, P, Bounds())(X, jnp.ones(2), U))
 
 
 def test_parameters_stay_where_they_make_sense():
-    change = adversary(plant, P, Bounds(parameters=0.5), least=[1.0, -1.0], most=[1.5, 0.0])
+    change = worst_disturbance(plant, P, Bounds(parameters=0.5), least=[1.0, -1.0], most=[1.5, 0.0])
     np.testing.assert_allclose(change(X, jnp.array([1.0, 1.0]), U), [(1.5 - 1.2) * 0.4, -0.2 * -1.0], rtol=1e-12)
     with pytest.raises(InputError, match="bound of action"):
-        adversary(plant, P, Bounds(action=-1.0))
+        worst_disturbance(plant, P, Bounds(action=-1.0))
 
 
 def test_a_robust_value_is_that_of_the_worst_plant():
@@ -53,7 +53,7 @@ def test_a_robust_value_is_that_of_the_worst_plant():
     line = ControlProblem(
         lambda x: x, lambda x: jnp.ones((1, 1)), lambda x: 0.5 * x @ x, quadratic(1.0), 0.0, [-5.0], [5.0], (), [0.0]
     )
-    worst = adversary(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=0.1))
+    worst = worst_disturbance(lambda x, u, p: p * x + u, [1.0], Bounds(parameters=0.1))
 
     fit = fit_residual(
         line, lambda theta, x: (theta * x[0] ** 2, 2 * theta * x), jnp.asarray(1.0), jax.random.key(0),

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dln_jax.data.schema import Trajectories
-from dln_jax.learning.growth import Trial, smallest_enough, stretches
+from dln_jax.learning.growth import Trial, segments, smallest_enough
 from dln_jax.learning.objectives import TORQUE, arrays, residuals, torque_scale
 from dln_jax.models.model import Model, Parameters
 from dln_jax.types import InputError, require_positive
@@ -28,7 +28,7 @@ LEAST_NOISE, MOST_NOISE = 0.5, 1.2
 error shows that the estimate of the noise is wrong."""
 
 
-class Fitted(NamedTuple):
+class FittedModel(NamedTuple):
     """A fitted candidate."""
 
     model: Model
@@ -37,19 +37,19 @@ class Fitted(NamedTuple):
     """Further results of the fit."""
 
 
-class Rung(NamedTuple):
+class Candidate(NamedTuple):
     """A candidate of the model selection."""
 
     name: str
-    fit: Callable[[float], Fitted | str]
+    fit: Callable[[float], FittedModel | str]
     """Remaining seconds -> the fitted model, or the reason why there is none. An InputError counts as a reason."""
 
 
-class Step(NamedTuple):
+class Assessment(NamedTuple):
     """A candidate and its validation errors."""
 
     name: str
-    fitted: Fitted | None
+    fitted: FittedModel | None
     errors: Float[np.ndarray, "S d"] | None
     """Normalised squared error of every segment of the validation motions, by joint; `None` without a model."""
     nmse: Float[np.ndarray, " d"] | None
@@ -62,30 +62,30 @@ class Step(NamedTuple):
     """Whether a fit was attempted."""
 
 
-class Climb(NamedTuple):
+class Selection(NamedTuple):
     """Result of a model selection: all candidates in order, tried or not."""
 
-    chosen: Step
-    fitted: Fitted
+    chosen: Assessment
+    fitted: FittedModel
     """The chosen candidate's model."""
-    steps: tuple[Step, ...]
+    steps: tuple[Assessment, ...]
     ended: str
     """Reason why no further candidate was tried; empty if all were."""
 
 
-def climb(
-    rungs: Sequence[Rung],
+def select_model(
+    candidates: Sequence[Candidate],
     train: Trajectories,
     validation: Trajectories,
     *,
     noise: Float[np.ndarray, " d"] | None = None,
     seconds: float = float("inf"),
-    report: Callable[[Step], None] = lambda step: None,
-) -> Climb:
+    report: Callable[[Assessment], None] = lambda step: None,
+) -> Selection:
     """Fits candidates in order and chooses the first that no other betters significantly.
 
     Args:
-        rungs: candidates, most structured first; of two equally good ones the first is chosen.
+        candidates: candidates, most structured first; of two equally good ones the first is chosen.
         train: samples to fit; the variances of their torques are the units of the errors.
         validation: other motions.
         noise: standard deviation of the joints' measured torques, N m or N, if known: the selection ends once the
@@ -99,14 +99,14 @@ def climb(
     require_positive(seconds=seconds)
     began, steps, ended = time.perf_counter(), [], ""
     scale = np.asarray(torque_scale(train))
-    for rung in rungs:
+    for candidate in candidates:
         since = time.perf_counter()
         left = seconds - (since - began)
         if ended or (left <= 0 and any(step.fitted for step in steps)):
             ended = ended or "time is out"
-            step = Step(rung.name, None, None, None, 0.0, ended, tried=False)
+            step = Assessment(candidate.name, None, None, None, 0.0, ended, tried=False)
         else:
-            step = _tried(rung, max(left, 1e-3), scale, train, validation)
+            step = _tried(candidate, max(left, 1e-3), scale, train, validation)
             ended = _ended(step, None if noise is None else (noise / scale) ** 2)
         steps.append(step)
         report(step)
@@ -118,7 +118,7 @@ def climb(
     if not trials or not np.isfinite(min(trial.validation for trial in trials)):
         raise InputError("no model could be fitted: " + "; ".join(f"{step.name}: {step.reason}" for step in steps))
     best = smallest_enough(trials)
-    return Climb(best.candidate, best.outcome, tuple(steps), ended)
+    return Selection(best.candidate, best.outcome, tuple(steps), ended)
 
 
 def torque_errors(
@@ -132,26 +132,26 @@ def torque_errors(
 
 
 def _tried(
-    rung: Rung, left: float, scale: Float[np.ndarray, " d"], train: Trajectories, validation: Trajectories
-) -> Step:
+    candidate: Candidate, left: float, scale: Float[np.ndarray, " d"], train: Trajectories, validation: Trajectories
+) -> Assessment:
     since = time.perf_counter()
     try:
-        fitted = rung.fit(left)
+        fitted = candidate.fit(left)
     except InputError as error:
         fitted = str(error)
     spent = time.perf_counter() - since
     if isinstance(fitted, str):
-        return Step(rung.name, None, None, None, spent, fitted)
+        return Assessment(candidate.name, None, None, None, spent, fitted)
     squares = torque_errors(fitted.model, fitted.parameters, validation, scale)
-    stretch = stretches(validation)
-    counts = np.bincount(stretch)
-    errors = np.stack([np.bincount(stretch, column) / counts for column in squares.T], axis=1)
+    segment = segments(validation)
+    counts = np.bincount(segment)
+    errors = np.stack([np.bincount(segment, column) / counts for column in squares.T], axis=1)
     if not np.isfinite(errors).all():
-        return Step(rung.name, None, None, None, spent, "its torques are not finite on validation motions")
-    return Step(rung.name, fitted, errors, squares.mean(axis=0), spent)
+        return Assessment(candidate.name, None, None, None, spent, "its torques are not finite on validation motions")
+    return Assessment(candidate.name, fitted, errors, squares.mean(axis=0), spent)
 
 
-def _ended(step: Step, share: Float[np.ndarray, " d"] | None) -> str:
+def _ended(step: Assessment, share: Float[np.ndarray, " d"] | None) -> str:
     """Returns the reason why no other candidate can be better, or an empty string."""
     if step.nmse is None:
         return ""

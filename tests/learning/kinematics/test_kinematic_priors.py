@@ -1,9 +1,9 @@
-"""A sketch in space gives the frames of the arm that it was drawn from, up to what torques do not show."""
+"""A kinematic prior in space gives the frames of the arm that it describes, up to what torques do not show."""
 
 import numpy as np
 import pytest
 
-from dln_jax.learning.kinematics import frames_of_axes, sketch_from_json
+from dln_jax.learning.kinematics import frames_of_axes, kinematic_prior_from_json
 from dln_jax.scenes.panda import panda
 from dln_jax.types import InputError
 
@@ -32,8 +32,10 @@ def test_json_has_axes_or_denavit_hartenberg_rows():
     axes, points = in_space((TREE.rotations, TREE.positions), TREE.parents)
     right = np.pi / 2
     rows = [[0, 0, 0.333, 0], [-right, 0, 0, 0], [right, 0, 0.316, 0]]
-    one = sketch_from_json({"axes": axes.tolist(), "points": points.tolist(), "angle_degrees": 10, "length": 0.1}, 3)
-    other = sketch_from_json({"dh_rows": rows}, 3)
+    one = kinematic_prior_from_json(
+        {"axes": axes.tolist(), "points": points.tolist(), "angle_degrees": 10, "length": 0.1}, 3
+    )
+    other = kinematic_prior_from_json({"dh_rows": rows}, 3)
     assert (one.angle, one.length) == (pytest.approx(np.radians(10)), 0.1)
     assert (other.angle, other.length) == (pytest.approx(np.radians(30)), 0.05)
     np.testing.assert_allclose(in_space(other.frames, TREE.parents), in_space(one.frames, TREE.parents), atol=1e-12)
@@ -53,6 +55,6 @@ AXES = {"axes": np.eye(3).tolist(), "points": np.zeros((3, 3)).tolist()}
         ({"dh_rows": np.zeros((3, 4)).tolist()}, BRANCHED, "one after the other"),
     ],
 )
-def test_what_is_no_sketch_is_refused(values, parents, message):
+def test_what_is_no_kinematic_prior_is_refused(values, parents, message):
     with pytest.raises(InputError, match=message):
-        sketch_from_json(values, 3, parents)
+        kinematic_prior_from_json(values, 3, parents)

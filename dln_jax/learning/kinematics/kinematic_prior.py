@@ -23,7 +23,7 @@ EXPECTED = (
 )
 
 
-class Sketch(NamedTuple):
+class KinematicPrior(NamedTuple):
     """Frames and their deviations."""
 
     frames: Frames
@@ -61,7 +61,7 @@ def frames_of_axes(
     return Frames(np.array(rotations), np.array(positions))
 
 
-def sketch_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> Sketch:
+def kinematic_prior_from_json(values: Any, d: int, parents: Sequence[int] | None = None) -> KinematicPrior:
     """Builds the prior of d joints from JSON values.
 
     Raises:
@@ -78,7 +78,7 @@ def sketch_from_json(values: Any, d: int, parents: Sequence[int] | None = None) 
         frames = Frames(*dh_frames(rows["dh_rows"]))
     else:
         frames = frames_of_axes(rows["axes"], rows["points"], parents)
-    return Sketch(frames, float(np.radians(rough["angle_degrees"])), rough["length"])
+    return KinematicPrior(frames, float(np.radians(rough["angle_degrees"])), rough["length"])
 
 
 def _rows(name: str, given: Any, d: int) -> np.ndarray:
