@@ -8,6 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
@@ -34,14 +35,17 @@ TRAIL = 25
 """Frames of a trace."""
 
 
-def sampled(motion: np.ndarray, frames: int) -> np.ndarray:
+def sampled(motion: ArrayLike, frames: int) -> np.ndarray:
     """Returns as many samples of a motion [T, ...] as there are frames, evenly spaced."""
-    return np.asarray(motion)[np.linspace(0, len(motion) - 1, frames).round().astype(int)]
+    values = np.asarray(motion)
+    return values[np.linspace(0, len(values) - 1, frames).round().astype(int)]
 
 
 def writing_arm(frames: int) -> Film:
     """The true arm writes a letter under torques of a DeLaN, with weak feedback beside them."""
     scene = two_link_arm()
+    tip = scene.tip
+    assert tip is not None
     sets = split(default_data(scene)._replace(needs=scene.needs), test=("e", "q", "v"))
     model = make_delan(scene.needs, width=8, depth=2, activation=tanh, dtype=jnp.float64)
     training = fit(torque_problem(model, sets), GaussNewton(steps=60))
@@ -58,8 +62,8 @@ def writing_arm(frames: int) -> Film:
     start = jnp.asarray(reference[0][0]), jnp.asarray(reference[1][0])
     q = np.asarray(jax.jit(lambda start: rollout(rk4(second_order(accelerate)), start, t))(start)[0])
     elbow = LINK_LENGTH * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
-    joints = sampled(np.stack([0 * elbow, elbow, np.asarray(jax.vmap(scene.tip)(q))], axis=1), frames)
-    path = np.asarray(jax.vmap(scene.tip)(reference[0]))
+    joints = sampled(np.stack([0 * elbow, elbow, np.asarray(jax.vmap(tip)(q))], axis=1), frames)
+    path = np.asarray(jax.vmap(tip)(reference[0]))
 
     def prepare(axis: Axes) -> Callable[[int], None]:
         axis.plot(*path.T, color="0.85", linewidth=5)
@@ -83,7 +87,9 @@ def three_bodies(frames: int) -> Film:
     sets = hold_out(task.train.data, 0.1, seed=0)
     training = fit(rate_problem(model, *sets), GaussNewton(steps=80))
     learned = flow(model.energies(training.parameters))
-    start = jnp.asarray(task.test.clean.q[0]), jnp.asarray(task.test.clean.p[0])
+    clean = task.test.clean
+    assert clean.p is not None
+    start = jnp.asarray(clean.q[0]), jnp.asarray(clean.p[0])
     step = gauss_legendre4(lambda t, state: learned.rates(*state))
     q, _ = jax.jit(lambda start: rollout(step, start, jnp.linspace(0, 12, 1201)))(start)
     places = sampled(q, frames).reshape(frames, 3, 2)
