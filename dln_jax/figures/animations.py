@@ -26,13 +26,13 @@ def write_gif(
     path: Path,
     figure: Figure,
     show: Callable[[int], None],
-    t: Float[np.ndarray, " times"],
+    t: Float[np.ndarray, " times"] | None,
     *,
     frames: range,
     frames_per_second: float,
     title: str = "",
 ) -> None:
-    """Writes a GIF by calling `show(frame)` for every frame, with the title and the time t[frame] in s above.
+    """Writes a GIF by calling `show(frame)` for every frame, with the title and, unless `None`, the time t[frame] in s.
 
     Raises:
         InputError: the file cannot be written; it is written completely or not at all.
@@ -44,7 +44,7 @@ def write_gif(
         with writer.saving(figure, str(written), DPI):
             for frame in frames:
                 show(frame)
-                heading.set_text(f"{title}  t = {t[frame]:5.2f} s".strip())
+                heading.set_text(title if t is None else f"{title}  t = {t[frame]:5.2f} s".strip())
                 writer.grab_frame()
                 # Fix the axes at the positions of the first frame.
                 figure.set_layout_engine("none")

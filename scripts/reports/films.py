@@ -63,7 +63,7 @@ def writing_arm(frames: int) -> Film:
     q = np.asarray(jax.jit(lambda start: rollout(rk4(second_order(accelerate)), start, t))(start)[0])
     elbow = LINK_LENGTH * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
     joints = sampled(np.stack([0 * elbow, elbow, np.asarray(jax.vmap(tip)(q))], axis=1), frames)
-    path = np.asarray(jax.vmap(tip)(reference[0]))
+    path = np.asarray(jax.vmap(tip)(jnp.asarray(reference[0])))
 
     def prepare(axis: Axes) -> Callable[[int], None]:
         axis.plot(*path.T, color="0.85", linewidth=5)
@@ -119,15 +119,18 @@ def swing_up(frames: int) -> Film:
     regulator = control.lqr(at.A, at.B, Q=np.diag([1, 1, 0.01, 0.01]), R=[[50.0]])
     near = control.regulated(regulator, goal, at.u, kinds)
     swing = control.energy_shaping(plant, control.parts_of(B), goal[:2], control.EnergyGains(2e7, 20.0, 5.0))
-    law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), 0.5)
+    levels = 10.0 ** np.arange(-2, 1.01, 0.1)
+    region = control.region_of_attraction(
+        field, near, regulator, goal, kinds, least=-limit, most=limit, rate=500.0, levels=levels, starts=32
+    )
+    law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regulator, goal, kinds), region.level)
     start = jnp.array([0.0, np.pi + 0.1, 0.0, 0.0])
     hardware = control.Hardware(-limit, limit, delay=1)
     run = control.simulate(field, control.stateless(law), start, seconds=4.0, rate=500.0, controls=1, hardware=hardware)
     q = sampled(run.x[:, :2], frames)
 
     def prepare(axis: Axes) -> Callable[[int], None]:
-        axis.set_anchor("C")
-        return rotary_pendulum_drawing(0.085, 0.129)(axis, q, TRAIL)
+        return rotary_pendulum_drawing(0.085, 0.129)(axis, q, TRAIL // 3)
 
     return prepare
 
@@ -146,10 +149,16 @@ def crawler(frames: int) -> Film:
         lines.set_clim(0.2, 1.1)
         axis.add_collection(body)
         axis.add_collection(lines)
-        framed(axis, x.reshape(-1, 2))
+        low, high = float(x[..., 0].min()), float(x[..., 0].max())
         axis.axhline(0, color="0.6", linewidth=1.5)
+        marks = np.arange(np.floor(low), np.ceil(high) + 1, 0.25 * task.length)
+        axis.plot(marks, 0 * marks, "|", color="0.6", markersize=8, markeredgewidth=1.5, zorder=0)
+        axis.set(ylim=(-0.3 * task.length, 1.0 * task.length), aspect="equal")
+        axis.set_axis_off()
 
         def show(frame: int) -> None:
+            middle = x[frame, :, 0].mean()
+            axis.set_xlim(middle - 0.75 * task.length, middle + 0.75 * task.length)
             body.set_verts(list(x[frame][mesh.elements]))
             lines.set_segments(list(x[frame][muscles]))
             lines.set_array(pull[frame])

@@ -7,7 +7,6 @@ its energy, and a soft body crawls. It takes about two minutes.
 from dataclasses import dataclass
 
 import jax
-import numpy as np
 
 from dln_jax.cli.options import Folder
 from dln_jax.cli.running import command_folder
@@ -34,23 +33,17 @@ def main(given: Arguments) -> None:
         for title, film in FILMS.items():
             films[title] = film(given.frames)
             print(f"{title}: done")
-        figure, axes = style.figure(1, len(films), height=2.6, dpi=DPI)
+        figure, axes = style.figure(1, len(films), height=2.1, width=9.0, dpi=DPI)
         shows = []
         for axis, (title, prepare) in zip(axes[0], films.items(), strict=True):
             shows.append(prepare(axis))
-            style.title(axis, title, fontsize=style.SMALL)
+            axis.set_anchor("S")
+            axis.text(0.5, 1.0, title, transform=axis.transAxes, ha="center")
 
         def show(frame: int) -> None:
             for draw in shows:
                 draw(frame)
 
-        t = np.arange(given.frames) / given.frames_per_second
-        write_gif(
-            folder / "films.gif",
-            figure,
-            show,
-            t,
-            frames=range(given.frames),
-            frames_per_second=given.frames_per_second,
-        )
+        path, frames = folder / "films.gif", range(given.frames)
+        write_gif(path, figure, show, None, frames=frames, frames_per_second=given.frames_per_second)
         print(f"run folder: {folder}")
