@@ -62,7 +62,7 @@ def writing_arm(frames: int) -> Film:
     start = jnp.asarray(reference[0][0]), jnp.asarray(reference[1][0])
     q = np.asarray(jax.jit(lambda start: rollout(rk4(second_order(accelerate)), start, t))(start)[0])
     elbow = LINK_LENGTH * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], axis=1)
-    joints = sampled(np.stack([0 * elbow, elbow, np.asarray(jax.vmap(tip)(q))], axis=1), frames)
+    joints = sampled(np.stack([0 * elbow, elbow, np.asarray(jax.vmap(tip)(jnp.asarray(q)))], axis=1), frames)
     path = np.asarray(jax.vmap(tip)(jnp.asarray(reference[0])))
 
     def prepare(axis: Axes) -> Callable[[int], None]:

@@ -1,0 +1,19 @@
+"""Every film of the strip moves, and stays within its frame."""
+
+import numpy as np
+import pytest
+from calls import command
+
+from scripts.reports.commands import film_strip
+from scripts.reports.films import sampled
+
+
+def test_samples_begin_and_end_with_the_motion():
+    motion = np.arange(101.0)
+    assert sampled(motion, 5).tolist() == [0.0, 25.0, 50.0, 75.0, 100.0]
+
+
+@pytest.mark.slow
+def test_the_strip_is_written(tmp_path):
+    command(film_strip, "--frames", "3", "--out", tmp_path / "strip")
+    assert (tmp_path / "strip" / "films.gif").read_bytes().startswith(b"GIF89a")
