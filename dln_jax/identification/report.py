@@ -82,8 +82,8 @@ def findings(found: Identification, data: Trajectories, names: tuple[str, ...]) 
         lines.append(f"negative, which no joint is: {', '.join(friction)}; ask for consistent parameters")
     if found.consistent is not None and not found.consistent.converged:
         lines.append(
-            f"the search for bodies that exist did not converge in {found.consistent.iterations} iterations; closer "
-            "ones may exist"
+            f"the search for physically consistent bodies did not converge in {found.consistent.iterations} "
+            "iterations; closer ones may exist"
         )
     return lines
 

@@ -183,7 +183,7 @@ FREE = (
 )
 
 
-def test_a_base_that_is_free_can_be_held(tmp_path):
+def test_a_free_base_can_be_locked(tmp_path):
     path = written(tmp_path, "free.xml", f"<mujoco><worldbody><body>{FREE}</body></worldbody></mujoco>")
     assert read_robot(path, lock=["root"]).tree.names == ("a",)
 
@@ -192,10 +192,10 @@ LOCKED = {"turned": ("branched.xml", {"x": 0.7, "w": -0.4}), "moved": ("arm.urdf
 
 
 @pytest.mark.parametrize("name", LOCKED)
-def test_joints_are_held_where_it_is_asked_for(name, tmp_path):
+def test_joints_are_locked_at_their_positions(name, tmp_path):
     file, lock = LOCKED[name]
     path = written(tmp_path, file, FILES[file])
-    free, held = read_robot(path), read_robot(path, lock=hold)
+    free, held = read_robot(path), read_robot(path, lock=lock)
     place = np.array([free.tree.names.index(name) for name in held.tree.names])
     q, qd, qdd = np.zeros((3, free.tree.degrees_of_freedom))
     for joint, position in lock.items():

@@ -1,4 +1,4 @@
-"""Bodies that exist: the parametrisation reaches all of them and no other, and costs little where the truth is one."""
+"""The parametrisation reaches all physically consistent bodies and no other; it costs little where the truth is one."""
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,7 @@ def test_no_direction_decreases_the_sum(noisy, spoiled):
     random = np.random.default_rng(0)
     for size in (1e-2, 1e-4):
         for _ in range(20):
-            # Relative steps of each parameter; those that leave the bodies that exist have no sum.
+            # Relative steps of each parameter; those that leave the consistent bodies have no sum.
             theta = found.theta * np.exp(size * random.normal(size=len(known)))
             if all(is_consistent(theta, columns)):
                 assert sum_of(theta, triangle, columns, known) >= least * (1 - 1e-9)

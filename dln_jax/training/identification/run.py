@@ -156,7 +156,7 @@ def write_file(folder: Path, given: Options, case: Case, found: Identification, 
         return [f"no {path.name}: the fit is refused"]
     if not all(bodies):
         which = ", ".join(name for name, good in zip(case.names, bodies, strict=True) if not good)
-        return [f"no {path.name}: by least squares the links behind {which} are no bodies that exist"]
+        return [f"no {path.name}: the least-squares links behind {which} are not physically consistent"]
     parameters = parameters_of(found.theta, case.known)
     tree = case.robot.tree._replace(inertias=np.asarray(parameters.inertias), armature=np.asarray(parameters.armature))
     remarks = [f"Identified from {given.data.name}."]

@@ -72,7 +72,7 @@ class Options(Folder, Drawn, Filtered):
     robust: bool = False
     """Huber's estimate, for torques with spikes."""
     consistent: bool = True
-    """Keep bodies that exist, with positive armature and friction; else what least squares gives."""
+    """Keep bodies physically consistent, with positive armature and friction; else what least squares gives."""
     regularisation: float = REGULARISATION
     """Of consistent parameters towards those of the robot's file; dimensionless, 1 is about one measurement."""
 

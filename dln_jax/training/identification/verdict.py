@@ -81,7 +81,7 @@ def existing(found: Identification, torques: dict[str, np.ndarray], kept: str, t
     if mine <= 2 * free + WORSE:
         return Verdict("good", "")
     level = "refused" if mine > free + IMPOSSIBLE else "doubtful"
-    reason = f"bodies that exist have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
+    reason = f"physically consistent bodies have an nMSE of {mine:.3g}, least squares without that bound {free:.3g}"
     reason += (
         f", not converged after {found.consistent.iterations} iterations" if not found.consistent.converged else ""
     )

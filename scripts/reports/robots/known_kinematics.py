@@ -64,7 +64,7 @@ def torque_of(model: Any, parameters: Any) -> Torque:
 
 
 def identified(tree: Tree, data: Trajectories, scale: Any, *, robust: bool = False) -> Torque:
-    """Ours: bodies that exist, torques weighted by their noise, or Huber's estimate.
+    """Ours: physically consistent bodies, torques weighted by their noise, or Huber's estimate.
 
     Args:
         tree: whose frames are known.

@@ -1,0 +1,46 @@
+"""Terms of the field are used throughout; words that they replaced do not come back."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FILES = [
+    path
+    for folder, pattern in (("dln_jax", "*.py"), ("scripts", "*.py"), ("docs", "*.md"), ("docs/examples", "*.py"))
+    for path in sorted((ROOT / folder).rglob(pattern))
+    if not {"gallery", "_build"} & set(path.parts)
+] + [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+REPLACED = {
+    r"laborator(y|ies)": "hardware (limits, encoders, noise and delay of a closed loop)",
+    r"receding": "model predictive control",
+    r"limited_horizon": "constrained LQ",
+    r"adversar(y|ies)": "worst-case disturbance",
+    r"sketch(es)?": "kinematic prior",
+    r"ladder(?! of gaps)": "model selection",
+    r"makers?(?! of result arrays)": "nominal model",
+    r"doctor": "log validation",
+    r"data\.stretches|cut_stretches": "segments",
+    r"--hold\b": "--lock",
+    r"(?:rooms|house|walls) (?:of|in) the (?:library|package|code)": "packages and layers",
+    r"bodies that exist": "physically consistent",
+    r"written_out|written out by hand": "unrolled; closed form",
+}
+
+
+@pytest.mark.parametrize(("word", "term"), REPLACED.items(), ids=REPLACED.values())
+def test_a_replaced_word_is_not_used(word, term):
+    pattern = re.compile(rf"(?<![\w])(?:{word})(?!\w)", re.IGNORECASE)
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:80]}"
+        for path in FILES
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if pattern.search(line)
+    ]
+    assert not found, f"say {term}"
+
+
+def test_the_pattern_finds_a_word():
+    """A search that looks in no file would pass everything above."""
+    assert len(FILES) > 400 and any("Lagrangian" in path.read_text() for path in FILES)
