@@ -112,7 +112,7 @@ def test_least_squares_that_is_no_body_is_kept_without_a_file(workplace, capsys)
         "--robust",
     )
     said = capsys.readouterr().out
-    assert "no arm_identified.urdf: by least squares the links behind" in said
+    assert "no arm_identified.urdf: the least-squares links behind" in said
     assert "10 blocks" not in said and "blocks of time of the one trajectory" in said
     assert not list((workplace / "free").glob("*.urdf")) and load(workplace / "free").dynamics is not None
 
