@@ -73,7 +73,7 @@ def heat_maps(truth: FunctionSamples, predicted: FunctionSamples) -> Figure:
         for axis, norm, text in ((column[1], scale, ""), (column[2], narrow, power.removeprefix(", "))):
             bar = figure.colorbar(ScalarMappable(norm, SIGNED), ax=axis, location="bottom", pad=0.03, aspect=12)
             bar.ax.tick_params(labelsize=7)
-            bar.ax.locator_params(nbins=3)
+            bar.ax.locator_params(nbins=2)
             bar.set_label(text, fontsize=style.SMALL)
     for axis, name in zip(axes[:, 0], ("truth", "model", "error"), strict=True):
         axis.set_ylabel(f"{name}\n$x_2$")

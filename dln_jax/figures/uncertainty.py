@@ -34,14 +34,15 @@ def torque_bands(
     shade = style.colour(model)
     axes = [figure.add_subplot(grid[joint, 0]) for joint in range(d)]
     bands = half_width(LEVEL) * std[shown]
+    within = np.maximum(np.quantile(bands, 0.98, axis=0), np.quantile(np.abs(error[shown]), 0.995, axis=0))
     # One unit for all joints, so that their errors can be compared.
-    factor, prefix = style.prefixed(float(np.quantile(bands[:, :d], 0.9, axis=0).max()), "")
+    factor, prefix = style.prefixed(float(within[:d].max()), "")
     for joint, axis in enumerate(axes):
         style.prepare(axis)
         band = bands[:, joint]
         axis.fill_between(shown, -band / factor, band / factor, color=shade, alpha=0.25, linewidth=0, label="95 % band")
         axis.plot(shown, error[shown, joint] / factor, color="black", linewidth=0.8, label="predicted minus measured")
-        largest = 1.1 * max(np.quantile(band, 0.98), np.quantile(np.abs(error[shown, joint]), 0.995)) / factor
+        largest = 1.1 * within[joint] / factor
         axis.set_ylim(-largest, largest)
         for first, last in _segments(outside[shown]):
             axis.axvspan(first - 0.5, last + 0.5, color="0.5", alpha=0.25, linewidth=0)
