@@ -57,9 +57,13 @@ law = control.switched(lambda x: swing(x[:2], x[2:]), near, control.value(regula
 hardware = control.Hardware(-LIMIT, LIMIT, delay=1)
 starts = np.zeros((STARTS, 4))
 starts[:, 1] = np.pi + 0.2 * np.random.default_rng(0).normal(size=STARTS)
-runs = jax.jit(jax.vmap(lambda x: control.simulate(
-    field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, hardware=hardware
-)))(starts)  # fmt: skip
+runs = jax.jit(
+    jax.vmap(
+        lambda x: control.simulate(
+            field, control.stateless(law), x, seconds=4.0, rate=500.0, controls=1, hardware=hardware
+        )
+    )
+)(starts)
 off = np.abs(jax.vmap(lambda x: control.error(x, goal, joints))(runs.x[:, -1])[:, 1])
 print(f"{np.sum(off < 0.05)} of {STARTS} starts are up after 4 s; largest torque {np.abs(runs.u).max():.3f} N m")
 assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
@@ -71,17 +75,26 @@ assert (off < 0.05).all() and np.abs(runs.u).max() <= LIMIT
 
 folder, t, torque = Path(tempfile.mkdtemp()), np.asarray(runs.t[0, :-1]), np.asarray(runs.u[:, :, 0])
 write_closed_loop_gif(
-    folder / "rotary-pendulum.gif", rotary_pendulum_drawing(0.085, 0.129), t, runs.x[0, :-1, :2], torque[0],
-    limits=(-LIMIT, LIMIT), unit="N m", frames_per_second=FRAMES_PER_SECOND,
-)  # fmt: skip
+    folder / "rotary-pendulum.gif",
+    rotary_pendulum_drawing(0.085, 0.129),
+    t,
+    runs.x[0, :-1, :2],
+    torque[0],
+    limits=(-LIMIT, LIMIT),
+    unit="N m",
+    frames_per_second=FRAMES_PER_SECOND,
+)
 angles, rates = np.linspace(-np.pi, np.pi, 121), np.linspace(-30, 30, 101)
 resting = jax.vmap(lambda angle, rate: plant.energy(jnp.array([0.0, angle]), jnp.array([0.0, rate])))
 each = [grid.ravel() for grid in np.meshgrid(angles, rates)]
 levels = np.asarray(jax.jit(resting)(*each)).reshape(len(rates), len(angles))
 phase_portrait(
-    runs.x[:, :, 1], runs.x[:, :, 3], energy=(angles, rates, levels),
-    goal_energy=float(plant.energy(goal[:2], goal[2:])), caught=(regulator.S[1::2, 1::2], region.level),
-).savefig(folder / "phase-portrait.png")  # fmt: skip
+    runs.x[:, :, 1],
+    runs.x[:, :, 3],
+    energy=(angles, rates, levels),
+    goal_energy=float(plant.energy(goal[:2], goal[2:])),
+    caught=(regulator.S[1::2, 1::2], region.level),
+).savefig(folder / "phase-portrait.png")
 print(f"a film and the phase plane are in {folder}")
 
 # %%

@@ -49,8 +49,11 @@ def off(x):
 
 problem = control.Problem(
     step=control.integrated(field, DT, method=RADAU_3),
-    cost=lambda x, u: DT * (off(x) + 1e-3 * u @ u), final_cost=lambda x: 50 * off(x), least=-LIMIT, most=LIMIT,
-)  # fmt: skip
+    cost=lambda x, u: DT * (off(x) + 1e-3 * u @ u),
+    final_cost=lambda x: 50 * off(x),
+    least=-LIMIT,
+    most=LIMIT,
+)
 guess, still = np.linspace(start, goal, STEPS + 1), np.zeros((STEPS, 1))
 found = jax.jit(lambda: control.shoot(problem, start, guess, still))()
 plan = found.plan
