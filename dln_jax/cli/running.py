@@ -167,11 +167,11 @@ def with_compilation_cache(arguments: type) -> Any:
 def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
     """Message after an interrupt: how to resume the run, or that its folder is incomplete.
 
-    A command can resume if its arguments have `resume`, unless they also have `continues` and it is false.
+    A command can resume if its arguments have `resume`.
     """
     if folder is None:
         return "interrupted"
-    if hasattr(given, "resume") and getattr(given, "continues", True) and (folder / CONFIG).is_file():
+    if hasattr(given, "resume") and (folder / CONFIG).is_file():
         return f"interrupted; continue with: {command} --out {folder} --resume"
     return f"interrupted; {folder} is incomplete"
 
@@ -202,7 +202,7 @@ def needs_from_option(text: str) -> Needs:
 def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
     """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
     resume = getattr(given, "resume", False)
-    resumable = hasattr(given, "resume") and getattr(given, "continues", True)
+    resumable = hasattr(given, "resume")
     folder_of_run = (
         run_folder(given.out, command, resume=resume, resumable=resumable)
         if is_first(given)

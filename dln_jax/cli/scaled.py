@@ -75,7 +75,7 @@ def _keep_standard_output_to_python() -> None:
 
 def remedy_of(given: Any) -> str:
     """Advice to the user after a process was lost."""
-    if not (hasattr(given, "resume") and getattr(given, "continues", True)):
+    if not hasattr(given, "resume"):
         return "start all processes again"
     return f"continue from the last checkpoint in {getattr(given, 'out', '--out')} with --resume in all processes"
 

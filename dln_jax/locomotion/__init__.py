@@ -1,4 +1,4 @@
-"""Locomotion of soft creatures: policies learned by gradients through the simulator, by evolution, or by PPO."""
+"""Locomotion of soft creatures: policies learned by gradients through the simulator, or by evolution."""
 
 from dln_jax.locomotion.learning import Goal, Learned, Record
 from dln_jax.locomotion.methods import Trained, shown_walk, train

@@ -1,7 +1,7 @@
 """Loop of all learning methods: learn, evaluate, record, until a distance or a number of environment steps.
 
 An environment step is one step of the simulator for one creature. Those of evaluations are counted separately. All
-methods are evaluated alike, by one episode from rest, after every call of `improve` or every update of PPO.
+methods are evaluated alike, by one episode from rest, after every call of `improve`.
 """
 
 import math
@@ -49,7 +49,7 @@ class Learner(NamedTuple):
 
     policy: Policy
     start: Callable[[int], Any]
-    """Seed -> state, a tree of arrays; except for PPO, whose state is its model and is not stored."""
+    """Seed -> state, a tree of arrays; of a method that is never stored, any object."""
     improve: Callable[[Any], Any]
     """State -> state after some updates; traceable for trees."""
     parameters: Callable[[Any], Parameters]
@@ -136,7 +136,7 @@ def learn(
     """Learns until the goal; with a directory, stores the state of every evaluation there and can resume bit for bit.
 
     Args:
-        compiled: from `compile_learner`, or from `compile_ppo` without a directory.
+        compiled: from `compile_learner`; without a directory its state may be any object.
         seed: decides everything random.
         goal: conditions that end learning.
         directory: an existing folder for checkpoints.

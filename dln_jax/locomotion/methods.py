@@ -12,18 +12,17 @@ from jax.sharding import Mesh
 
 from dln_jax.locomotion.evolution import EvolutionSettings, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, Learned, Record, compile_learner, learn
+from dln_jax.locomotion.learning import Compiled, Goal, Learned, Record, compile_learner, learn
 from dln_jax.locomotion.policy import WIDTH, Parameters, Policy, make_policy
-from dln_jax.locomotion.ppo import PPOSettings, compile_ppo
 from dln_jax.locomotion.task import Task, Walk, beginning, walk
 from dln_jax.types import InputError
 
-Method = Literal["gradient", "evolution", "ppo"]
+Method = Literal["gradient", "evolution"]
 METHODS: tuple[Method, ...] = get_args(Method)
-SETTINGS: dict[str, Any] = {"gradient": GradientSettings(), "evolution": EvolutionSettings(), "ppo": PPOSettings()}
+SETTINGS: dict[str, Any] = {"gradient": GradientSettings(), "evolution": EvolutionSettings()}
 WINDOWS = {"crawler": 40, "biped": 80, "quadruped": 40}
 """Steps that gradients go back, by creature: balance on two legs needs the whole episode."""
-STEPS = {"gradient": 40_000, "evolution": 500_000, "ppo": 300_000}
+STEPS = {"gradient": 40_000, "evolution": 500_000}
 """Default numbers of environment steps."""
 
 Report = Callable[[int, Record], None]
@@ -59,35 +58,35 @@ def train(
 
     Args:
         task: to learn.
-        method: "gradient", "evolution" or "ppo".
+        method: "gradient" or "evolution".
         seeds: trained one after the other; programs are compiled once.
         goal: conditions that end the learning of a seed.
-        width: of the hidden layer of a policy that is learned by gradients or evolution.
+        width: of the hidden layer of the policy.
         window: steps that gradients go back (default: those of `WINDOWS`).
-        lanes: creatures side by side, an even number for gradients and evolution (default: those of `SETTINGS`).
-        directory: where gradients and evolution store their states.
+        lanes: creatures side by side, an even number (default: those of `SETTINGS`).
+        directory: where states are stored.
         resume: continue the runs stored there.
         mesh: devices that share the creatures simulated side by side.
         report: called with seed and record after every evaluation.
 
     Raises:
-        InputError: an unknown method, PPO without stable-baselines3 or with resume, a stored run with other settings,
-            or a mesh that does not divide the creatures.
+        InputError: an unknown method, a stored run with other settings, or a mesh that does not divide the creatures.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown; choose from {', '.join(METHODS)}")
     chosen = settings_of(method, task.creature.name, window, lanes)
-    if method == "ppo":
-        if resume:
-            raise InputError("runs of ppo are not stored on their way; train again without --resume")
-        compiled, directory = compile_ppo(task, chosen, mesh=mesh), None
-    else:
-        make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
-        compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen, mesh=mesh), mesh)
+    make_learner = make_gradient_learner if method == "gradient" else make_evolution_learner
+    compiled = compile_learner(task, make_learner(task, make_policy(task, width=width), chosen, mesh=mesh), mesh)
     settings: dict[str, Any] = {"creature": task.creature.name, "method": method, "width": width}
     settings |= {"episode": task.episode, "clock_period": task.clock_period, "upright": task.upright}
     settings |= chosen._asdict()
-    one = partial(learn, compiled, goal=goal, directory=directory, settings=settings, resume=resume)
+    stored = {"directory": directory, "settings": settings, "resume": resume}
+    return learn_seeds(compiled, seeds, goal, report, **stored)
+
+
+def learn_seeds(compiled: Compiled, seeds: Sequence[int], goal: Goal, report: Report, **stored: Any) -> Trained:
+    """Learns with several seeds by one compiled method; `stored` are arguments of `learn` on checkpoints."""
+    one = partial(learn, compiled, goal=goal, **stored)
     return Trained(compiled.learner.policy, [one(seed=seed, report=partial(report, seed)) for seed in seeds])
 
 
@@ -95,13 +94,13 @@ def settings_of(method: Method, creature: str, window: int | None = None, lanes:
     """Returns the settings of a method for a creature; only the window of gradients depends on the creature.
 
     Raises:
-        InputError: an odd number of lanes, for a method that takes them in pairs.
+        InputError: an odd number of lanes, which the methods take in pairs.
     """
     settings = SETTINGS[method]
-    if lanes is not None and method != "ppo" and lanes % 2:
+    if lanes is not None and lanes % 2:
         raise InputError(f"{lanes} creatures are no pairs, in which {method} takes them; give an even number")
     if lanes is not None:
-        settings = settings._replace(lanes=lanes) if method == "ppo" else settings._replace(pairs=lanes // 2)
+        settings = settings._replace(pairs=lanes // 2)
     if method != "gradient":
         return settings
     return settings._replace(window=window or WINDOWS.get(creature, GradientSettings().window))

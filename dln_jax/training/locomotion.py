@@ -1,10 +1,10 @@
 """Trains policies of a soft creature from options, and writes the run folder of the best: model, metrics, gait."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jax.sharding import Mesh
@@ -13,11 +13,11 @@ from dln_jax.cli.arguments import Unstated, require_positive_if_given
 from dln_jax.cli.progress import progress
 from dln_jax.figures.soft_body_animations import write_soft_body_gif
 from dln_jax.files import write_figure, write_json
-from dln_jax.locomotion import comparison, gradient
+from dln_jax.locomotion import gradient
 from dln_jax.locomotion.learning import LANES, Goal, Record
-from dln_jax.locomotion.methods import STEPS, Method, Trained, settings_of, shown_walk, train
+from dln_jax.locomotion.methods import STEPS, Method, Report, Trained, settings_of, shown_walk, train
 from dln_jax.locomotion.policy import WIDTH
-from dln_jax.locomotion.ppo import require_stable_baselines3
+from dln_jax.locomotion.progress import learning_figure, median_to_reach
 from dln_jax.locomotion.task import CLOCK_PERIOD, EPISODE, UPRIGHT, Task, Walk, creature_named, make_task
 from dln_jax.scale.devices import device_lines
 from dln_jax.scale.mesh import shares
@@ -41,7 +41,7 @@ class Options:
     seeds: int = 1
     """How many seeds, one after the other."""
     steps: Unstated[int] = None
-    """Environment steps of each seed (default: 40000 by gradient, 500000 by evolution, 300000 by ppo)."""
+    """Environment steps of each seed (default: 40000 by gradient, 500000 by evolution)."""
     until: Unstated[float] = None
     """Body lengths at which a seed ends (default: no limit)."""
     upright: float = UPRIGHT
@@ -53,10 +53,9 @@ class Options:
     window: Unstated[int] = None
     """gradient: steps that gradients go back; divides the episode (default: 40, of the biped 80)."""
     width: Unstated[int] = None
-    """gradient, evolution: hidden units of the policy (default: 32)."""
+    """Hidden units of the policy (default: 32)."""
     lanes: Unstated[int] = None
-    """Creatures side by side, which devices share; in pairs but for ppo (default: 2 by gradient, 32 by evolution, 16 by
-    ppo)."""
+    """Creatures side by side, in pairs, which devices share (default: 2 by gradient, 32 by evolution)."""
 
 
 def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Task:
@@ -71,8 +70,6 @@ def prepare(given: Options, methods: Sequence[Method], mesh: Mesh | None) -> Tas
             gradient.check(settings, given.episode)
     if not (math.isfinite(given.upright) and given.upright >= 0):
         raise InputError(f"--upright is {given.upright}; expected 0 or a positive number")
-    if "ppo" in methods:
-        require_stable_baselines3()
     creature = creature_named(given.creature)
     return make_task(creature, episode=given.episode, clock_period=given.clock_period, upright=given.upright)
 
@@ -95,19 +92,15 @@ def learned(
     resume: bool = False,
 ) -> Trained:
     """Trains all seeds of one method, with checkpoints in `directory`, if any."""
-    steps = given.steps or STEPS[method]
-    with progress(given.seeds * steps, "environment steps") as show:
-
-        def report(seed: int, at: Record) -> None:
-            done = (seed - given.seed) * steps + min(at.steps, steps)
-            skipped = f", {at.skipped} skipped" if at.skipped else ""
-            show(done, f"{method}, seed {seed}: {at.distance:.3f} body lengths{skipped}")
-
-        return train(
+    return reported(
+        given,
+        method,
+        given.steps or STEPS[method],
+        lambda seeds, goal, report: train(
             task,
             method,
-            seeds=range(given.seed, given.seed + given.seeds),
-            goal=Goal(steps, given.until or math.inf),
+            seeds=seeds,
+            goal=goal,
             width=given.width or WIDTH,
             window=given.window,
             lanes=given.lanes,
@@ -115,11 +108,24 @@ def learned(
             directory=directory,
             resume=resume,
             report=report,
-        )
+        ),
+    )
+
+
+def reported(given: Options, method: str, steps: int, run: Callable[[Sequence[int], Goal, Report], Trained]) -> Trained:
+    """Trains all seeds by `run(seeds, goal, report)`, `steps` environment steps each, and shows the progress."""
+    with progress(given.seeds * steps, "environment steps") as show:
+
+        def report(seed: int, at: Record) -> None:
+            done = (seed - given.seed) * steps + min(at.steps, steps)
+            skipped = f", {at.skipped} skipped" if at.skipped else ""
+            show(done, f"{method}, seed {seed}: {at.distance:.3f} body lengths{skipped}")
+
+        return run(range(given.seed, given.seed + given.seeds), Goal(steps, given.until or math.inf), report)
 
 
 def write_run(
-    folder: Path, task: Task, method: Method, trained: Trained, given: Options, *, figures: bool
+    folder: Path, task: Task, method: str, trained: Trained, given: Options, settings: Any, *, figures: bool
 ) -> dict[str, float]:
     """Writes model, metrics, figure and GIF (at half speed) of the best seed; returns the metrics."""
     best, creature = trained.best, task.creature.name
@@ -131,7 +137,7 @@ def write_run(
         "width": given.width or WIDTH,
         "precision": "f64",
         "clock_period": task.clock_period,
-        "settings": settings_of(method, creature, given.window, given.lanes)._asdict(),
+        "settings": settings._asdict(),
     }
     save_tree(folder, MODEL, best.parameters, {"model": description})
     seen = shown_walk(task, trained.policy, best.parameters, task.episode)
@@ -139,7 +145,7 @@ def write_run(
     write_json(folder / "metrics.json", numbers)
     if figures:
         records = [of.records for of in trained.learned]
-        write_figure(folder / "learning.png", comparison.learning_figure(records, method=method))
+        write_figure(folder / "learning.png", learning_figure(records, method=method))
         x = np.concatenate([task.creature.mesh.vertices[None], seen.x])
         write_soft_body_gif(
             folder / "gait.gif",
@@ -164,8 +170,8 @@ def metrics_of(task: Task, trained: Trained, seen: Walk) -> dict[str, float]:
         "distance_body_lengths_median": np.median([float(of.distance) for of in trained.learned]),
         "environment_steps": best.records[-1].steps,
         "evaluation_steps": best.evaluation_steps,
-        "environment_steps_to_one_body_length": comparison.median_to_reach(records, GOAL, "steps"),
-        "seconds_to_one_body_length": comparison.median_to_reach(records, GOAL, "seconds"),
+        "environment_steps_to_one_body_length": median_to_reach(records, GOAL, "steps"),
+        "seconds_to_one_body_length": median_to_reach(records, GOAL, "seconds"),
         "compile_seconds": best.compile_seconds,
         "train_seconds": best.records[-1].seconds - best.compile_seconds,
         "skipped_updates": best.records[-1].skipped,

@@ -97,7 +97,6 @@ def test_every_command_says_its_choices_and_defaults(name, monkeypatch, capsys):
     ("name", "arguments", "resumes"),
     [
         ("compare_locomotion", {}, False),
-        ("train_locomotion", {"method": "ppo"}, False),
         ("train_locomotion", {"method": "evolution"}, True),
         ("train_hnn_pixels", {}, True),
     ],
@@ -235,20 +234,12 @@ class Resumable:
     continues: ClassVar = True
 
 
-@dataclass(frozen=True)
-class Sometimes(Resumable):
-    """Of a command that can continue, but not with these arguments."""
-
-    continues: ClassVar = False
-
-
 @pytest.mark.parametrize(
     ("arguments", "stored", "said"),
     [
         (Resumable, True, "interrupted; continue with: command --out {folder} --resume"),
         (Resumable, False, "interrupted; {folder} is incomplete"),
         (Arguments, True, "interrupted; {folder} is incomplete"),
-        (Sometimes, True, "interrupted; {folder} is incomplete"),
     ],
 )
 def test_an_interrupt_says_how_to_continue(monkeypatch, capsys, tmp_path, arguments, stored, said):

@@ -1,7 +1,5 @@
 """Locomotion: the task, its environment, and the ways of learning, on a body of six vertices and short episodes."""
 
-import importlib.util
-import itertools
 import json
 import os
 import signal
@@ -13,36 +11,27 @@ import pytest
 from calls import refused
 from gymnasium.utils.env_checker import check_env
 from jax.sharding import Mesh
+from small_creature import EPISODE, block_task
 
 from dln_jax.cli.commands import train_locomotion
 from dln_jax.figures.soft_body_animations import soft_body_frame, write_soft_body_gif
-from dln_jax.locomotion import comparison
 from dln_jax.locomotion.environment import CreatureEnvironment
 from dln_jax.locomotion.evolution import EvolutionSettings, centred_ranks, estimate, make_evolution_learner
 from dln_jax.locomotion.gradient import GradientSettings, make_gradient_learner
-from dln_jax.locomotion.learning import Goal, Record, compile_learner, learn
+from dln_jax.locomotion.learning import Goal, compile_learner, learn
 from dln_jax.locomotion.policy import make_policy
-from dln_jax.locomotion.ppo import make_actor
-from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, make_task, observe
+from dln_jax.locomotion.task import FALLEN, Walk, actuation_of, beginning, judged, observe
 from dln_jax.scale.mesh import AXIS
-from dln_jax.softbody.mesh.creatures import Creature
 from dln_jax.softbody.mesh.mesh import make_mesh
-from dln_jax.softbody.mesh.shapes import lattice
 from dln_jax.types import InputError
-from scripts.reports.commands import compare_locomotion
 
-EPISODE, WINDOW = 12, 6
+WINDOW = 6
 QUICK = GradientSettings(window=WINDOW, learning_rate=0.05, updates=4)
 
 
 @pytest.fixture(scope="module")
 def task():
-    """A block of two cells that two muscles along its sides bend."""
-    positions, triangles = lattice([(0, 0), (1, 0)])
-    mesh = make_mesh(0.4 * np.asarray(positions, float), triangles)
-    number = {tuple(place): index for index, place in enumerate(np.asarray(positions).tolist())}
-    muscles = np.array([[number[0, 0], number[0, 1]], [number[0, 1], number[1, 1]]])
-    return make_task(Creature("block", mesh, muscles), episode=EPISODE, clock_period=6.0, upright=0.5)
+    return block_task()
 
 
 @pytest.fixture(scope="module")
@@ -213,54 +202,12 @@ def test_evolution_improves(task, policy, compiled):
     assert learned.records[-1].skipped == 0
 
 
-def test_the_actor_is_the_network_of_tanh_layers(task):
-    random = np.random.default_rng(0)
-    sizes = (task.observation_size, 4, 4, 2)
-    layers = tuple(
-        {"w": random.normal(size=(m, n)).astype(np.float32), "b": random.normal(size=m).astype(np.float32)}
-        for n, m in itertools.pairwise(sizes)
-    )
-    seen = random.normal(size=sizes[0])
-    h = np.tanh(layers[1]["w"] @ np.tanh(layers[0]["w"] @ seen + layers[0]["b"]) + layers[1]["b"])
-    expected = 0.625 + 0.375 * np.clip(layers[2]["w"] @ h + layers[2]["b"], -1, 1)
-    np.testing.assert_allclose(make_actor(task).apply(layers, jnp.asarray(seen)), expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize("shared", [False, True])
-def test_vector_lanes_are_single_environments(task, environment, shared):
-    pytest.importorskip("stable_baselines3", reason="PPO needs the extra [rl]")
-    from dln_jax.locomotion.vector_environment import VectorEnvironment
-
-    # One device shares them with nobody, by the program of several.
-    mesh = Mesh(np.array(jax.devices()[:1]), (AXIS,)) if shared else None
-    lanes = VectorEnvironment(task, 2, reward_scale=10.0, mesh=mesh)
-    random = np.random.default_rng(1)
-    single, _ = environment.reset(seed=0)
-    np.testing.assert_array_equal(lanes.reset()[1], single)
-    for _ in range(EPISODE):
-        actions = random.uniform(-1, 1, (2, 2)).astype(np.float32)
-        seen, rewards, done, infos = lanes.step(actions)
-        single, reward, *_ = environment.step(actions[1])
-        np.testing.assert_allclose(rewards[1], 10.0 * reward, rtol=1e-4, atol=1e-6)
-    assert done.all() and infos[1]["TimeLimit.truncated"]
-    np.testing.assert_allclose(infos[1]["terminal_observation"], single, rtol=1e-3, atol=1e-5)
-    np.testing.assert_array_equal(seen, lanes.reset())
-
-
-def test_missing_stable_baselines3_is_one_line(capsys, monkeypatch, tmp_path):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "stable_baselines3" else find(name))
-    for script, *arguments in ((train_locomotion, "--method", "ppo"), (compare_locomotion,)):
-        assert "pip install 'dln-jax[rl]'" in refused(capsys, script, *arguments, "--out", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--steps", "0"), "steps is 0"),
         (("--upright", "-1"), "--upright is -1"),
-        (("--method", "ppo", "--resume", "--out", "run"), "holds none"),
+        (("--method", "evolution", "--resume", "--out", "run"), "holds none"),
         (("--episode", "50"), "a window has 40 steps"),
         (("--window", "7"), "a window has 7 steps"),
         (("--window", "8", "--method", "evolution"), "--window is not used by --method evolution"),
@@ -283,28 +230,6 @@ def test_devices_that_do_not_divide_the_creatures_are_refused(task, policy, make
     mesh = Mesh(np.array(7 * jax.devices()[:1]), (AXIS,))
     with pytest.raises(InputError, match="creatures side by side cannot be split over 7 devices"):
         make_learner(task, policy, settings, mesh=mesh)
-
-
-def test_medians_and_the_crossover():
-    def records(*pairs):
-        return [Record(steps, steps / 10, distance, 0) for steps, distance in pairs]
-
-    quick = [records((10, 0.1), (20, 1.1)), records((10, 0.3), (20, 0.2), (30, 1.0)), records((10, 0.2), (40, 1.5))]
-    slow = [records((5, 0.4), (100, 1.2)), records((5, 0.5), (100, np.nan))]
-    assert comparison.median_to_reach(quick, 1.0, "steps") == 30
-    assert comparison.median_to_reach(slow, 1.0, "steps") == np.inf
-    places, heights = comparison.median_curve(quick, "steps")
-    np.testing.assert_array_equal(places, [10, 20, 30, 40])
-    np.testing.assert_allclose(heights, [0.2, 0.3, 1.0, 1.1])
-    # Behind from 5 to 20, ahead from 30 on.
-    assert comparison.crossover(quick, slow, "steps") == 30
-    assert comparison.crossover(slow, quick, "steps") is None
-    axes = comparison.comparison_figure({"gradient": quick, "ppo": slow}, distance=1.0, title="").axes
-    assert [axis.get_xscale() for axis in axes] == ["log", "log"]
-    said = {text.get_text() for text in axes[0].get_legend().get_texts()}
-    assert said == {"gradient: 30", "ppo: not reached", "from here gradient is ahead"}
-    (ahead,) = (line for line in axes[0].lines if line.get_label().startswith("from here"))
-    np.testing.assert_array_equal(ahead.get_xdata(), 30)
 
 
 def test_animations_hold_their_frames_and_refuse_what_does_not_fit(task, tmp_path):

@@ -63,11 +63,7 @@ def plan(
     by_text = {name: dict(zip(texts, words[name], strict=True)) for _, name, texts in stated}
     for number, values in enumerate(combinations(grid)):
         line = (*(words[name][0] for name in fixed), *alone, *(by_text[name][text] for name, text in values.items()))
-        resumes = "resume" in known
-        if hasattr(arguments, "continues"):
-            resumes = _parsed(command, arguments, line).continues
-        job = Job(folder / "jobs" / f"{number:04}", command, line, values, resumes, Path.cwd())
-        jobs.append(job)
+        jobs.append(Job(folder / "jobs" / f"{number:04}", command, line, values, "resume" in known, Path.cwd()))
     return jobs
 
 

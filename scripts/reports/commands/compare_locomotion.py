@@ -5,20 +5,23 @@ steps and against wall time, and the model and gait of each method's best seed. 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Any, ClassVar
 
 from dln_jax.cli.arguments import Unstated
 from dln_jax.cli.options import Drawn, Folder, Scaled
 from dln_jax.cli.running import command_folder
 from dln_jax.cli.scaled import mesh_of
 from dln_jax.files import write_figure, write_json
-from dln_jax.locomotion import comparison
-from dln_jax.locomotion.methods import METHODS, settings_of
+from dln_jax.locomotion.methods import METHODS, Trained, settings_of
+from dln_jax.locomotion.progress import median_to_reach
 from dln_jax.locomotion.task import FALLEN
 from dln_jax.metrics.report import conditions, print_report, write_report
-from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, write_run
-from scripts.reports.locomotion import comparison_rows
+from dln_jax.training.locomotion import GOAL, Options, announce, learned, prepare, reported, write_run
+from scripts.reports.locomotion import comparison, ppo
+from scripts.reports.locomotion.rows import comparison_rows
 
 
 @dataclass(frozen=True)
@@ -36,17 +39,26 @@ class Arguments(Options, Folder, Drawn, Scaled):
 def main(given: Arguments) -> None:
     """Trains by all methods, prints and writes."""
     mesh = mesh_of(given)
+    ppo.check(given.lanes, mesh)
     task = prepare(given, METHODS, mesh)
+    settings: dict[str, Any] = {
+        method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS
+    }
+    settings["ppo"] = ppo.settings_of(given.lanes)
     with command_folder(given, "compare_locomotion") as folder:
         announce(task)
         curves, numbers = {}, {}
-        for method in METHODS:
-            trained = learned(task, method, given, mesh)
+        by_ppo = partial(ppo.train_by_ppo, task, lanes=given.lanes, mesh=mesh)
+        ways: dict[str, Callable[[], Trained]] = {
+            method: partial(learned, task, method, given, mesh) for method in METHODS
+        }
+        ways["ppo"] = lambda: reported(given, "ppo", given.steps or ppo.STEPS, by_ppo)
+        for method, train in ways.items():
+            trained = train()
             (folder / method).mkdir()
-            found = write_run(folder / method, task, method, trained, given, figures=given.figures)
+            found = write_run(folder / method, task, method, trained, given, settings[method], figures=given.figures)
             numbers |= {f"{method}_{name}": value for name, value in found.items()}
             curves[method] = [of.records for of in trained.learned]
-        settings = {method: settings_of(method, given.creature, given.window, given.lanes) for method in METHODS}
         rows = comparison_rows(given.creature, curves, goal=GOAL, seed=given.seed)
         facts = conditions(
             dtype="float64; ppo's networks float32",
@@ -62,6 +74,6 @@ def main(given: Arguments) -> None:
             title = f"{given.creature}: farthest so far, {given.seeds} seeds (thin) and their median (thick)"
             write_figure(folder / "comparison.png", comparison.comparison_figure(curves, distance=GOAL, title=title))
         print_report(rows, facts)
-        if any(math.isinf(comparison.median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
+        if any(math.isinf(median_to_reach(seeds, GOAL, "steps")) for seeds in curves.values()):
             print("where a median was not reached, ratios take the steps that were allowed: they are lower bounds")
         print(f"run folder: {folder}")

@@ -2,8 +2,8 @@
 
 import math
 
-from dln_jax.locomotion.comparison import first_reaching, median_to_reach
 from dln_jax.locomotion.learning import Record
+from dln_jax.locomotion.progress import first_reaching, median_to_reach
 from dln_jax.metrics.report import Row
 
 

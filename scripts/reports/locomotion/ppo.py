@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3, with its actor as a policy of this package.
+"""Proximal policy optimisation (Schulman et al. 2017) by stable-baselines3, whose actor becomes a policy of dln_jax.
 
 The actor is a network of two tanh layers; its mean in [-1, 1] is an actuation in [0.25, 1].
 """
@@ -6,15 +6,18 @@ The actor is a network of two tanh layers; its mean in [-1, 1] is an actuation i
 import importlib.util
 import math
 import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from dln_jax.locomotion.learning import Compiled, Learner, compile_evaluation
+from dln_jax.locomotion.learning import LANES, Compiled, Goal, Learner, compile_evaluation
+from dln_jax.locomotion.methods import Report, Trained, learn_seeds
 from dln_jax.locomotion.policy import Parameters, Policy
 from dln_jax.locomotion.task import Task, actuation_of
+from dln_jax.scale.mesh import shares
 from dln_jax.softbody.terms.creature import TIME_STEP
 from dln_jax.types import InputError
 
@@ -42,10 +45,32 @@ class PPOSettings(NamedTuple):
     """Of the two hidden layers, of actor and critic."""
 
 
+STEPS = 300_000
+"""Environment steps by default."""
+
+
+def settings_of(lanes: int | None) -> PPOSettings:
+    """Returns the settings, with another number of lanes if it is stated."""
+    return PPOSettings() if lanes is None else PPOSettings(lanes=lanes)
+
+
+def check(lanes: int | None, mesh: Mesh | None) -> None:
+    """Raises `InputError` if stable-baselines3 is not installed, or if the mesh does not divide the lanes."""
+    require_stable_baselines3()
+    shares(mesh, settings_of(lanes).lanes, f"{LANES} (--lanes)")
+
+
+def train_by_ppo(
+    task: Task, seeds: Sequence[int], goal: Goal, report: Report, *, lanes: int | None, mesh: Mesh | None
+) -> Trained:
+    """Learns with several seeds, without checkpoints; arguments as for `dln_jax.locomotion.train`."""
+    return learn_seeds(compile_ppo(task, settings_of(lanes), mesh=mesh), seeds, goal, report)
+
+
 def require_stable_baselines3() -> None:
     """Raises `InputError` if stable-baselines3 is not installed."""
     if importlib.util.find_spec("stable_baselines3") is None:
-        raise InputError("--method ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
+        raise InputError("ppo needs stable-baselines3; install it by: pip install 'dln-jax[rl]'")
 
 
 def make_actor(task: Task) -> Policy:
@@ -91,7 +116,7 @@ def compile_ppo(
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
-    from dln_jax.locomotion.vector_environment import VectorEnvironment
+    from scripts.reports.locomotion.vector_environment import VectorEnvironment
 
     began = time.perf_counter()
     # Networks of this size are slower on several threads.
