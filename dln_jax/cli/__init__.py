@@ -1,3 +1,3 @@
-"""What the commands share: typed arguments, errors as one line, progress and tables."""
+"""Shared parts of the commands: typed arguments, one-line errors, progress and tables."""
 
 __all__ = []

@@ -1,4 +1,4 @@
-"""Typed command lines: what help shows, and a mistake as one line."""
+"""Typed command lines: help texts, and mistakes reported in one line."""
 
 import contextlib
 import dataclasses
@@ -20,14 +20,14 @@ T = TypeVar("T")
 Arguments = TypeVar("Arguments")
 
 Unstated = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]
-"""An option that is `None` where it is not given; its own text says what then holds."""
+"""An option that is `None` by default; its help text states the effective default."""
 
 UNREADABLE = {
     r"Error parsing (--\S+): invalid literal for int\(\) with base 10: (.*)": "a whole number",
     r"Error parsing (--\S+): Exceeds the limit \(\d+ digits\)()[^']*": "a whole number of fewer than 4,300 digits",
     r"Error parsing (--\S+): could not convert string to float: (.*)": "a number",
 }
-"""What Python says of text that is no number, as the option and the text; and what was expected."""
+"""Python's conversion errors (groups: the option and its text), and the value that the option expects."""
 
 _rules = ConstructorRegistry()
 
@@ -49,9 +49,10 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def choice(names: Iterable[str], *, several: bool = False, unstated: bool = False) -> Any:
-    """For `Annotated[str, ...]`: shows the names of which an option takes one, or several, by default all.
+    """Shows the allowed names of an option in its help, for `Annotated[str, ...]`.
 
-    With `unstated` the default is not shown, as for `Unstated`.
+    With `several` the option takes a list of names, by default all. With `unstated` the default is not shown, as for
+    `Unstated`.
     """
     return tyro.conf.arg(
         metavar="{" + ",".join(names) + "}" + "[,...]" * several, help_behavior_hint="" if several or unstated else None
@@ -61,10 +62,10 @@ def choice(names: Iterable[str], *, several: bool = False, unstated: bool = Fals
 def parse(
     arguments: type[Arguments], *, prog: str, description: str | None, line: Sequence[str] | None = None
 ) -> Arguments:
-    """The arguments of a command's `line`, by default this process's; `--help` prints the text and exits.
+    """Parses a command line, by default that of this process; `--help` prints the help and exits.
 
     Raises:
-        InputError: what cannot be parsed.
+        InputError: the line cannot be parsed.
     """
     said = io.StringIO()
     try:
@@ -77,7 +78,7 @@ def parse(
 
 
 def own_first(arguments: type[Arguments]) -> type[Arguments]:
-    """Orders a dataclass's fields for help: its own before those of its bases, where a dataclass has them behind."""
+    """Reorders a dataclass's fields for the help: its own first (a dataclass puts inherited fields first)."""
     fields = arguments.__dataclass_fields__  # type: ignore[attr-defined]
     names = [name for base in arguments.__mro__ for name in inspect.get_annotations(base) if name in fields]
     arguments.__dataclass_fields__ = {name: fields[name] for name in names}  # type: ignore[attr-defined]
@@ -85,30 +86,30 @@ def own_first(arguments: type[Arguments]) -> type[Arguments]:
 
 
 def names_listed(text: str | None) -> tuple[str, ...]:
-    """The names of an option such as --hold, which commas separate; none where it was not given."""
+    """Splits the comma-separated names of an option such as --hold; empty if the option was not set."""
     return tuple(name for each in (text or "").split(",") if (name := each.strip()))
 
 
 def refuse_given(given: Any, names: Iterable[str], why: str) -> None:
-    """Raises `InputError` for the first of these options that was given, for example "--batch is for adam: ..."."""
+    """Raises `InputError` for the first of these options that was set, for example "--batch is for adam: ..."."""
     for name in names:
         if getattr(given, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} is {why}; leave it out")
 
 
 def require_positive_if_given(given: Any, names: Iterable[str]) -> None:
-    """Raises `InputError` for the first of these options that was given and is not positive."""
+    """Raises `InputError` for the first of these options that is set but not positive."""
     require_positive(**{name: getattr(given, name) for name in names if getattr(given, name) is not None})
 
 
 def resolved(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that `defaults` names, with its values for those that were not given."""
+    """The options named in `defaults`, with unset ones replaced by their defaults."""
     stated = {name: getattr(given, name) for name in defaults}
     return {name: defaults[name] if value is None else value for name, value in stated.items()}
 
 
 def names_in(option: str, given: str, known: Iterable[str]) -> list[str]:
-    """The names of a comma-separated list; `InputError` lists those that there are."""
+    """Splits a comma-separated list of names; `InputError` lists the known names if one is unknown or none is named."""
     names = [name.strip() for name in given.split(",") if name.strip()]
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"{option}: '{unknown[0]}' is unknown; choose from {', '.join(known)}")
@@ -118,7 +119,10 @@ def names_in(option: str, given: str, known: Iterable[str]) -> list[str]:
 
 
 def _complaint(box: str) -> str:
-    """The first section below the title of a box of text, on one line; a rule follows the title of one in ASCII."""
+    """Extracts the error from tyro's text box as one line: the first section below the title.
+
+    A rule separates the title from the section where the box is drawn in ASCII.
+    """
     framed = "│" in box
     lines = [line.strip("│ ") for line in box.splitlines() if line[:1] not in ("╭", "╰")]
     sections = re.split(r"\n[─-]{4,}\n", "\n".join(lines))
@@ -131,16 +135,16 @@ def _complaint(box: str) -> str:
 
 
 def numbers_of(option: str, text: str, counts: Collection[int] = (), *, positive: bool = False) -> tuple[float, ...]:
-    """The numbers of an option that takes several, separated by commas.
+    """Parses the comma-separated numbers of an option.
 
     Args:
-        option: such as --noise.
-        text: as it was typed.
-        counts: how many there may be (default: any).
-        positive: whether they must be.
+        option: name, such as --noise.
+        text: text as typed.
+        counts: allowed counts of numbers (default: any).
+        positive: whether all numbers must be positive.
 
     Raises:
-        InputError: another number of them, or what is no number, or none of a possible size.
+        InputError: wrong count, text that is not a number, or a number out of range.
     """
     try:
         numbers = tuple(float(each) for each in text.split(","))

@@ -1,7 +1,7 @@
-"""Compiled programs that are kept from one command to the next, by JAX's persistent compilation cache.
+"""Reuse of compiled programs between commands, by JAX's persistent compilation cache.
 
-Only commands turn it on, never the library. Programs are kept under the user's cache, for each version of JAX, XLA's
-options and kind of processor apart (JAX's own key), and found by what they compute.
+Only commands turn the cache on, never the library. Programs are stored in the user's cache folder. JAX's key contains
+the computation, the version of JAX, XLA's options and the kind of processor.
 """
 
 import functools
@@ -16,26 +16,26 @@ from dln_jax.files import cache_folder
 from dln_jax.types import InputError
 
 MOST_BYTES = 512 * 2**20
-"""Of the folder; the program that was used longest ago goes first."""
+"""Size limit of the cache folder; the least recently used program is evicted first."""
 LEAST_SECONDS = 0.05
-"""Of compilation, from which on a program is kept: to read one takes 0.01."""
+"""Compilation time from which a program is stored; reading one back takes 0.01 s."""
 LOCK = ".lockfile"
-"""By which JAX lets one process at a time read or write."""
+"""Lock file by which JAX lets one process at a time read or write."""
 
 
 class Compilation(NamedTuple):
-    """What this process has compiled."""
+    """Totals of this process's compilation."""
 
     seconds: float
-    """What was found in the cache included."""
+    """Compilation time, including programs that came from the cache."""
     found: int
-    """Programs that came from the cache."""
+    """Number of programs that came from the cache."""
 
 
 def keep(wanted: bool) -> str:
-    """Turns the cache on, or off if it is not wanted; gives the reason where it cannot be on, and all is compiled anew.
+    """Turns the cache on or off. Returns the reason if it cannot be turned on, else an empty string.
 
-    A folder that the user has told JAX (`JAX_COMPILATION_CACHE_DIR`) stays, with its settings.
+    A cache folder that the user has set (`JAX_COMPILATION_CACHE_DIR`) keeps its settings.
     """
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)
@@ -50,19 +50,19 @@ def keep(wanted: bool) -> str:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", MOST_BYTES)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_SECONDS)
-    # A disk that is full, or a program that cannot be read, costs its compilation and not a line for each program.
+    # A full disk or an unreadable program costs a compilation; one warning per program would flood the output.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
     return ""
 
 
 def compilation() -> Compilation:
-    """What has been compiled since this was first asked for; a difference of two is what was in between."""
+    """Totals since the first call of this function; subtract two readings to measure an interval."""
     counts = _counts()
     return Compilation(counts["seconds"], int(counts["found"]))
 
 
 def summary(since: Compilation, unkept: str = "") -> str:
-    """A line about compilation; empty where it was not worth one."""
+    """Summary of the compilation since a reading, in one line; empty if it was short and used no cached program."""
     now = compilation()
     seconds, found = now.seconds - since.seconds, now.found - since.found
     if seconds < 0.5 and not found:
@@ -88,14 +88,14 @@ def _counts() -> dict[str, float]:
 
 
 def _remove_torn(folder: Path) -> None:
-    """Removes programs that a kill left half-written: JAX writes when one was used after the program itself.
+    """Removes programs that a kill left half-written, which lack the access time that JAX writes after a program.
 
-    JAX 0.10 would keep nothing more beside one.
+    Next to such a program JAX 0.10 would store no others.
     """
     try:
         with FileLock(folder / LOCK, timeout=0):
             for program in folder.glob("*-cache"):
                 if not program.with_name(program.name.removesuffix("-cache") + "-atime").exists():
                     program.unlink(missing_ok=True)
-    except Timeout:  # another command is at work there, which has looked
+    except Timeout:  # another command holds the lock and has done this
         pass

@@ -1,4 +1,4 @@
-"""Options of commands that read logs, and what is said of a log before it is learned from."""
+"""Options of commands that read logs, and the lines printed about a log before training."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ FILTERED = (
     "qd-sign", "qd-unlike", "qd-delay", "qd-exchanged", "qdd-unit", "qdd-sign", "qdd-unlike", "qdd-delay",
     "qdd-exchanged", "raw-differences", "quantisation", "jitter", "gaps", "rates", "repeated",
 )  # fmt: skip
-"""Checks of what a filter of q replaces or repairs."""
+"""Checks for faults that filtering q replaces or repairs."""
 
 
 @dataclass(frozen=True)
 class Logged:
-    """What a log does not say of itself."""
+    """Facts that a log does not state."""
 
     rate: Unstated[float] = None
     """Hz, at which a file without t was sampled."""
@@ -34,7 +34,7 @@ class Logged:
 
 @dataclass(frozen=True)
 class Checked(Logged):
-    """What becomes of a log with errors."""
+    """How to treat a log with errors."""
 
     accept_log: bool = False
     """Go on although the check of the log found errors, which then are warnings."""
@@ -42,7 +42,7 @@ class Checked(Logged):
 
 @dataclass(frozen=True)
 class Filtered(Checked):
-    """How rates come about where a log has none that can be trusted."""
+    """How to derive rates where a log has no reliable ones."""
 
     cutoff: Unstated[str] = None
     """Low-pass q without delay at so many Hz, and derive the rates from it; auto: a cut-off chosen from the data
@@ -52,10 +52,10 @@ class Filtered(Checked):
 
 
 def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
-    """What the options make of a log; `None` where they leave it as it is.
+    """Filters a log as the options ask; `None` without --cutoff.
 
     Raises:
-        InputError: what is no cut-off, a decimation without one, or what `data.encoders.smooth` refuses.
+        InputError: an invalid cut-off, --decimate without --cutoff, or data that `data.encoders.smooth` refuses.
     """
     if given.cutoff is None:
         refuse_given(given, ["decimate"], "for filtered data: add --cutoff auto")
@@ -69,7 +69,7 @@ def smoothed(given: Filtered, data: Trajectories) -> Smoothed | None:
 
 
 def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
-    """Lines on where rates and torques come from, and how noisy they are."""
+    """Lines that state where rates and torques come from, and how noisy they are."""
     if found is None:
         estimated = [key for key in data.estimated if key != "tau"]
         lines = [f"not in the data: {', '.join(data.estimated)}"] if data.estimated else []
@@ -94,7 +94,7 @@ def preparation(data: Trajectories, found: Smoothed | None) -> list[str]:
 
 
 def fitted_torque(found: Smoothed | None) -> str:
-    """Which torque a model is fitted to and its bands are of, in words."""
+    """Names the torque, measured or filtered, that a model is fitted to and its uncertainty bands refer to."""
     if found is None or not found.filtered_torque:
         return "measured torques"
     return f"torques low-passed at {found.cutoff:.3g} Hz (measured ones scatter more)"
@@ -108,17 +108,17 @@ def checked(
     robot: Robot | None = None,
     without: Collection[str] = (),
 ) -> list[str]:
-    """What the quick part of `check_data` finds, a line each; none where nothing is found.
+    """Findings of the quick checks of `check_data`, one line per finding.
 
     Args:
-        given: options; with a cut-off, what concerns the rates of the file only is left out.
-        data: as they are in the file.
-        path: of the file.
-        robot: whose file the log is compared with, if there is one.
-        without: names of checks that say nothing to this command.
+        given: options; with a cut-off, checks that concern only the file's own rates (`FILTERED`) are skipped.
+        data: unfiltered data of the file.
+        path: the file.
+        robot: robot that the log is compared with, if any.
+        without: names of checks that do not matter for this command.
 
     Raises:
-        InputError: an error was found, and --accept-log was not given.
+        InputError: the log has an error, and --accept-log is not set.
     """
     filtered = isinstance(given, Filtered) and given.cutoff is not None
     settled = {*without, *(FILTERED if filtered else ())}

@@ -1,4 +1,4 @@
-"""The names of optimisers, which command lines take and stored settings have; everywhere else they are records."""
+"""Names of optimisers in command lines and stored settings; everywhere else optimisers are records."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ NAMES: dict[str, type[Optimiser]] = {"adam": Adam, "gauss-newton": GaussNewton}
 
 
 def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
-    """The optimiser of a name, with those of the settings that it has; `None` is its default.
+    """Builds an optimiser by name. Settings that it lacks are ignored; a setting of `None` takes its default.
 
     Raises:
-        InputError: an unknown name, settings out of range, or Gauss-Newton in another precision than f64.
+        InputError: an unknown name, a setting out of range, or Gauss-Newton in a precision other than f64.
     """
     if name not in NAMES:
         raise InputError(f"optimizer is '{name}'; expected one of {', '.join(NAMES)}")
@@ -27,6 +27,6 @@ def optimiser_named(name: str, *, precision: str, **settings: Any) -> Optimiser:
 
 
 def name_of(optimiser: Optimiser | type[Optimiser]) -> str:
-    """What a command line calls an optimiser."""
+    """The name of an optimiser in command lines."""
     kind = optimiser if isinstance(optimiser, type) else type(optimiser)
     return next(name for name, each in NAMES.items() if each is kind)

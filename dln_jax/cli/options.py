@@ -1,4 +1,4 @@
-"""Options that several commands have; each command inherits those that it takes, and help shows its own first."""
+"""Options shared by several commands. A command inherits the ones it takes; its help shows its own options first."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ class Folder:
 
 @dataclass(frozen=True)
 class Resumable(Folder):
-    """Where the results go, and whether a part of them is there."""
+    """Where the results go, and whether to resume a run there."""
 
     resume: bool = False
     """Continue what is in --out with the settings it was started with."""
@@ -24,7 +24,7 @@ class Resumable(Folder):
 
 @dataclass(frozen=True)
 class Drawn:
-    """Whether pictures are wanted."""
+    """Whether to draw figures."""
 
     figures: bool = True
     """Draw the figures."""
@@ -32,7 +32,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Limited:
-    """How long it may take until there is a model."""
+    """Time limit until the model is stored."""
 
     seconds: Unstated[float] = None
     """Seconds from the start of the command until the model is stored (default: no limit). Reading the data, choosing a
@@ -43,7 +43,7 @@ class Limited:
 
 @dataclass(frozen=True)
 class SingleCalls:
-    """How a model's calls are timed."""
+    """How to time single calls of a model."""
 
     low_latency: bool = True
     """Time single calls also in low-latency mode, in a process of its own (about 2 s)."""

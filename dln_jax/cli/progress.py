@@ -1,4 +1,4 @@
-"""Live progress: a bar on a terminal, a line now and then elsewhere."""
+"""Live progress: a bar on a terminal, a line every few seconds elsewhere."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -9,14 +9,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 SECONDS_BETWEEN_LINES = 5.0
 ROOM_FOR_RATE = 110
-"""Columns of a terminal from which there is room for the rate beside the count, the time left and the text."""
+"""Terminal width in columns from which the rate fits beside the count, the time left and the text."""
 
 
 @contextmanager
 def progress(
     total: int, unit: str = "steps", *, console: Console | None = None
 ) -> Iterator[Callable[[int, str], None]]:
-    """Yields `show(done, text)`: count, text and time left are whole at 80 columns, and the bar takes what is over."""
+    """Yields `show(done, text)`. Count, text and time left fit in 80 columns; the bar takes the rest of the line."""
     console = console or Console()
     if console.is_terminal:
         columns = [

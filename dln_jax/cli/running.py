@@ -1,4 +1,4 @@
-"""What the command lines share: errors as one line, names for scenes, and the folder of a run."""
+"""Shared parts of the command lines: one-line errors, scene names, and run folders."""
 
 import contextlib
 import dataclasses
@@ -36,7 +36,7 @@ from dln_jax.types import InputError, Needs, require_seed
 from dln_jax.zoo.run_folder import CONFIG, run_folder
 
 MOST_CHARACTERS = 400
-"""Of each end of a message, of which the middle is left out if it is longer."""
+"""Characters shown at either end of a long message; the middle is left out."""
 SceneName = Annotated[str, choice(SCENES)]
 
 Arguments = TypeVar("Arguments")
@@ -50,11 +50,14 @@ def run(
     from_shell: bool = False,
     joining: int = JOINING,
 ) -> None:
-    """Parses the command line and runs `main`: a user's mistake is one line and exit status 2, a refused fit 1,
-    a lost process 3, an interrupt 130.
+    """Parses the command line and runs `main`; errors and exit statuses as `as_one_line`.
 
-    `prog` is what the user typed; `from_shell`, that the process is the command's own, which keeps compiled programs;
-    `joining`, how many seconds several processes wait for each other to be started.
+    Args:
+        main: body of the command.
+        arguments: dataclass of its arguments.
+        prog: the command as the user typed it.
+        from_shell: whether the process runs only this command; compiled programs are then kept.
+        joining: seconds that several processes wait for each other to start.
     """
     # Data and references are float64; models state their own precision.
     jax.config.update("jax_enable_x64", True)
@@ -63,7 +66,7 @@ def run(
         try:
             whole = parse(with_compilation_cache(arguments), prog=prog, description=description)
         finally:
-            sys.stdout.flush()  # the help, perhaps to somebody who has gone
+            sys.stdout.flush()  # the help; raises BrokenPipeError here if its reader has closed the pipe
         given = whole.own
         require_possible(given)
         member = membership_in(given)
@@ -94,9 +97,10 @@ def run(
 
 @contextlib.contextmanager
 def as_one_line(prog: str, given: Any) -> Iterator[None]:
-    """Turns mistakes, and what the machine lacks, into one line and status 2.
+    """Reports errors in one line and sets the exit status.
 
-    A refused fit is 1, a lost process 3, an interrupt 130.
+    A user's mistake, or memory, a device or disk space that the machine lacks, is 2, a refused fit 1, a lost process 3,
+    an interrupt 130, a closed output pipe 141.
     """
     try:
         yield
@@ -116,10 +120,10 @@ def as_one_line(prog: str, given: Any) -> Iterator[None]:
         if (line := unusable_platform()) is None:
             raise
         raise _refusal(line) from None
-    except BrokenPipeError:  # whoever read the output has gone
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         _say("")
         raise SystemExit(141) from None
-    except OSError as error:  # a disk that is full, or a file that is there no more
+    except OSError as error:  # a full disk, or a file that has been removed
         where = "" if error.filename is None else f"{error.filename}: "
         raise _refusal(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt as stop:
@@ -128,7 +132,7 @@ def as_one_line(prog: str, given: Any) -> Iterator[None]:
 
 
 def _refusal(message: str) -> SystemExit:
-    """Prints a message as one line, and gives the exit of a user's mistake."""
+    """Prints an error as one line, and returns the exit for a user's mistake (status 2)."""
     shown = "".join(each if each.isprintable() else repr(each)[1:-1] for each in message)
     if len(shown) > 2 * MOST_CHARACTERS:
         shown = f"{shown[:MOST_CHARACTERS]} ... {shown[-MOST_CHARACTERS:]}"
@@ -137,7 +141,7 @@ def _refusal(message: str) -> SystemExit:
 
 
 def _say(last: str) -> None:
-    """Says a command's last word, and keeps the interpreter from complaining that it cannot write as it ends."""
+    """Prints a command's last line on standard error. Redirects closed streams so that the exit raises no error."""
     for stream, text in ((sys.stdout, ""), (sys.stderr, last)):
         try:
             print(text, end="\n" if text else "", file=stream, flush=True)
@@ -147,7 +151,7 @@ def _say(last: str) -> None:
 
 
 def with_compilation_cache(arguments: type) -> Any:
-    """A dataclass of a command's own arguments, `own`, and of `compilation_cache`, the one that all commands have."""
+    """A dataclass with a command's own arguments, `own`, and the option of all commands, `compilation_cache`."""
     kept = not getattr(arguments, "MEASURES_COMPILATION", False)
     text = "Keep compiled programs for the next command, under the user's cache, 512 MiB at most"
     text += "." if kept else "; off where compilation is measured."
@@ -161,9 +165,9 @@ def with_compilation_cache(arguments: type) -> Any:
 
 
 def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
-    """What a user is told whose interrupt ended a command, in whose folder there may be a run to continue.
+    """Message after an interrupt: how to resume the run, or that its folder is incomplete.
 
-    A command continues if its arguments have `resume`, unless they have `continues` too, and that is false.
+    A command can resume if its arguments have `resume`, unless they also have `continues` and it is false.
     """
     if folder is None:
         return "interrupted"
@@ -173,7 +177,7 @@ def interrupted(command: str, given: Any, folder: Path | None = None) -> str:
 
 
 def require_possible(given: Any) -> None:
-    """Raises `InputError` for a number that is not finite, or so large that it must be a mistake."""
+    """Raises `InputError` for an option that is not finite or is implausibly large."""
     for name, value in dataclasses.asdict(given).items():
         option = f"--{name.replace('_', '-')}"
         if isinstance(value, float):
@@ -187,7 +191,7 @@ def require_possible(given: Any) -> None:
 
 
 def needs_from_option(text: str) -> Needs:
-    """The needs that --needs states; `InputError` for what states none."""
+    """Parses --needs; `InputError` if the text does not state valid needs."""
     try:
         return needs_from_text(text)
     except InputError as error:
@@ -196,7 +200,7 @@ def needs_from_option(text: str) -> Needs:
 
 @contextlib.contextmanager
 def command_folder(given: Any, command: str, **chosen: Any) -> Iterator[Path]:
-    """Yields the run folder of a command, with its arguments in config.json, and beside them what they came to."""
+    """Yields the run folder of a command. config.json gets the arguments, and the values `chosen` from them."""
     resume = getattr(given, "resume", False)
     resumable = hasattr(given, "resume") and getattr(given, "continues", True)
     folder_of_run = (

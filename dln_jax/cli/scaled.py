@@ -1,4 +1,4 @@
-"""A command that works on several devices, and in several processes, of which the first prints and writes."""
+"""Commands on several devices and in several processes; the first process prints and writes."""
 
 import contextlib
 import dataclasses
@@ -21,26 +21,26 @@ from dln_jax.scale.mesh import batch_mesh
 from dln_jax.types import InputError
 
 SEEN_BY_USERS = ("figures", "low_latency")
-"""What the first process alone does."""
+"""Options for output that only the first process produces."""
 
 
 def mesh_of(given: Scaled) -> Mesh | None:
-    """The devices that share a command's batches, `None` where that is one alone.
+    """The mesh of devices that share a command's batches; `None` for a single device.
 
-    One process takes one device unless it is asked for more: most networks are small, and lose by being shared.
+    A single process defaults to one device: most networks are small, and sharing them is slower.
 
     Raises:
-        InputError: there are not so many.
+        InputError: the machine has fewer devices.
     """
     alone = jax.process_count() == 1
     return batch_mesh(1 if alone and given.devices is None else given.devices)
 
 
 def membership_in(given: Any) -> Membership | None:
-    """How this process joins others, `None` where it is alone; a processor has the devices that a command asks for.
+    """How this process joins others; `None` for a single process. On a CPU, sets the number of devices.
 
     Raises:
-        InputError: the options, or the cluster's variables, are no membership, or name no folder for all processes.
+        InputError: the options or the cluster's environment variables are inconsistent, or --out is missing.
     """
     if not isinstance(given, Scaled):
         return None
@@ -52,7 +52,7 @@ def membership_in(given: Any) -> Membership | None:
 
 
 def joined(member: Membership, given: Any, *, seconds: int) -> Any:
-    """Joins the other processes of a command, and gives the arguments of this one; errors as `processes.join`."""
+    """Joins the other processes of a command and returns the arguments of this one; errors as `processes.join`."""
     own = {"processes", "coordinator", "process_id", "out", *SEEN_BY_USERS}
     shared = {
         key: str(v) if isinstance(v, Path) else v for key, v in dataclasses.asdict(given).items() if key not in own
@@ -61,27 +61,27 @@ def joined(member: Membership, given: Any, *, seconds: int) -> Any:
     processes.join(member, {f"--{key.replace('_', '-')}": value for key, value in shared.items()}, seconds=seconds)
     here: dict[str, Any] = {"processes": jax.process_count(), "process_id": jax.process_index()}
     if jax.process_index():
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  to the process's end
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115  open until the process ends
         here |= {name: False for name in SEEN_BY_USERS if hasattr(given, name)}
     return dataclasses.replace(given, **here)
 
 
 def _keep_standard_output_to_python() -> None:
-    """Drops what libraries print past Python: gloo states every connection on standard output."""
+    """Drops output that libraries print past Python: gloo reports every connection on standard output."""
     sys.stdout.flush()
-    sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  to the process's end
+    sys.stdout = open(os.dup(1), "w", buffering=1, errors=sys.stdout.errors)  # noqa: SIM115  open until the process ends
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def remedy_of(given: Any) -> str:
-    """What a user does after a process was lost."""
+    """Advice to the user after a process was lost."""
     if not (hasattr(given, "resume") and getattr(given, "continues", True)):
         return "start all processes again"
     return f"continue from the last checkpoint in {getattr(given, 'out', '--out')} with --resume in all processes"
 
 
 def end_at_once(code: int) -> NoReturn:
-    """Ends this process without waiting for the others, as JAX's own shutdown does."""
+    """Ends this process at once; JAX's own shutdown would wait for the others."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):
             stream.flush()
@@ -89,12 +89,12 @@ def end_at_once(code: int) -> NoReturn:
 
 
 def is_first(given: Any) -> bool:
-    """Whether this process is the one that writes."""
+    """Whether this process writes the results."""
     return not getattr(given, "process_id", None)
 
 
 def wait_for_all(given: Any) -> None:
-    """Waits until all processes are here."""
+    """Waits until all processes have reached this call."""
     if (getattr(given, "processes", None) or 1) > 1:
         from jax.experimental import multihost_utils  # takes long to import
 
@@ -103,7 +103,11 @@ def wait_for_all(given: Any) -> None:
 
 @contextlib.contextmanager
 def copied_folder(given: Any, resume: bool) -> Iterator[Path]:
-    """Yields a folder of this process alone, which is then removed, with a copy of the run to be continued."""
+    """Yields a temporary folder for this process, with a copy of the run if it is resumed.
+
+    Raises:
+        InputError: the run's folder cannot be copied.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if resume:

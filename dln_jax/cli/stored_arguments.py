@@ -1,4 +1,4 @@
-"""The arguments that a run was started with: stored in its folder, and found again by --resume."""
+"""Arguments of a run: stored in its folder and restored by --resume."""
 
 import dataclasses
 import hashlib
@@ -12,40 +12,40 @@ from dln_jax.types import InputError
 from dln_jax.zoo.run_folder import CONFIG
 
 CHOSEN = "chosen"
-"""Key in a run's config.json of what its arguments came to, beside these."""
+"""Key in config.json of values derived from the arguments."""
 FILES = "files"
-"""Key of the SHA-256 of the files that are arguments, by their names."""
+"""Key in config.json of the SHA-256 digests of input files, by argument name."""
 SCALE = ("devices", "processes", "coordinator", "process_id")
-"""Arguments that say where a result is computed."""
+"""Arguments that state where a result is computed."""
 PLACES = ("out", "resume", "figures", "low_latency", "uncertainty", *SCALE)
-"""Arguments that do not decide the result."""
+"""Arguments that do not affect the result."""
 CHANGEABLE = ("seconds",)
-"""Arguments that may be given anew to --resume; a class of arguments may have others, as `CHANGEABLE`."""
+"""Arguments that may change with --resume; a class of arguments may list more in its own `CHANGEABLE`."""
 
 Arguments = TypeVar("Arguments")
 
 
 def write_config(folder: Path, given: Any, **chosen: Any) -> None:
-    """Writes the arguments of a run into its folder, and what they came to."""
+    """Writes config.json: the arguments of a run, the values `chosen` from them, and digests of the input files."""
     files = fingerprints(stored_files(given))
     more = {CHOSEN: chosen} if chosen else {}
     write_json(folder / CONFIG, {**stored_arguments(given), **more, **({FILES: files} if files else {})})
 
 
 def stored_arguments(given: Any) -> dict[str, Any]:
-    """The arguments that decide the result, as JSON values."""
+    """The arguments that affect the result, as JSON values."""
     values = dataclasses.asdict(given)
     return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if key not in PLACES}
 
 
 def stored_files(given: Any) -> dict[str, Path]:
-    """The files that decide the result, by the names of their arguments."""
+    """The input files that affect the result, by argument name."""
     values = dataclasses.asdict(given)
     return {key: v for key, v in values.items() if isinstance(v, Path) and key not in PLACES and is_file(v)}
 
 
 def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
-    """SHA-256 of each file, by which a resumed run knows it wherever it is."""
+    """SHA-256 digests of files; a resumed run recognises its files by them, even if they have moved."""
     found = {}
     for name, path in files.items():
         with path.open("rb") as file:
@@ -54,12 +54,12 @@ def fingerprints(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def with_stored_arguments(given: Arguments) -> Arguments:
-    """The arguments that the run in --out was started with; what is given anew must not differ.
+    """Restores the arguments of the run in --out; arguments on the command line must not contradict them.
 
-    A file may have another path, if it is the same file.
+    A file may have moved, if its content is the same.
 
     Raises:
-        InputError: --out holds no run, one of other arguments or files, or one whose config.json is damaged.
+        InputError: --out holds no run, its arguments or files differ, or its config.json is damaged.
     """
     folder = getattr(given, "out")  # noqa: B009  every script's arguments have it
     if folder is None or not is_file(folder / CONFIG):
@@ -94,10 +94,10 @@ def with_stored_arguments(given: Arguments) -> Arguments:
 
 
 def checked_arguments(path: Path, arguments: type, expected: Collection[str]) -> dict[str, Any]:
-    """The stored arguments in a config.json, each of the type that a script's arguments state for it.
+    """Reads the arguments in a config.json and checks their types against the command's dataclass.
 
     Raises:
-        InputError: the file is damaged, or a release with other arguments has written it.
+        InputError: the file is damaged, or a release with other arguments wrote it.
     """
     remedy = "restore the file, or train again into another folder"
     stored = read_json(path, remedy=remedy)
@@ -106,7 +106,7 @@ def checked_arguments(path: Path, arguments: type, expected: Collection[str]) ->
     if absent := [key for key in expected if key not in stored]:
         raise InputError(f"{path}: {absent[0]} is missing; {remedy}")
     hints = get_type_hints(arguments)
-    # What another release had and nobody gave decides nothing.
+    # An argument of another release that was left unset does not affect the result.
     stored = {key: value for key, value in stored.items() if key in expected or value not in (None, False)}
     for key, value in stored.items():
         if key not in expected:

@@ -5,4 +5,4 @@ COMMANDS = [
     *("train_hnn_pixels", "train_diffnet", "swing_up", "train_value", "simulate", "train_locomotion"),
     *("sweep", "export_c"),
 ]
-"""Their names, in the order of work: data, models, control, soft bodies, many runs, deployment."""
+"""Names of the commands, in the order of a project: data, models, control, soft bodies, sweeps, deployment."""

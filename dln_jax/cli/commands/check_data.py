@@ -25,7 +25,7 @@ from dln_jax.files import write_bytes, write_figure, write_json
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments(Folder, Drawn, Logged):
-    """What to examine."""
+    """The log to examine."""
 
     data: Path
     """Log as npz or CSV: t and q, and tau, qd, qdd and trajectory where there are any."""
@@ -37,7 +37,7 @@ class Arguments(Folder, Drawn, Logged):
 
 
 def main(given: Arguments) -> None:
-    """Examines, prints and writes; exits with status 1 if an error was found."""
+    """Examines the log, prints and writes the findings; exits with status 1 if there is an error among them."""
     recording = read(given.data, rate=given.rate, units=given.units)
     if given.robot is None:
         refuse_given(given, ["hold"], "for joints of --robot")
@@ -57,7 +57,7 @@ def main(given: Arguments) -> None:
 
 
 def metrics(examined: Examination) -> dict[str, Any]:
-    """Numbers of the page."""
+    """Metrics of the examination, for metrics.json."""
     counted = {f"{kind}s": sum(each.severity == kind for each in examined.findings) for kind in ("error", "warning")}
     smoothed, regression, on_tree = examined.smoothed, examined.regression, examined.on_tree
     numbers: dict[str, Any] = dict(counted)

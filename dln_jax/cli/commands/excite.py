@@ -40,7 +40,7 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments(Folder, Drawn):
-    """Which robot, which motions, within which limits."""
+    """Robot, motions and limits."""
 
     robot: Path
     """URDF or MJCF file; meshes need not be there."""
@@ -86,7 +86,7 @@ class Arguments(Folder, Drawn):
 
 
 class Prepared(NamedTuple):
-    """What the arguments come to."""
+    """Robot, limits, model and task that follow from the arguments."""
 
     robot: Robot
     names: tuple[str, ...]
@@ -97,7 +97,7 @@ class Prepared(NamedTuple):
 
 
 def main(given: Arguments) -> None:
-    """Designs, writes and says what was written."""
+    """Designs the motions, writes them and prints a summary."""
     require_positive(trajectories=given.trajectories, starts=given.starts)
     prepared = prepare(given)
     with command_folder(given, "excite") as folder:
@@ -116,14 +116,14 @@ def main(given: Arguments) -> None:
 
 
 def prepare(given: Arguments) -> Prepared:
-    """Reads the robot, and says what is assumed of it."""
+    """Reads the robot, builds the task, and prints the limits that had to be assumed."""
     if given.criterion not in CRITERIA:
         raise InputError(f"--criterion is '{given.criterion:.60}'; expected one of {', '.join(CRITERIA)}")
     require_sampling(period=given.seconds, harmonics=given.harmonics, rate=given.rate)
     robot = read_robot(given.robot)
     d = robot.tree.degrees_of_freedom
     samples = given.seconds * given.rate * (given.trajectories + 1)
-    # Measured values, rates and torques, as they are written and drawn.
+    # Positions, rates and torques in the copies that are written and drawn.
     require_memory(f"{samples:.3g} samples (--seconds, --rate and --trajectories)", 100.0 * d * samples)
     if given.payload is not None:
         require_positive(payload=given.payload)
@@ -161,12 +161,12 @@ def prepare(given: Arguments) -> Prepared:
 
 
 def labels(designs: list[Design]) -> list[str]:
-    """Names of the motions, the last of which is to validate on."""
+    """Names of the motions; the last one is for validation."""
     return [*(f"train-{place + 1}" for place in range(len(designs) - 1)), VALIDATION]
 
 
 def numbers(task: Task, drawn: list[Design], train: list[Design], validation: Design) -> dict[str, float]:
-    """Of what was drawn and what was designed; sets are as many motions taken together."""
+    """Metrics of the random and the designed motions; a random set combines as many motions as the training set."""
     groups = [drawn[place : place + len(train)] for place in range(0, len(drawn) - len(train) + 1, len(train))]
     ratios = [error_ratio(train, group) for group in groups]
     return {
@@ -186,7 +186,7 @@ def numbers(task: Task, drawn: list[Design], train: list[Design], validation: De
 
 
 def write(folder: Path, given: Arguments, prepared: Prepared, designs: list[Design]) -> None:
-    """The motions, as data, as tables and as series."""
+    """Writes the motions as a dataset, as CSV tables and as Fourier series."""
     data = _data(given.rate, prepared, designs)
     schema.save(folder / "excitation.npz", data)
     for index, label in enumerate(data.label):
@@ -212,17 +212,17 @@ def _data(rate: float, prepared: Prepared, designs: list[Design]) -> schema.Traj
 
 
 def draw(folder: Path, prepared: Prepared, drawn: list[Design], designs: list[Design]) -> None:
-    """The figure."""
+    """Draws the motions, their limits and their condition numbers."""
     limits = prepared.limits
     shown = {"q": limits.position, "qd": np.stack([-limits.velocity, limits.velocity], 1), "tau": limits.force}
     conditions = {"random": [each.condition for each in drawn], "designed": [each.condition for each in designs]}
-    # A picture has some thousand points across.
+    # The figure is some thousand points wide: a higher rate would not show.
     data = _data(max(400 / prepared.task.period, 3 * prepared.task.harmonics / prepared.task.period), prepared, designs)
     write_figure(folder / "excitation.png", excitation_figure(data, shown, names=prepared.names, conditions=conditions))
 
 
 def say(drawn: list[Design], train: list[Design], validation: Design, metrics: dict[str, float]) -> None:
-    """The table."""
+    """Prints the table of condition numbers and the gain in standard error."""
     count = metrics["base_parameters"]
     rows = [
         (name, f"{condition:.3g}", f"{logarithm:.1f}", near)

@@ -19,7 +19,7 @@ from dln_jax.mechanics.discrete import ITERATIONS
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to export, and where to."""
+    """What to export, and where."""
 
     run: Path
     """Folder of a training run, with model.json and model.safetensors."""
@@ -42,7 +42,7 @@ class Arguments:
 
 
 def main(given: Arguments) -> None:
-    """Exports, and says what was written."""
+    """Exports the model, and prints the files and the functions left out."""
     paths = export_run(
         given.run,
         given.out,

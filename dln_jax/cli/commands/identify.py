@@ -14,9 +14,9 @@ from dln_jax.training.identification.task import Options
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments(Options):
-    """The robot, the data, and how it is identified."""
+    """Robot, data and method of identification."""
 
 
 def main(given: Arguments) -> None:
-    """Identifies, evaluates, and writes the run folder."""
+    """Identifies the robot, evaluates the model and writes the run folder."""
     run(given, "identify")

@@ -21,7 +21,7 @@ OF_KIND = {
     "uniform": ("samples", "position_bound", "rate_bound", "acceleration_bound", "control_bound", "seed"),
     "free-swing": ("trajectories", "steps", "dt", "seed"),
 }
-"""Options of each kind; what is not given is the generator's own choice."""
+"""Options of each kind; unset options take the generator's defaults."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Arguments:
 
 
 def main(given: Arguments) -> None:
-    """Generates, writes and says what was written."""
+    """Generates the trajectories, writes them and prints a summary."""
     data = generate(given)
     schema.save(given.out, data, overwrite=given.overwrite)
     count = len(set(data.trajectory.tolist()))
@@ -65,7 +65,7 @@ def main(given: Arguments) -> None:
 
 
 def generate(given: Arguments) -> Trajectories:
-    """The trajectories that the arguments ask for."""
+    """Generates the requested trajectories; `InputError` for options that the kind or the scene does not use."""
     scene = scene_named(given.scene)
     unused = {name for names in OF_KIND.values() for name in names} - set(OF_KIND[given.kind])
     refuse_given(given, sorted(unused), f"not used for --kind {given.kind}")

@@ -51,17 +51,17 @@ MATERIALS = {
 }
 FACETS = {2: "edges", 3: "triangles"}
 CHUNKS = 20
-"""Programs called for a motion, after each of which progress is shown."""
+"""Number of chunks a motion is split into; progress is shown after every chunk."""
 LARGEST_SIZE = 10.0
-"""Length in m above which a mesh is probably in millimetres."""
+"""Length, m, above which a mesh is probably in millimetres."""
 ALL = "all"
 GALLERY = (0, 3, 2, 1, 4)
-"""Order of the scenes in the picture of all."""
+"""Order of the scenes in the combined picture."""
 
 
 @dataclass(frozen=True)
 class Arguments(Folder, Drawn):
-    """What to simulate, how, and where the results go. What is not given is the scene's own choice."""
+    """What to simulate, how, and where the results go. Unset options take the scene's defaults."""
 
     scene: Literal["beam", "twist", "slope", "drop", "creature", "all"] = "beam"
     """What to simulate; all: each in a folder of its own, with one picture of them."""
@@ -94,18 +94,18 @@ class Arguments(Folder, Drawn):
 
 
 class Prepared(NamedTuple):
-    """A scene that is ready to be simulated."""
+    """A scene with its stepper, ready to simulate."""
 
     given: Arguments
     example: Example
     stepper: Stepper
     dt: float
-    """In s."""
+    """Time step, s."""
     steps: int
 
 
 def main(given: Arguments) -> None:
-    """Simulates one scene into the run folder, or all, each into a folder of its own, with one picture of them."""
+    """Simulates one scene into the run folder, or all scenes into subfolders with a combined picture."""
     several = given.scene == ALL
     prepared = [prepare(dataclasses.replace(given, scene=name)) for name in (EXAMPLES if several else [given.scene])]
     with run_folder(given.out, "simulate") as folder:
@@ -121,7 +121,7 @@ def main(given: Arguments) -> None:
 
 
 def prepare(given: Arguments) -> Prepared:
-    """What is to be simulated; every mistake of the command line is found here, before anything is written."""
+    """Builds the scene and its stepper; checks the whole command line before anything is written."""
     example = example_of(given)
     dt, seconds = resolved(given, {"dt": example.dt, "seconds": example.seconds}).values()
     require_positive(dt=dt, seconds=seconds)
@@ -129,14 +129,14 @@ def prepare(given: Arguments) -> Prepared:
         raise InputError(f"--seconds is {seconds} and --dt {dt}; expected a finite length of one time step or more")
     steps = round(seconds / dt)
     require_within({"steps (--seconds / --dt)": steps})
-    # Positions and velocities of every step, twice: they are joined from chunks.
+    # Positions and velocities of every step in float64, held twice while chunks are concatenated.
     require_memory(f"a motion of {steps:,} steps", 32.0 * steps * example.scene.mesh.vertices.size)
     stepper = driven_step(example, dt, INTEGRATORS[given.integrator])
     return Prepared(given, example, stepper, dt, steps)
 
 
 def simulate(prepared: Prepared, folder: Path) -> Moments:
-    """Simulates one scene and writes its folder; gives its picture."""
+    """Simulates one scene, writes its folder and returns its picture."""
     given, example, _, dt, steps = prepared
     write_json(folder / CONFIG, {**stored_arguments(given), "dt": dt, "seconds": steps * dt})
     mesh = example.scene.mesh
@@ -174,10 +174,10 @@ def simulate(prepared: Prepared, folder: Path) -> Moments:
 
 
 def example_of(given: Arguments) -> Example:
-    """The scene with what was chosen for it.
+    """Builds the scene with the options set on the command line.
 
     Raises:
-        InputError: an unknown name, a choice that the scene does not have, or a value that cannot be.
+        InputError: an option that the scene does not have, options that exclude each other, or an invalid value.
     """
     scene = EXAMPLES[given.scene]
     names = ("cells", "dimension", "youngs_modulus", "poisson_ratio", "friction", "turns", "mesh")
@@ -208,12 +208,12 @@ def example_of(given: Arguments) -> Example:
 
 
 def in_precision(tree: Any, precision: Any) -> Any:
-    """Floating point arrays in this precision."""
+    """Casts the floating-point arrays of a tree to this precision."""
     return jax.tree.map(lambda leaf: leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)
 
 
 def run_motion(prepared: Prepared) -> Motion:
-    """The motion, in chunks of one compiled program; compilation is timed apart, and results are waited for."""
+    """Runs the motion in chunks of one compiled program; times compilation separately and waits for the results."""
     given, example, (init, step), dt, steps = prepared
     count = max(1, steps // CHUNKS)
     params = example.scene.params

@@ -24,7 +24,7 @@ from dln_jax.types import InputError
 
 @dataclass(frozen=True)
 class Arguments(Resumable):
-    """What to run, where, and how to compare."""
+    """What to run, where to run it, and how to compare the jobs."""
 
     CHANGEABLE: ClassVar = ("where", "jobs", "gpus", "slurm", "metric", "best", "error", "over")
 
@@ -55,7 +55,7 @@ class Arguments(Resumable):
 
 
 def main(given: Arguments) -> None:
-    """Checks, runs, and shows what came of it; raises `SystemExit` with 1 if a job is not done."""
+    """Checks the grid, runs the jobs and shows the results; raises `SystemExit` with 1 if a job is not done."""
     require_positive_if_given(given, ("jobs", "gpus"))
     grid, fixed = grid_of(given.grid or ""), fixed_of(given.fixed)
     if given.jobs is not None and given.jobs > (given.gpus or given.jobs):
@@ -84,7 +84,7 @@ def main(given: Arguments) -> None:
 
 
 def arguments_of(command: str) -> type:
-    """The dataclass of a command's arguments; `InputError` for a name that is none, or this one's."""
+    """The dataclass of a command's arguments; `InputError` for an unknown command or `sweep` itself."""
     known = [name for name in COMMANDS if name != "sweep"]
     if command not in known:
         like = closest(command, known)
@@ -93,7 +93,7 @@ def arguments_of(command: str) -> type:
 
 
 def over_of(text: str | None, grid: dict[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Options of --over that the grid has, by default seed if it is one."""
+    """Options named by --over, by default seed if the grid has it; `InputError` for one that is not in the grid."""
     if text is None:
         return ("seed",) if "seed" in grid else ()
     names = tuple(name.strip().replace("-", "_") for name in text.split(","))

@@ -20,7 +20,7 @@ from dln_jax.training.swing_ups.run import asked, swing_up
 
 @dataclass(frozen=True)
 class Arguments(Folder, Drawn):
-    """What to swing up, by which model, and where the results go."""
+    """Plant, model, and where the results go."""
 
     plant: Annotated[str, choice(NAMES)] = "rotary-pendulum"
     """The plant; furuta is the rotary pendulum by its other name."""
@@ -35,7 +35,7 @@ class Arguments(Folder, Drawn):
 
 
 def main(given: Arguments) -> None:
-    """Explores, learns and swings up, into the run folder."""
+    """Explores the plant, learns the model, swings up and writes the run folder."""
     checked = asked(given.plant, given.model, given.seconds_of_data, given.starts, given.seed)
     with command_folder(given, "swing_up") as folder:
         swing_up(checked, folder, figures=given.figures)

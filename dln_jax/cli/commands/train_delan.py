@@ -39,5 +39,5 @@ class Arguments(ArmOptions):
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates the model, and writes the run folder."""
     run(given, "train_delan")

@@ -10,5 +10,5 @@ from dln_jax.training.functions.task import Options as Arguments
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates the network, and writes the run folder."""
     run(given, "train_diffnet")

@@ -24,7 +24,7 @@ class Arguments(Options):
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates the model, and writes the run folder; `InputError` for data without tau."""
     if given.data is not None and "tau" in schema.load(given.data).estimated:
         raise InputError(
             f"{given.data} has no tau, which train_hnn is fitted to; motions without applied forces are for "

@@ -13,5 +13,5 @@ from dln_jax.training.hamiltonian.run import run
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates the model, and writes the run folder."""
     run(given, "train_hnn_task")

@@ -19,7 +19,7 @@ from dln_jax.training.results import print_numbers
 from dln_jax.types import InputError
 
 UNUSED = {"gradient": (), "evolution": ("window",), "ppo": ("window", "width")}
-"""Options that a method does not use."""
+"""Options that are refused with a method because it does not use them."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Arguments(Options, Resumable, Drawn, Scaled):
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates the policy, and writes the run folder."""
     refuse_given(given, UNUSED[given.method], f"not used by --method {given.method}")
     if given.resume and not given.continues:
         raise InputError("--resume is for gradient and evolution; train again without it")

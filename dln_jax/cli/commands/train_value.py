@@ -45,7 +45,7 @@ from dln_jax.types import InputError, require_positive, require_seed
 
 @dataclass(frozen=True)
 class Arguments(Folder, Scaled):
-    """What to train a value function of, how, and where it goes."""
+    """Plant, method, and where the results go."""
 
     plant: Annotated[str | None, choice(PLANTS, unstated=True)] = None
     """The plant and its costs (default: pendulum)."""
@@ -74,7 +74,7 @@ class Arguments(Folder, Scaled):
 
 
 def main(given: Arguments) -> None:
-    """Trains, evaluates, and writes the run folder."""
+    """Trains and evaluates a value function, or evaluates a stored one, and writes the run folder."""
     mesh = mesh_of(given)
     require_positive(seeds=given.seeds, starts=given.starts)
     require_seed(given.seed, given.seeds)
@@ -104,7 +104,7 @@ OF_TRAINING = ("plant", "method", "goal", "width", "depth", "members", "iteratio
 
 
 def evaluate_stored(given: Arguments, stored: Path) -> None:
-    """Evaluates the value function of a run on its own plant; `InputError` for options that only a training has."""
+    """Evaluates a stored value function on its own plant; `InputError` for options that only training uses."""
     unused = [name for name in OF_TRAINING if getattr(given, name) != getattr(Arguments(), name)]
     if unused:
         raise InputError(
@@ -117,7 +117,7 @@ def evaluate_stored(given: Arguments, stored: Path) -> None:
 
 
 def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteration, mesh: Mesh | None) -> list[Trained]:
-    """The trainings of all seeds, with their progress."""
+    """Trains once per seed and shows the progress."""
     seeds = range(given.seed, given.seed + given.seeds)
     with contextlib.ExitStack() as stack:
         show: list[Callable[[int, str], None]] = []
@@ -134,7 +134,7 @@ def train(given: Arguments, plant: ValuePlant, family: Family, numbers: Iteratio
 
 
 def over_seeds(trained: list[Trained]) -> dict[str, float]:
-    """Medians and the worst of several."""
+    """Median and worst validation, and median training time, over several seeds."""
     validation = [each.validation for each in trained]
     return {
         "validation_median": float(np.median(validation)),
@@ -144,7 +144,7 @@ def over_seeds(trained: list[Trained]) -> dict[str, float]:
 
 
 def finish(folder: Path, run: ValueRun, given: Arguments, numbers: dict[str, float]) -> None:
-    """Evaluates a value function, prints and writes the numbers."""
+    """Evaluates a value function, prints the numbers and writes them to metrics.json."""
     numbers = numbers | measured(run.plant, run.law, count=given.starts)
     write_json(folder / "metrics.json", {key: finite(value) for key, value in numbers.items()})
     rows = [[key.replace("_", " "), f"{value:.4g}", "s" if "seconds" in key else ""] for key, value in numbers.items()]
@@ -153,7 +153,7 @@ def finish(folder: Path, run: ValueRun, given: Arguments, numbers: dict[str, flo
 
 
 def posture(text: str | None) -> tuple[float, ...] | None:
-    """The coordinates of --goal; `InputError` for what are no numbers."""
+    """Parses the coordinates of --goal; `InputError` for text that is not numbers."""
     if text is None:
         return None
     return numbers_of("--goal", text)

@@ -1,3 +1,3 @@
-"""Many runs of one command: a grid of its options as independent jobs, on engines that exist, and what came of them."""
+"""Sweeps: a grid of one command's options as independent jobs on existing executors, and a comparison of the runs."""
 
 __all__ = []

@@ -1,4 +1,4 @@
-"""What of a sweep is drawn: which options are colours and markers, and which runs are points."""
+"""Figure of a sweep: which options set colours and markers, and which runs become points."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,7 +9,7 @@ from dln_jax.cli.sweeps.tables import spaced
 from dln_jax.figures.sweeps import Point, error_against_seconds
 
 MOST_PANELS = 6
-"""One for each problem, if there are not more, and each has several jobs."""
+"""Largest number of problems drawn in panels of their own."""
 
 
 def drawn(
@@ -21,15 +21,15 @@ def drawn(
     *,
     beside: int | None,
 ) -> Figure | None:
-    """Test error against seconds of training; None where no job has both.
+    """Draws test error against training time; `None` if no job has both.
 
     Args:
         found: all jobs.
-        best: those to ring.
-        of: groups, whose medians are drawn if jobs differ in `over`.
+        best: jobs to mark with a ring.
+        of: groups of jobs; their medians are drawn if the grid has an option of `over`.
         over: options that medians are taken over.
-        names: metrics.
-        beside: jobs that ran beside each other, if that is known.
+        names: names of the metrics.
+        beside: number of jobs that ran at once, if known.
     """
     if not names.error or not names.seconds:
         return None
@@ -67,7 +67,7 @@ def drawn(
 
 
 def undone(found: Sequence[Entry]) -> str:
-    """How many jobs are not done, and why; empty if all are."""
+    """Counts of the jobs that are not done, by state; empty if all are done."""
     states = [entry.status.state for entry in found if entry.status.state != "done"]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
     return f"{len(found)} jobs, of which {counts}" if states else ""

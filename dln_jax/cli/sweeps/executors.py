@@ -1,4 +1,4 @@
-"""What runs the jobs of a sweep: each yields a function from jobs to futures (`done()`, `cancel()`) of an executor."""
+"""Executors of a sweep: contexts that yield a function from jobs to futures (`done()`, `cancel()`)."""
 
 import contextlib
 import importlib
@@ -21,15 +21,17 @@ from dln_jax.types import InputError
 Submit = Callable[[Sequence[Job]], Sequence[Any]]
 """Jobs -> their futures."""
 MOST_JOBS = 1000
-"""Of one array, by Slurm's default MaxArraySize."""
+"""Largest number of jobs in an array, Slurm's default MaxArraySize."""
 MINUTES, TIMEOUTS = 60, 20
-"""After which Slurm ends a job and submitit queues it again, and how often."""
+"""Time limit of a Slurm job in minutes, and how often submitit requeues a job that reaches it."""
 
 
 @contextlib.contextmanager
 def here(at_once: int, gpus: int) -> Iterator[Submit]:
-    """Processes of this machine. Each gets its share of the cores as XLA's threads, one thread for BLAS, and one GPU or
-    none; what the user has set stays.
+    """Runs jobs as processes of this machine.
+
+    A process gets its share of the cores as XLA threads, one BLAS thread, and one GPU or none. Variables that the user
+    has set keep their values, except CUDA_VISIBLE_DEVICES.
     """
     running: list[Popen] = []
     ending = threading.Event()
@@ -64,15 +66,15 @@ def here(at_once: int, gpus: int) -> Iterator[Submit]:
 
 @contextlib.contextmanager
 def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Submit]:
-    """One array of a Slurm cluster, by submitit.
+    """Runs jobs as one array of a Slurm cluster, by submitit.
 
     Args:
-        folder: of the sweep, which all hosts must see.
-        at_once: jobs of the array that run beside each other; None: as many as Slurm allows.
-        options: of sbatch, by the names that submitit has for them: "partition=gpu time=60 gpus_per_node=1".
+        folder: folder of the sweep, which all hosts must see.
+        at_once: jobs of the array that run at once; None: as many as Slurm allows.
+        options: options of sbatch under submitit's names: "partition=gpu time=60 gpus_per_node=1".
 
     Raises:
-        InputError: no Slurm here, more jobs than an array holds, or an option that submitit does not know.
+        InputError: Slurm is not installed here, the array is too large, or submitit does not know an option.
     """
     submitit = required("submitit", "sweep")
     if missing := [name for name in ("sbatch", "srun", "sacct", "scancel") if shutil.which(name) is None]:
@@ -97,14 +99,14 @@ def slurm(folder: Path, at_once: int | None, options: str) -> Iterator[Submit]:
     try:
         yield submit
     finally:
-        # submitit hands jobs and results over in pickles, which are not read again.
+        # submitit exchanges jobs and results as pickles; nothing reads them again.
         for left in (folder / "submitit").glob("*.pkl"):
             left.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def ray(at_once: int, gpus: int) -> Iterator[Submit]:
-    """Tasks of Ray: on the cluster of RAY_ADDRESS, else on this machine; each has a core, and one GPU if there are."""
+    """Runs jobs as Ray tasks, on the cluster of RAY_ADDRESS or on this machine, with one core and at most one GPU."""
     package = required("ray", "ray")
     if os.environ.get("RAY_ADDRESS"):
         package.init(log_to_driver=False)
@@ -120,12 +122,12 @@ def ray(at_once: int, gpus: int) -> Iterator[Submit]:
 
 
 def perform(job: Job) -> None:
-    """Does a job: a function, for executors that take no other callable."""
+    """Runs a job: a plain function, for executors that accept no other callable."""
     job()
 
 
 def sbatch_options(text: str) -> dict[str, Any]:
-    """The values of --slurm, by the names that submitit has for them."""
+    """Parses --slurm into submitit's parameters; `InputError` if the time is not in whole minutes."""
     found: dict[str, Any] = {}
     for name, value in pairs("--slurm", text).items():
         number = value.isdecimal() and len(value) < 10
@@ -136,12 +138,12 @@ def sbatch_options(text: str) -> dict[str, Any]:
 
 
 def cores() -> int:
-    """That this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def required(package: str, extra: str) -> ModuleType:
-    """An executor's package; `InputError` names the extra that brings it, where it is missing."""
+    """Imports an executor's package; `InputError` names the extra that installs it if it is missing."""
     try:
         return importlib.import_module(package)
     except ImportError:

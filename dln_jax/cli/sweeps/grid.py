@@ -1,4 +1,4 @@
-"""The language of grids: `width=8,16 seed=0:10 data=a.npz,b.npz`, all combinations of some options' values."""
+"""Syntax of grids: `width=8,16 seed=0:10 data=a.npz,b.npz` means all combinations of these values."""
 
 import itertools
 import re
@@ -11,18 +11,18 @@ from dln_jax.types import InputError
 RANGE = re.compile(r"(-?\d+):(-?\d+)(?::(-?\d+))?")
 MOST_JOBS = 10_000
 MOST_DIGITS = 60
-"""Of a range."""
+"""Longest text of a range."""
 EXAMPLE = "expected for example 'width=8,16 seed=0:10'"
 
 
 def grid_of(text: str) -> dict[str, tuple[str, ...]]:
-    """Values by option, in the order of the text.
+    """Parses a grid: values by option, in the order of the text.
 
-    Options are separated by spaces, values by commas; `a:b` and `a:b:step` are whole numbers, without b. Quotes keep
-    spaces, as in a shell.
+    Spaces separate options, commas separate values; `a:b` and `a:b:step` are whole numbers that exclude b. Quotes
+    protect spaces, as in a shell.
 
     Raises:
-        InputError: no or no such text, an option or a value twice, an empty range, more than 10,000 combinations.
+        InputError: empty or malformed text, a repeated option or value, an empty range, more than 10,000 combinations.
     """
     grid = {name: _values(name, values) for name, values in pairs("--grid", text).items()}
     if not grid:
@@ -36,17 +36,17 @@ def grid_of(text: str) -> dict[str, tuple[str, ...]]:
 
 
 def fixed_of(text: str) -> dict[str, str]:
-    """The value of each option that all jobs have, commas and all: `steps=500 test=e,q,v`. Errors as `grid_of`."""
+    """Parses options common to all jobs; commas are part of a value: `steps=500 test=e,q,v`. Errors as `pairs`."""
     return pairs("--fixed", text)
 
 
 def combinations(grid: Mapping[str, Sequence[str]]) -> list[dict[str, str]]:
-    """Every combination of the values, the last option's changing fastest."""
+    """All combinations of the values; the last option changes fastest."""
     return [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
 
 
 def pairs(option: str, text: str) -> dict[str, str]:
-    """The words NAME=VALUE of an option's text; `InputError` for others, and for a name twice."""
+    """Splits an option's text into NAME=VALUE pairs; `InputError` for other words and for repeated names."""
     try:
         words = shlex.split(text)
     except ValueError as error:

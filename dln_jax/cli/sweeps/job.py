@@ -1,4 +1,4 @@
-"""One job of a sweep: a command in a process of its own, and one small file in its folder that says how it ended."""
+"""One job of a sweep: a command in its own process, and a status file in its folder that records how it ended."""
 
 import os
 import re
@@ -20,57 +20,57 @@ from dln_jax.zoo.run_folder import CONFIG, LOCK
 
 STATUS = "status.json"
 OUTPUT = "output.txt"
-"""What the command printed, errors too."""
+"""Standard output and errors of the command."""
 METRICS = "metrics.json"
-"""In the run's folder: what is compared."""
+"""File in the run's folder with the numbers to compare."""
 INTERRUPTED = 130
 SECONDS_TO_END = 10.0
-"""For a command that was interrupted to store its last checkpoint."""
+"""Time that an interrupted command has to store its last checkpoint, before it is killed."""
 _RUN = re.compile(r"run(-\d{1,9})?")
-"""Names of the folders that a job gives to its runs."""
+"""Names of the run folders that a job creates."""
 State = Literal["missing", "running", "done", "failed", "killed"]
 
 
 class Status(NamedTuple):
-    """How far a job is."""
+    """Progress of a job."""
 
     state: State = "missing"
     line: str = ""
-    """Why, if it is not done: the command's own line, or what ended it."""
+    """Reason if the job is not done: the command's error message, or the signal that ended it."""
     attempt: int = 0
     run: str = "run"
-    """Folder of the run, in the job's."""
+    """Name of the run's folder within the job's folder."""
     seconds: float | None = None
-    """From start to end of the last attempt."""
+    """Duration of the last attempt."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a command, which any executor may call in any process that sees its folder.
+    """One run of a command; any executor may call it in any process that sees its folder.
 
-    A job that is done is not done again. One that was begun is continued with --resume if its command can, else begun
-    anew in another folder. Of two processes that have the same job the second waits for the first.
+    A finished job is not repeated. An interrupted one continues with --resume if its command supports that, else it
+    starts again in another folder. If two processes call the same job, the second waits for the first.
     """
 
     folder: Path
     command: str
     arguments: tuple[str, ...]
-    """Of the command's line, without --out and --resume."""
+    """Arguments of the command line, without --out and --resume."""
     values: Mapping[str, str]
-    """Of the grid, as they were typed."""
+    """Grid values by option, as typed."""
     resumes: bool
-    """Whether the command can continue what was interrupted."""
+    """Whether the command can continue an interrupted run."""
     directory: Path
-    """In which the command runs."""
+    """Working directory of the command."""
 
     def __call__(
         self, environment: Mapping[str, str] = os.environ, started: Callable[[subprocess.Popen], None] | None = None
     ) -> None:
-        """Runs the command and stores how it ended.
+        """Runs the command and stores its status.
 
         Args:
-            environment: of the command.
-            started: called with its process.
+            environment: environment variables of the command.
+            started: called with the command's process.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(self.folder / LOCK):
@@ -101,21 +101,21 @@ class Job:
             write_json(self.folder / STATUS, status._asdict())
 
     def line(self, run: Path) -> list[str]:
-        """The command's line, for a folder of its run."""
+        """The command line that writes its run into this folder."""
         return [sys.executable, "-m", "dln_jax", self.command, *self.arguments, f"--out={run}"]
 
     def checkpoint(self, *arguments: Any) -> Any:
-        """What submitit queues before the job's time is up or as it is preempted: the same job, which resumes."""
+        """Called by submitit on a timeout or preemption: requeues the same job, which then resumes."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, *arguments)
 
 
 def status_of(folder: Path) -> Status:
-    """The status of the job in a folder; one that something else has run is done if its metrics are there.
+    """Reads the status of the job in a folder. A job run by other means counts as done if its metrics exist.
 
     Raises:
-        InputError: the file is damaged, or names a run that is not in the job's folder.
+        InputError: the status file is damaged, or names a run that is not in the job's folder.
     """
     path, remedy = folder / STATUS, "remove it, and --resume does the job again"
     if not is_file(path):
@@ -133,9 +133,9 @@ def status_of(folder: Path) -> Status:
 
 
 def end_processes(processes: list[subprocess.Popen]) -> None:
-    """Interrupts commands, so that they store a checkpoint, and kills those that do not end."""
+    """Interrupts commands so that they store a checkpoint, and kills the ones that do not end in time."""
     for process in processes:
-        process.terminate()  # our commands end as by Ctrl-C, which a process in the background would ignore
+        process.terminate()  # our commands treat it as Ctrl-C; a background process would ignore Ctrl-C itself
     until = time.monotonic() + SECONDS_TO_END
     for process in processes:
         try:
@@ -146,7 +146,7 @@ def end_processes(processes: list[subprocess.Popen]) -> None:
 
 
 def _outcome(code: int, output: Path, first: int) -> tuple[State, str]:
-    """State and reason of an exit status, and of what the command printed from the byte `first` on."""
+    """State and reason of a job, from its exit status and its output after the byte `first`."""
     if code == 0:
         return "done", ""
     if code in (INTERRUPTED, -signal.SIGINT, -signal.SIGTERM):

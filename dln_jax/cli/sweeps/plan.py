@@ -1,4 +1,4 @@
-"""From a grid to jobs: options and values checked against the command's own arguments before anything starts."""
+"""From a grid to jobs; checks options and values against the command's own arguments before anything starts."""
 
 import dataclasses
 import difflib
@@ -13,25 +13,25 @@ from dln_jax.cli.sweeps.job import Job
 from dln_jax.types import InputError
 
 OF_SWEEPS = ("out", "resume", "processes", "coordinator", "process_id")
-"""Options of commands that every job gets from the sweep, or cannot have."""
+"""Options that the sweep sets for its jobs or that its jobs cannot use."""
 TRUTH = {**dict.fromkeys(("yes", "true", "on"), True), **dict.fromkeys(("no", "false", "off"), False)}
 
 
 def plan(
     command: str, arguments: type, grid: Mapping[str, Sequence[str]], fixed: Mapping[str, str], folder: Path
 ) -> list[Job]:
-    """The jobs of a grid, in folders 0000, 0001, ... below `folder`.
+    """The jobs of a grid, in folders jobs/0000, jobs/0001, ... of `folder`.
 
     Args:
         command: name of the command.
         arguments: its dataclass of arguments.
         grid: values by option.
-        fixed: values of the options that all jobs have.
-        folder: of the sweep.
+        fixed: values of the options common to all jobs.
+        folder: folder of the sweep.
 
     Raises:
-        InputError: an option that the command does not have or that is the sweep's, a value of another type, a file
-            that does not exist.
+        InputError: an option that the command lacks or that the sweep sets itself, a value of the wrong type, or a
+            missing file.
     """
     known = [*(field.name for field in dataclasses.fields(arguments)), "compilation_cache"]
     if both := [name for name in grid if name in fixed]:
@@ -50,7 +50,7 @@ def plan(
     for where, name, texts in stated:
         for text, word in zip(texts, words[name], strict=True):
             if word != words[name][0] and not _differs_in_kind(text, texts[0]):
-                continue  # parsing takes milliseconds, and one whole number is like another
+                continue  # parsing takes milliseconds; one whole number is checked for all
             try:
                 value = getattr(_parsed(command, arguments, [*(first | {name: word}).values()]), name, None)
             except InputError as error:
@@ -58,7 +58,7 @@ def plan(
             if isinstance(value, Path) and not value.exists():
                 raise InputError(f"{where}: {name}={text}: no such file or folder")
     jobs = []
-    # Within an allocation of several tasks each of them would take itself for a part of one run.
+    # Within an allocation of several tasks, a job would otherwise take itself for one process of a larger run.
     alone = ("--processes=1",) if "processes" in known else ()
     by_text = {name: dict(zip(texts, words[name], strict=True)) for _, name, texts in stated}
     for number, values in enumerate(combinations(grid)):
@@ -72,13 +72,17 @@ def plan(
 
 
 def closest(word: str, known: Sequence[str]) -> str:
-    """ "; did you mean WORD?" for the word that is most like a wrong one, or nothing."""
+    """ "; did you mean WORD?" for the known word closest to an unknown one, or nothing."""
     like = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {like[0]}?" if like else ""
 
 
 def _word(arguments: type, where: str, name: str, text: str) -> str:
-    """The word of a command line for an option's value; paths are absolute, wherever the job will run."""
+    """The command-line word for an option's value; paths become absolute, so that jobs may run anywhere.
+
+    Raises:
+        InputError: an option that is yes or no has another value.
+    """
     hint = get_type_hints(arguments).get(name, bool)
     option = name.replace("_", "-")
     if bool in (hint, *get_args(hint)):

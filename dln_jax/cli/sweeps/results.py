@@ -1,4 +1,4 @@
-"""What a sweep came to: every job's numbers, medians over seeds, and the best, which validation alone chooses."""
+"""Results of a sweep: metrics of all jobs, medians over seeds, and the best job, chosen by validation alone."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,15 +14,15 @@ from dln_jax.types import InputError
 VALIDATION = ("validation_error", "validation_loss", "validation")
 ERRORS = ("torque_mse", "value_mse", "rollout_mse", "torque_nmse", "down_return_mean")
 SECONDS = ("train_seconds", "learning_seconds", "identify_seconds")
-"""Names of metrics, of which a command has one of each; the first that there is counts."""
+"""Names of metrics in the commands; of every group the first name that the jobs have counts."""
 PROBLEM = (
     "creature", "data", "function", "goal", "hold", "needs", "objective", "plant", "robot", "scene", "task", "test",
 )  # fmt: skip
-"""Options that state a problem: errors of different ones are not compared."""
+"""Options that define a problem; errors of different problems are not compared."""
 
 
 class Names(NamedTuple):
-    """Which metrics are looked at; None where no job has one."""
+    """Names of the metrics in use; `None` if no job has such a metric."""
 
     validation: str | None
     error: str | None
@@ -32,20 +32,20 @@ class Names(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A job and what came of it."""
+    """A job, its status and its metrics."""
 
     job: Job
     status: Status
     metrics: dict[str, Any]
 
     def number(self, name: str | None) -> float | None:
-        """A metric, if the job has it and it is finite."""
+        """A metric; `None` if the job lacks it or it is not finite."""
         value = self.metrics.get(name) if name else None
         return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 class Group(NamedTuple):
-    """Jobs that differ only in what medians are taken over."""
+    """Jobs that differ only in the options that medians are taken over."""
 
     values: dict[str, str]
     done: int
@@ -55,7 +55,7 @@ class Group(NamedTuple):
 
 
 def entries(jobs: Sequence[Job]) -> list[Entry]:
-    """Every job with its status, and its metrics if it is done; one whose metrics are damaged has failed."""
+    """All jobs with their status, and metrics if they are done; a job with damaged metrics counts as failed."""
     found = []
     for job in jobs:
         status, metrics = status_of(job.folder), {}
@@ -70,7 +70,7 @@ def entries(jobs: Sequence[Job]) -> list[Entry]:
 
 
 def names_in(found: Sequence[Entry], validation: str | None, error: str | None, *, largest: bool) -> Names:
-    """The metrics that were asked for, else those that the jobs have."""
+    """The requested metrics, else the first usual names that any job has."""
     known = list(dict.fromkeys(name for entry in found for name in entry.metrics))
 
     def first(usual: Sequence[str]) -> str | None:
@@ -80,7 +80,7 @@ def names_in(found: Sequence[Entry], validation: str | None, error: str | None, 
 
 
 def require_known(found: Sequence[Entry], **asked: str | None) -> None:
-    """Raises `InputError` for a metric asked for by an option that no job has, if any job has metrics."""
+    """Raises `InputError` for a requested metric that no job has, if any job has metrics."""
     known = sorted({name for entry in found for name in entry.metrics})
     for option, name in asked.items():
         if known and name is not None and name not in known:
@@ -91,17 +91,17 @@ def require_known(found: Sequence[Entry], **asked: str | None) -> None:
 
 
 def problem_of(values: Mapping[str, str]) -> tuple[str, ...]:
-    """What of a job's values states its problem."""
+    """The values of a job that define its problem."""
     return tuple(f"{name} {shown(text)}" for name, text in values.items() if name in PROBLEM)
 
 
 def shown(text: str) -> str:
-    """A value for a table: of a path the last part."""
+    """A value for a table; a path is shortened to its last part."""
     return Path(text).name if "/" in text else text
 
 
 def best_of(found: Sequence[Entry], names: Names) -> list[Entry]:
-    """Of each problem with several jobs the one with the best validation; test errors take no part."""
+    """The job with the best validation for every problem with several jobs; test errors are ignored."""
     problems: dict[tuple[str, ...], list[Entry]] = {}
     for entry in found:
         if entry.number(names.validation) is not None:

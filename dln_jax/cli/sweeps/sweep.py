@@ -1,4 +1,4 @@
-"""A sweep from its jobs to its table: what is not done is run, and everything is compared."""
+"""Run a sweep: execute the jobs that are not done, and compare all of them."""
 
 import shlex
 import time
@@ -17,11 +17,11 @@ from dln_jax.files import write_figure, write_json
 
 SECONDS_BETWEEN_LOOKS = 0.2
 LATER = "jobs.sh"
-"""File in the sweep's folder with the line of each job, for --where later."""
+"""File in the sweep's folder with the command lines of the jobs, for --where later."""
 
 
 class Asked(NamedTuple):
-    """How to run a sweep, and how to compare; None is the default that the command's help states."""
+    """How to run a sweep and compare its jobs; `None` is the default stated in the command's help."""
 
     where: Literal["here", "slurm", "ray", "later"] = "here"
     at_once: int | None = None
@@ -34,16 +34,16 @@ class Asked(NamedTuple):
 
     @property
     def beside(self) -> int | None:
-        """Jobs at once; None where that is left to Slurm."""
+        """Number of jobs at once; `None` if Slurm decides."""
         return self.at_once or (None if self.where == "slurm" else self.gpus or cores())
 
 
 def sweep(jobs: Sequence[Job], asked: Asked, folder: Path) -> bool:
-    """Runs the jobs that are not done, prints and writes what came of all; whether all are done.
+    """Runs the jobs that are not done, prints and writes the results of all, and returns whether all are done.
 
     Raises:
-        InputError: what runs the jobs is missing, or refuses them; or no job has a metric that was asked for.
-        KeyboardInterrupt: the jobs that ran have been ended, and can be continued.
+        InputError: the executor is missing or refuses the jobs, or no job has a requested metric.
+        KeyboardInterrupt: running jobs have been interrupted and can be resumed.
     """
     left = [job for job in jobs if status_of(job.folder).state != "done"]
     if asked.where == "later":
@@ -72,12 +72,12 @@ def sweep(jobs: Sequence[Job], asked: Asked, folder: Path) -> bool:
 
 
 def run(jobs: Sequence[Job], submit: Submit, report: Callable[[int, int], None] = lambda over, bad: None) -> None:
-    """Runs jobs by any executor until all are over, and stores of each that ended without a word that it was killed.
+    """Runs jobs by any executor until all have ended; records jobs that ended without a status as killed.
 
     Args:
-        jobs: a job is a function without arguments, which an executor calls wherever its folder is seen.
+        jobs: functions without arguments, which an executor may call wherever their folders are visible.
         submit: jobs -> futures, which have `done()` and `cancel()`: `lambda jobs: [pool.submit(job) for job in jobs]`.
-        report: called with how many are over, and how many of them are not done.
+        report: called with the number of jobs that have ended, and how many of these are not done.
     """
     for job in jobs:
         job.folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def run(jobs: Sequence[Job], submit: Submit, report: Callable[[int, int], None] 
 
 
 def executor_of(asked: Asked, folder: Path) -> AbstractContextManager[Submit]:
-    """What runs the jobs; errors as it is entered."""
+    """The executor of the jobs; entering the context may raise its errors."""
     if asked.where == "slurm":
         return slurm(folder, asked.beside, asked.slurm)
     at_once = asked.beside or 1
@@ -107,7 +107,7 @@ def executor_of(asked: Asked, folder: Path) -> AbstractContextManager[Submit]:
 
 
 def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder: Path) -> None:
-    """Prints what was chosen and by what, what is not done, and where everything is."""
+    """Prints the best jobs and the metric that chose them, the jobs that are not done, and the sweep's folder."""
     known = sorted({name for entry in found for name in entry.metrics})
     if known and names.validation not in known:
         print(f"no job has a validation error: none is chosen; --metric takes one of {', '.join(known)}")
@@ -127,10 +127,10 @@ def conclude(found: Sequence[Entry], best: Sequence[Entry], names: Names, folder
 
 
 def _closed(job: Job, future: object) -> str:
-    """The state of a job whose future is done; one that has not stored its end was killed."""
+    """Final state of a job whose future is done; a job that has not stored its end is recorded as killed."""
     status = status_of(job.folder)
     if status.state in ("missing", "running"):
-        word = getattr(future, "state", "")  # of Slurm, such as OUT_OF_MEMORY
+        word = getattr(future, "state", "")  # Slurm's state, such as OUT_OF_MEMORY
         how = "did not start" if status.state == "missing" else "ended without a word"
         line = f"{how} ({word})" if isinstance(word, str) and word else how
         status = status._replace(state="killed", line=line)

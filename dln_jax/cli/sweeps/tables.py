@@ -1,4 +1,4 @@
-"""A sweep's results as tables to read, to open in a spreadsheet, and to load."""
+"""A sweep's results as printed tables, CSV and JSON."""
 
 import csv
 import io
@@ -13,13 +13,13 @@ from dln_jax.cli.sweeps.results import Entry, Group, Names, shown
 from dln_jax.files import finite, write_bytes, write_json
 
 WIDTH = 200
-"""Of tables: a narrow terminal gets long lines, since numbers that are cut off say nothing."""
+"""Width of tables in columns. A narrow terminal wraps their lines, since truncated numbers would be useless."""
 MOST_ROWS = 200
-"""Of a table that is printed."""
+"""Largest number of rows of a printed table."""
 
 
 def print_jobs(found: Sequence[Entry], best: Sequence[Entry], names: Names, *, title: str) -> None:
-    """Prints a line for each job; of a long sweep only the best and those that are not done."""
+    """Prints a line per job; a long sweep shows only the best jobs and the ones that are not done."""
     listed = found
     if len(found) > MOST_ROWS:
         listed = [entry for entry in found if entry in best or entry.status.state != "done"][:MOST_ROWS]
@@ -34,7 +34,7 @@ def print_jobs(found: Sequence[Entry], best: Sequence[Entry], names: Names, *, t
 
 
 def print_groups(of: Sequence[Group], names: Names, over: Sequence[str]) -> None:
-    """Prints medians and the worst over some options."""
+    """Prints the median and worst metrics of the groups."""
     listed = [name for name in filter(None, names[:3]) if any(name in group.medians for group in of)]
     judged = [name for name in listed if name != names.seconds]
     titles = [*map(spaced, listed), *(f"worst {spaced(name)}" for name in judged)]
@@ -87,13 +87,13 @@ def write_tables(
 
 
 def said(entry: Entry, best: Sequence[Entry]) -> str:
-    """A job's status; times of one that was interrupted are those since."""
+    """A job's status, with the number of attempts if several."""
     again = f", attempt {entry.status.attempt}" if entry.status.attempt > 1 else ""
     return ("best" if entry in best else entry.status.state) + again
 
 
 def figure(number: float | None) -> str:
-    """Of a table's cell."""
+    """Text of a number in a table's cell; empty if it is missing."""
     return "" if number is None else f"{number:.3g}"
 
 
