@@ -1,13 +1,13 @@
-"""Dynamics that come from energies: write or learn a scalar, get equations of motion, rollouts and controllers.
+"""Dynamics from energies: write or learn a scalar energy, get equations of motion, rollouts and controllers.
 
-The public names, gathered from all rooms; every room has its own `__all__`. Functions take one state (`q, qd, qdd, tau`
-of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for each concept.
+This module gathers the most used names; every package has its own `__all__`. Functions take one state (`q, qd, qdd,
+tau` of shape [d], SI units): `jax.vmap` them over samples. The documentation has a page for every concept.
 """
 
 import importlib.metadata
 
 import dln_jax.interrupts
-import dln_jax.time_limit  # noqa: F401  that second counts
+import dln_jax.time_limit  # noqa: F401  first, as its import starts the clock
 from dln_jax.data.robots import Robot, read_robot
 from dln_jax.data.schema import Trajectories
 from dln_jax.data.schema import load as load_trajectories

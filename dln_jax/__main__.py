@@ -1,4 +1,4 @@
-"""The commands from the shell: `dln-jax NAME ...`, or `python -m dln_jax NAME ...`."""
+"""Entry point of the commands: `dln-jax NAME ...` or `python -m dln_jax NAME ...`."""
 
 import ast
 import difflib
@@ -11,21 +11,21 @@ from pathlib import Path
 from dln_jax.cli.commands import COMMANDS
 
 REPORTS = "scripts.reports.commands"
-"""Package of the commands that measure the project, which a checkout has and the wheel has not."""
+"""Package of the commands that measure the project; part of a checkout, not of the wheel."""
 
 
 def command(name: str, prog: str, *, package: str = "dln_jax.cli.commands") -> None:
     """Runs one command with the arguments of this process.
 
     Args:
-        name: of a module in `package`.
-        prog: what the user typed to get here, for help and for messages.
-        package: where the command is.
+        name: name of a module in `package`.
+        prog: the command as the user typed it, for help and messages.
+        package: package of the command.
     """
-    # Factorisations here are small: OpenBLAS's threads spin while they wait for each other, which took 4 to 20
-    # times the processor time of one thread in a step of 560 tetrahedra. Read as SciPy is imported; what is set stays.
+    # Factorisations here are small, and OpenBLAS's threads spin while they wait: a step of 560 tetrahedra took 4 to 20
+    # times the processor time of one thread. OpenBLAS reads the variable when SciPy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.argv[0] = prog  # a report says how it was made
+    sys.argv[0] = prog  # reports state the command that made them
     try:
         from dln_jax.cli.running import run
 
@@ -37,7 +37,7 @@ def command(name: str, prog: str, *, package: str = "dln_jax.cli.commands") -> N
 
 
 def main() -> None:
-    """The command that the first argument names; without one, or with --help, a list of them."""
+    """Runs the command named by the first argument; without one, or with --help, lists the commands."""
     prog = "dln-jax" if Path(sys.argv[0]).stem == "dln-jax" else "python -m dln_jax"
     words = sys.argv[1:]
     if words[:1] == ["--version"]:
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def report_names() -> list[str]:
-    """Names of the reports of this checkout, sorted; none where there is no checkout."""
+    """Sorted names of the reports of this checkout; empty for an installed package."""
     try:
         found = importlib.util.find_spec(REPORTS)
     except ModuleNotFoundError:
@@ -62,7 +62,7 @@ def report_names() -> list[str]:
 
 
 def _choose(words: list[str], prog: str, package: str, names: list[str], more: str = "") -> None:
-    """Runs the command that the first word names, or lists what there is."""
+    """Runs the command named by the first word, or lists the commands."""
     if not names:
         print("error: reports are part of the project's checkout, not of the installed package", file=sys.stderr)
         raise SystemExit(2)
@@ -89,8 +89,8 @@ def _choose(words: list[str], prog: str, package: str, names: list[str], more: s
 
 
 def first_line(name: str, package: str = "dln_jax.cli.commands") -> str:
-    """What a command's first line states that it does."""
-    # Read and not imported: some commands take seconds to import.
+    """First line of a command's docstring."""
+    # Parsed instead of imported: some commands take seconds to import.
     specification = importlib.util.find_spec(f"{package}.{name}")
     source = Path(str(specification and specification.origin)).read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]

@@ -1,4 +1,4 @@
-"""Work in a thread beside the caller's: XLA releases the interpreter while it compiles or runs."""
+"""Work in a background thread: XLA releases the interpreter lock while it compiles or runs."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,7 @@ def in_background(
     """Starts `function(*arguments, **options)` in a thread.
 
     Returns:
-        A function that waits for the result and returns it, or raises what `function` has raised.
+        A function that waits for the result and returns it, or raises the exception of `function`.
     """
     thread = ThreadPoolExecutor(1)
     future = thread.submit(function, *arguments, **options)

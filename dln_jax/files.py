@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read or refused in one line."""
+"""Files: atomic writes, and reads that fail with a one-line error."""
 
 import json
 import math
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PARTIAL = ".partial"
-"""Ending of a file that is being written; one that was left behind by a kill holds nothing of value."""
+"""Suffix of a file that is being written; a file left behind by a kill can be deleted."""
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """Yields the path of a new file beside `path`, to be written; it takes the place of `path` if nothing is raised.
+    """Yields the path of a new file beside `path` to write to; it replaces `path` if the block raises nothing.
 
-    The file is created exclusively under a name of its own: no link is followed, and no other writer is disturbed.
+    The file is created exclusively under a unique name: it follows no link and does not disturb other writers.
 
     Raises:
-        InputError: the folder is missing or cannot be written to, or the disk is full.
+        InputError: the folder is missing or not writable, or the disk is full.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:
@@ -43,24 +43,24 @@ def writing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Writes a file, whole or not at all; errors as `writing`."""
+    """Writes a file atomically; errors as `writing`."""
     with writing(path) as partial:
         partial.write_bytes(data)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Writes JSON, whole or not at all; what is not finite, which JSON cannot say, is null. Errors as `writing`."""
+    """Writes JSON atomically; numbers that are not finite, which JSON lacks, become null. Errors as `writing`."""
     write_bytes(path, json.dumps(finite(values), indent=2, allow_nan=False).encode() + b"\n")
 
 
 def write_figure(path: Path, figure: "Figure", **options: Any) -> None:
-    """Writes a figure as PNG, whole or not at all; options as `Figure.savefig`, errors as `writing`."""
+    """Writes a figure as PNG atomically; options as `Figure.savefig`, errors as `writing`."""
     with writing(path) as partial:
         figure.savefig(partial, format="png", **options)
 
 
 def finite(values: Any) -> Any:
-    """The same JSON values with `None` for numbers that are not finite."""
+    """Replaces numbers that are not finite in JSON values by `None`."""
     if isinstance(values, Mapping):
         return {key: finite(value) for key, value in values.items()}
     if isinstance(values, list | tuple):
@@ -69,7 +69,7 @@ def finite(values: Any) -> Any:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file of this name; a name that the system cannot hold is none."""
+    """Whether the file exists; False for a name that the system does not allow, such as one that is too long."""
     try:
         return path.is_file()
     except OSError:
@@ -77,10 +77,10 @@ def is_file(path: Path) -> bool:
 
 
 def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
-    """The JSON object in a file.
+    """Reads the JSON object in a file.
 
     Raises:
-        InputError: the file is missing, cannot be read, or holds anything else; `remedy` says what to do then.
+        InputError: the file is missing, unreadable, or not a JSON object; the message ends with `remedy`.
     """
     if not is_file(path):
         raise InputError(f"{path}: no such file; {remedy}")
@@ -95,7 +95,7 @@ def read_json(path: Path, *, remedy: str) -> dict[str, Any]:
 
 
 def matches(value: Any, hint: Any) -> bool:
-    """Whether a JSON value is one of a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
+    """Whether a JSON value has a type: bool, int, float (finite), str, Path (a str), None, Literal or a union."""
     if get_origin(hint) is Literal:
         return any(type(value) is type(each) and value == each for each in get_args(hint))
     if options := get_args(hint):
@@ -108,7 +108,7 @@ def matches(value: Any, hint: Any) -> bool:
 
 
 def in_words(hint: Any) -> str:
-    """What a type that `matches` takes is called in a message: "a whole number", "one of a, b, or null"."""
+    """Describes a type of `matches` for a message: "a whole number", "one of a, b, or null"."""
     if get_origin(hint) is Literal:
         return f"one of {', '.join(map(str, get_args(hint)))}"
     if options := get_args(hint):
@@ -118,7 +118,11 @@ def in_words(hint: Any) -> str:
 
 
 def cache_folder() -> Path:
-    """Where what can be made again is kept: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`."""
+    """Folder for reproducible files, created if missing: `$XDG_CACHE_HOME/dln_jax`, by default `~/.cache/dln_jax`.
+
+    Raises:
+        InputError: the folder cannot be created.
+    """
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "dln_jax"
     try:

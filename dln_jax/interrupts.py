@@ -1,4 +1,4 @@
-"""An interrupt is no error: it is said in a word, and what is being stored is stored first."""
+"""Interrupts of commands: one word instead of a traceback, and a checkpoint that is being stored is completed."""
 
 import contextlib
 import io
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Takes the place of `sys.excepthook`: an interrupt while a command is still being imported leaves no trace."""
+    """Replaces `sys.excepthook`, so that an interrupt while a command is being imported prints no traceback."""
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)
     else:
@@ -21,7 +21,7 @@ def in_a_word(kind: type[BaseException], error: BaseException, trace: TracebackT
 
 
 def is_command() -> bool:
-    """Whether this process was started as `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`, by no other."""
+    """Whether this process runs `dln-jax`, `python -m dln_jax` or `python -m scripts.NAME`, and no other program."""
     words = sys.orig_argv
     package, _, name = words[words.index("-m") + 1 :][0].partition(".") if "-m" in words[:-1] else ("", "", "")
     script = package == "scripts" and (Path(__file__).parents[1] / "scripts" / f"{name}.py").is_file()
@@ -29,16 +29,17 @@ def is_command() -> bool:
 
 
 def terminate_as_interrupt() -> None:
-    """Lets SIGTERM end this process as Ctrl-C does, unless the process that started it has decided otherwise."""
+    """Makes SIGTERM end this process as Ctrl-C does, unless SIGTERM is already handled or ignored."""
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @contextlib.contextmanager
 def held_back() -> Iterator[None]:
-    """Lets what is within end before an interrupt is raised: a step of a training, and its checkpoint.
+    """Delays SIGINT and SIGTERM to the end of the block, such as a training step and its checkpoint.
 
-    Python raises an interrupt only when a compiled program returns, so that this delays it by the checkpoint alone.
+    Python raises an interrupt only when a compiled program returns, so this delays it by the checkpoint alone. Has no
+    effect outside the main thread, which alone may set signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -50,7 +51,7 @@ def held_back() -> Iterator[None]:
 
     signals = (signal.SIGINT, signal.SIGTERM)
     before: dict[int, Any] = {each: signal.getsignal(each) for each in signals}
-    before = {each: handler for each, handler in before.items() if callable(handler)}  # those of Python
+    before = {each: handler for each, handler in before.items() if callable(handler)}  # Python functions
     for each in before:
         signal.signal(each, note)
     try:
@@ -63,10 +64,10 @@ def held_back() -> Iterator[None]:
 
 
 def open_standard_streams() -> None:
-    """Gives a process whose output was closed (`>&-`) somewhere to write, and prints any text in any encoding."""
+    """Opens standard streams that were closed (`>&-`) on the null device, and prints any text in any encoding."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            os.dup2(os.open(os.devnull, os.O_RDWR), number)  # so that no other file gets this number
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)  # keeps the descriptor for it
             setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115  to the end
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

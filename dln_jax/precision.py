@@ -1,4 +1,4 @@
-"""Single and double precision: their names, and what needs which."""
+"""Single and double precision: names, checks, and contexts that set the precision."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ def data_type(precision: str) -> Any:
     """float32 or float64, for "f32" or "f64".
 
     Raises:
-        InputError: another name, or f64 while JAX computes in 32 bits.
+        InputError: an unknown name, or f64 while JAX computes in 32 bits.
     """
     require_precision(precision)
     if precision == "f64":
@@ -32,9 +32,9 @@ def require_precision(precision: Any) -> None:
 
 
 def require_double_precision(what: str) -> None:
-    """Raises `InputError` that says how to switch on double precision, where JAX computes in 32 bits.
+    """Raises `InputError` that states how to enable double precision, if JAX computes in 32 bits.
 
-    The setting is the process's, which a caller's own arrays, `vmap` and `grad` follow: the caller sets it.
+    The caller has to enable it: the setting affects the whole process, with the caller's arrays, `vmap` and `grad`.
     """
     if not jax.config.read("jax_enable_x64"):
         raise InputError(
@@ -51,11 +51,11 @@ def require_float64(precision: str) -> None:
 
 @contextmanager
 def computing_in(precision: str) -> Iterator[None]:
-    """JAX in f32 or f64, whatever its own setting is.
+    """Runs JAX in f32 or f64, regardless of its setting.
 
-    JAX keeps a NumPy array that a function closes over in the precision in which it met it first (as of 0.11, by the
-    array's identity), and a function that is jitted in both gets constants of the wrong one. So where the setting is
-    another, all that JAX has compiled is forgotten on both sides. Traced programs must not outlive the context.
+    JAX caches a NumPy array that a function closes over in the precision of its first use (as of 0.11, by the array's
+    identity), so a function jitted in both precisions gets constants of the wrong one. If the precision differs from
+    the setting, JAX's caches are therefore cleared on entry and exit. Traced programs must not outlive the context.
     """
     differs = jax.config.read("jax_enable_x64") != (precision == "f64")
     if differs:
@@ -72,7 +72,7 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def in_float64(function: Function) -> Function:
-    """Computes in float64, whatever the caller's default is."""
+    """Decorates a function to compute in float64, regardless of the caller's setting."""
 
     @functools.wraps(function)
     def wrapped(*arguments, **keywords):
@@ -83,5 +83,5 @@ def in_float64(function: Function) -> Function:
 
 
 def with_float64(parameters: Any) -> Any:
-    """Parameters in float64, where JAX computes in it."""
+    """Converts parameters to JAX's default float: float64 if double precision is enabled."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), parameters)

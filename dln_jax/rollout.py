@@ -1,4 +1,4 @@
-"""Many steps of anything as one scan, which is differentiable from end to end."""
+"""Rollouts: many steps as one scan, differentiable from end to end."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,19 +18,19 @@ def rollout(
     observe: Callable[[Any, Any], Any] = lambda state, info: state,
     segment: int | None = None,
 ) -> tuple[Any, Any]:
-    """The state after all steps, and what `observe` sees after each, stacked along a leading axis.
+    """Advances a state by many steps; returns the last state and the observations of all steps, [steps, ...].
 
     Args:
         step: (state, input) -> (state, info); parameters are closed over, as by `functools.partial(step, params)`.
-        state: at the start; any tree of arrays, whose shapes and types a step keeps.
-        inputs: of the steps along the leading axis, [steps, ...], or `None` with `steps`.
-        steps: how many, where there are no inputs.
-        observe: (state, info) -> what to keep, the state by default; what is not kept of `info` is not computed either.
-        segment: steps between the states that reverse mode keeps; the steps between are then computed twice, and memory
-            grows with steps / segment + segment. Must divide the number of steps. By default all is kept.
+        state: initial state; any tree of arrays. A step must keep their shapes and types.
+        inputs: inputs of the steps along the leading axis, [steps, ...], or `None` with `steps`.
+        steps: number of steps, if there are no inputs.
+        observe: (state, info) -> values to keep, by default the state; unused parts of `info` are not computed.
+        segment: steps between the states that reverse mode stores. The steps between them are computed twice, and
+            memory grows with steps / segment + segment. Must divide the number of steps. By default all is stored.
 
     Raises:
-        InputError: neither inputs nor steps, or a segment that does not divide them.
+        InputError: neither inputs nor steps, or a segment that does not divide the number of steps.
     """
     count = steps if inputs is None else jax.tree.leaves(inputs)[0].shape[0]
     if count is None:

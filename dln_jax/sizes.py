@@ -1,7 +1,7 @@
-"""Upper bounds of what can be asked for, in one place: a typo must not take all memory, or run for years.
+"""Upper bounds of counts and magnitudes in one place: a typo must not exhaust the memory or run for years.
 
 The bounds are far above any sensible use. Counts that multiply (cells of a mesh, equations of Gauss-Newton) are
-bounded by an estimate of the memory that they take, before anything is allocated.
+bounded by an estimate of their memory before anything is allocated.
 """
 
 import os
@@ -38,23 +38,23 @@ MOST: dict[str, int] = {
     "trajectories": 1_000_000,
     "width": 16_384,
 }
-"""Of counts, by the name of the option or argument; `MOST_OF_OTHERS` of those that are not listed."""
+"""Upper bounds of counts by name of the option or argument; `MOST_OF_OTHERS` bounds the rest."""
 MOST_OF_OTHERS = 100_000_000
 LARGEST, SMALLEST = 1e50, 1e-50
-"""Magnitudes of measured quantities in SI units; the squares of what lies between stay finite."""
+"""Range of magnitudes of measured quantities in SI units; the squares of values in the range stay finite."""
 LARGEST_STATED = 1e20
-"""Of a number that is typed as an option."""
+"""Largest magnitude of an option on the command line."""
 
 
 def require_within(counts: Mapping[str, int]) -> None:
-    """Raises `InputError` that names the first count above its upper bound; names may be those of options."""
+    """Raises `InputError` that names the first count above its bound; names may be written as options (--steps)."""
     for name, count in counts.items():
         if count > (most := MOST.get(name.removeprefix("--").replace("-", "_"), MOST_OF_OTHERS)):
             raise InputError(f"{name} is {written(count)}; expected at most {most:,}")
 
 
 def require_magnitude(name: str, value: float) -> None:
-    """Raises `InputError` for a number other than zero that no quantity in SI units has."""
+    """Raises `InputError` for a nonzero number whose magnitude is implausible in SI units."""
     if value != 0 and not SMALLEST <= abs(value) <= LARGEST_STATED:
         raise InputError(
             f"{name} is {value:.3g}; expected 0, or a size between {SMALLEST:.0e} and {LARGEST_STATED:.0e}"
@@ -62,12 +62,12 @@ def require_magnitude(name: str, value: float) -> None:
 
 
 def require_network(*, width: int, depth: int) -> None:
-    """Raises `InputError` unless width and depth are positive whole numbers within bounds, and the weights fit."""
+    """Raises `InputError` unless width and depth are positive whole numbers in bounds and the weights fit in memory."""
     for name, value in (("width", width), ("depth", depth)):
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise InputError(f"{name} is {value!r:.40}; expected a positive whole number")
     require_within({"width": width, "depth": depth})
-    # Parameters, their gradient, and two moments of Adam.
+    # Parameters, gradient, and Adam's two moments, in float64.
     require_memory(f"a network with {depth} hidden layers of {width} units", 4 * 8.0 * width**2 * (depth - 1))
 
 
@@ -81,7 +81,7 @@ def require_memory(what: str, bytes_needed: float) -> None:
 
 
 def memory() -> float:
-    """Bytes of this machine or of the container, whichever is less; infinite where the system does not say."""
+    """Memory of this machine or container, whichever is less, bytes; infinite if the system does not report it."""
     found = float("inf")
     try:
         found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -91,5 +91,5 @@ def memory() -> float:
 
 
 def written(number: int) -> str:
-    """A whole number for a message, however many digits it has."""
+    """A whole number for a message; a number of more than 18 digits is only described."""
     return f"{number:,}" if abs(number) < 10**18 else f"{'-' * (number < 0)}a number of more than 18 digits"

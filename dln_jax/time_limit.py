@@ -1,4 +1,4 @@
-"""A command's limit of time: `--seconds` counts from the start of its process until the model is stored."""
+"""Time limit of a command: `--seconds` counts from the start of its process until the model is stored."""
 
 import contextlib
 import math
@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 
 IMPORTED = time.perf_counter()
-"""When this package was imported, which is about when a command's process started."""
+"""Time of this package's import, which is close to the start of a command's process."""
 SOON = 1e-3
-"""Seconds that count as left when the time is over: a fit needs a positive number, and then does one dispatch."""
+"""Seconds that count as left after the deadline: a fit needs a positive number, and then does one dispatch."""
 _began: ContextVar[float | None] = ContextVar("began", default=None)
 
 
 @contextlib.contextmanager
 def counting_from(began: float) -> Iterator[None]:
-    """Lets the deadlines of a command count from this reading of `time.perf_counter`."""
+    """Counts the deadlines of a command from this reading of `time.perf_counter`."""
     token = _began.set(began)
     try:
         yield
@@ -24,9 +24,9 @@ def counting_from(began: float) -> Iterator[None]:
 
 
 def deadline(seconds: float | None) -> float:
-    """The reading of `time.perf_counter` at which a command's seconds are over; infinite without a limit.
+    """The reading of `time.perf_counter` at which the time is up; infinite without a limit.
 
-    Outside of a command the seconds count from now.
+    Outside a command the seconds count from now.
     """
     began = _began.get()
     return math.inf if seconds is None else seconds + (time.perf_counter() if began is None else began)

@@ -1,4 +1,4 @@
-"""Symbols, units and shapes that every floor shares.
+"""Symbols, units and shapes of the whole library.
 
 | symbol | shape | unit | meaning |
 |---|---|---|---|
@@ -29,7 +29,7 @@ Vector = Float[Array, "d"]
 Matrix = Float[Array, "d d"]
 
 VectorLike = ArrayLike | Sequence[ArrayLike]
-"""What a caller may give for a vector: an array, or a list or tuple of numbers."""
+"""Accepted types of a vector argument: an array, or a list or tuple of numbers."""
 
 Lagrangian = Callable[[Array, Array], Array]
 """L(q, qd) -> scalar, in J."""
@@ -46,11 +46,11 @@ JointKind = Literal["revolute", "prismatic"]
 FrictionLaw = Literal["viscous", "coulomb", "stribeck", "offset", "asymmetric", "sigmoid", "load"]
 """Laws of friction in a joint; `mechanics.friction` has their formulas."""
 ResidualTerm = Literal["potential", "dissipation", "inertia"]
-"""Energies that a residual may have; `mechanics.residual` says what each explains."""
+"""Energies that a residual may have; `mechanics.residual` states what they explain."""
 
 
 class InputError(ValueError):
-    """A user's input is wrong; the message says what was wrong, what was expected and what to do."""
+    """Invalid user input; the message states what was wrong, what was expected and what to do."""
 
 
 def require_positive(**numbers: int | float) -> None:
@@ -61,7 +61,7 @@ def require_positive(**numbers: int | float) -> None:
 
 
 def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """The value as float64 of this shape; `InputError` says whether type, shape or a number is at fault."""
+    """Converts a value to a float64 array of this shape; `InputError` names a wrong type, shape or number."""
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -75,7 +75,7 @@ def finite_array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 LARGEST_SEED = 2**32 - 1
-"""Of one that NumPy and JAX take, in 32 bits too."""
+"""Largest seed that NumPy and JAX accept, also in 32-bit mode."""
 
 
 def require_seed(seed: int, seeds: int = 1) -> None:
@@ -89,27 +89,27 @@ class _Needs(NamedTuple):
     """The fields of `Needs`."""
 
     joints: tuple[JointKind, ...]
-    """Kind of each joint: a revolute angle enters a model as cos and sin, a prismatic displacement as it is."""
+    """Kinds of the joints: a revolute angle enters a model as cos and sin, a prismatic displacement unchanged."""
     gravity: bool = True
     """Whether there is a potential V(q) (weight, springs)."""
     friction: bool = False
     """Whether there is a Rayleigh dissipation function D(q, qd)."""
     actuation: tuple[tuple[float, ...], ...] | None = None
-    """Rows of the matrix B [d, u] in tau = B control; `None` when each coordinate has its own motor."""
+    """Rows of the matrix B [d, u] in tau = B control; `None` if every coordinate has its own motor."""
     joint_friction: tuple[FrictionLaw, ...] = ()
-    """Laws of the friction that acts in every joint; `friction` is a dissipation of another form, learned."""
+    """Laws of friction that act in every joint; `friction` is a learned dissipation of another form."""
     joint_map: tuple[tuple[float, ...], ...] | None = None
-    """Rows of the matrix J [d, d] in joint rates = J qd, where coordinates are not those of the joints, such as angles
-    from the vertical; `None` where they are."""
+    """Rows of the matrix J [d, d] in joint rates = J qd, if the coordinates differ from the joints', such as angles
+    from the vertical; `None` if they are the same."""
     velocity_scale: float = 0.01
-    """v of the joints' dry friction, which is smooth below, in rad/s or m/s."""
+    """Velocity v of the joints' dry friction, rad/s or m/s; the law is smooth below it."""
 
 
 class Needs(_Needs):
-    """What a scene needs, and nothing more: what is absent here is never built, traced or compiled.
+    """Terms that a scene needs; a term that is absent here is never built, traced or compiled.
 
-    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. InputError for
-    unknown kinds of joints or laws of friction, and for values of another type.
+    Hashable and made of plain Python values, so that it can be a static argument and a line of JSON. Raises
+    `InputError` for unknown kinds of joints or laws of friction, and for values of a wrong type.
     """
 
     __slots__ = ()
@@ -133,12 +133,12 @@ class Needs(_Needs):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """d."""
+        """Number of degrees of freedom, d."""
         return len(self.joints)
 
 
 def _names_of(field: str, given: Any, known: tuple[str, ...]) -> tuple[Any, ...]:
-    """Names as a tuple; `InputError` for others than those known."""
+    """Names as a tuple; `InputError` for an unknown name."""
     if not isinstance(given, list | tuple) or not all(isinstance(each, str) and each in known for each in given):
         raise InputError(f"{field}: {reprlib.repr(given)}; expected a tuple of {', '.join(known)}")
     return tuple(given)
