@@ -34,7 +34,7 @@ class Arguments(Options, Folder, Drawn, Scaled):
 
 
 def main(given: Arguments) -> None:
-    """Trains by all methods, prints and writes."""
+    """Trains by all methods, prints the comparison and writes it."""
     mesh = mesh_of(given)
     task = prepare(given, METHODS, mesh)
     with command_folder(given, "compare_locomotion") as folder:
