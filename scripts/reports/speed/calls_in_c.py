@@ -130,10 +130,10 @@ class Prototype(NamedTuple):
 
     real: str
     inputs: dict[str, int]
-    """0 is the size of a number that is passed by value."""
+    """Sizes of the inputs by name; 0 for a number passed by value."""
     results: dict[str, int]
     returns: bool
-    """Whether a number is returned."""
+    """Whether the function returns a number."""
 
 
 class Times(NamedTuple):

@@ -72,7 +72,7 @@ def learned_energy(problem: Problem, *, quick: bool) -> Hamiltonian:
 
 
 def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:
-    """The integrator of a Hamiltonian; `None` for one that needs a separable energy where this is none."""
+    """The integrator of a Hamiltonian; `None` if the method needs a separable energy and this one is not."""
     slope_q, slope_p = (jax.grad(H, argnums=argument) for argument in range(2))
 
     def field(t, state):
@@ -91,7 +91,7 @@ def step_of(method: str, H: Hamiltonian, *, separable: bool) -> Step | None:
         return None
     if method == "symplectic-euler":
         return integrators.symplectic_euler(lambda t, q, p: slope_p(q, p), lambda t, q, p: -slope_q(q, p))
-    # Each half is evaluated where the other variable is zero, since it does not read it.
+    # Both parts of a separable energy are evaluated with the other variable zero, on which they do not depend.
     return integrators.stormer_verlet(
         lambda t, p: slope_p(jnp.ones_like(p), p), lambda t, q: -slope_q(q, jnp.zeros_like(q))
     )
