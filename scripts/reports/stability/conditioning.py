@@ -180,7 +180,7 @@ def _residual(mass: np.ndarray, q, qd, qdd, tau) -> tuple[np.ndarray, np.ndarray
 
 
 def _there_and_back(system: Dynamics, *states) -> tuple[np.ndarray, np.ndarray]:
-    """tau from qdd, and qdd from that tau; one state at a time, as batched library calls within one program may wait."""
+    """tau from qdd, and qdd from that tau; one state at a time, as batched library calls in one program may wait."""
 
     def one(state):
         q, qd, qdd = state

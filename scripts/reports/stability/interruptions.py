@@ -53,7 +53,7 @@ def killed_and_resumed(name: str, random: np.random.Generator, kills: int) -> Fi
 def interrupted(
     command: Sequence[str], place: Path, random: np.random.Generator, *, kills: int
 ) -> tuple[int, list[float]]:
-    """Number of `kills` interrupted runs that end as the unbroken one, and moments of the kills, s after a checkpoint."""
+    """Number of `kills` interrupted runs that end as the unbroken one, and the kills' times, s after a checkpoint."""
     # Twice: the second run finds the compiled programs of the first, as the killed runs do.
     for name in ("first", "unbroken"):
         length = lasted(start(command, place, name), place / name)
