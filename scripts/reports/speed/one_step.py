@@ -86,7 +86,7 @@ draw = partial(
 
 
 def train_into(place: Path, name: str, sets: Split, *, quick: bool) -> Path:
-    """Trains a model into a folder: the wide one by Adam, the trigonometric one by its solve, others by Gauss-Newton."""
+    """Trains a model into a folder: the wide one by Adam, the trigonometric one directly, others by Gauss-Newton."""
     folder = place / name
     folder.mkdir()
     kind, wide = SMALL if name == WIDE else name, name == WIDE
