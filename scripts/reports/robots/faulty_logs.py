@@ -112,7 +112,7 @@ FAULTS: dict[str, Fault] = {
     "late-by-200-ms": Fault(_delayed, "doubtful"),
     "dead-channel": Fault(_dead, "doubtful"),
 }
-"""By name. Torques of 20 times their deviation are spikes of 1 in 100 samples."""
+"""Faults by name. Spikes are torques of 20 standard deviations in 1 of 100 samples."""
 
 
 def _body(mass: float, random: np.random.Generator) -> np.ndarray:

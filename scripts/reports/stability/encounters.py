@@ -40,7 +40,7 @@ DT = 0.01
 BELOW_UPRIGHT = 1e-3
 """Initial angle from the saddle, rad; the swing starts from rest."""
 HIGHER_ORDERS = 1.1
-"""What the next orders of the expansion may add: g dt² and sqrt(g) dt are 0.001 and 0.03."""
+"""Allowance for the next orders of the expansion: g dt² and sqrt(g) dt are 0.001 and 0.03."""
 TOLERANCE = 1e-12
 STEPS_NEAR = 100
 """Steps whose errors may add up at the nearest point."""
